@@ -4,8 +4,9 @@
     model = advsearch.load_model("reference")
     result = advsearch.attack(scene, model, controls=["texture"])
 
-Nothing heavy is imported until one of these is used. Editors and type checkers read the block of imports; of the
-experiments other than `attack`, `sweep` and `render` the class of settings documents the keywords.
+Nothing heavy is imported until one of these is used. Editors and type checkers read the
+block of imports; of the experiments other than `attack`, `sweep` and `render` the class
+of settings documents the keywords.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ if TYPE_CHECKING:
     from advsearch.questions.compare import compare as compare
     from advsearch.questions.explain import explain as explain
     from advsearch.questions.harden import harden as harden
-    from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
+    from advsearch.questions.photographs.carry_out import (
+        photo_agreement as photo_agreement,
+    )
     from advsearch.questions.precision import precision as precision
     from advsearch.questions.recipe import recipe as recipe
     from advsearch.questions.region import region as region
@@ -79,13 +82,18 @@ if not TYPE_CHECKING:  # else a checker would take any name
         if name in _MODULES or name in _HOMES:
             import_module("advsearch.api")  # sets the threads before torch is imported
             return (
-                import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+                import_module(f"advsearch.{name}")
+                if name in _MODULES
+                else getattr(import_module(_HOMES[name]), name)
             )
         if name.isidentifier() and not name.startswith("_") and name in EXPERIMENTS:
             import_module("advsearch.api")
             return get_experiment(name).python
         if name == "plan":
-            raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
+            raise AttributeError(
+                "`plan` is a part of `check` now: use "
+                "advsearch.check(..., loss='model')"
+            )
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -9,14 +9,17 @@ import sys
 
 def start() -> int:
     """Run the command line and return its exit status."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the process, without a traceback, until `main` begins
+    # Ctrl-C ends the process, without a traceback, until `main` begins
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     # first the handling of signals above
     from advsearch.cli.main import main
     from advsearch.cli.output import INTERRUPTED
 
     status = main()
-    if status == INTERRUPTED:  # one that struck inside Dr.Jit has left it so that the interpreter aborts at its end
+    # one that struck inside Dr.Jit has left it so that the interpreter aborts at its
+    # end
+    if status == INTERRUPTED:
         sys.stderr.flush()
         os._exit(status)  # standard output is written out, and every file is closed
     return status

@@ -1,4 +1,5 @@
-"""The built-in parts that somebody could also add from a package: where each is, and a line of help.
+"""The built-in parts that somebody could also add from a package: where each is, and a
+line of help.
 
 Nothing is imported before it is needed. A part whose module is missing is left out.
 """
@@ -16,10 +17,11 @@ class BuiltIn(NamedTuple):
     """A built-in part.
 
     Attributes:
-        kind: "experiment", "control", "policy", "task", "model source", "recognizer" of networks from Python,
-            "exporter", "reader" of mesh files, or "converter" of files to glTF.
-        name: the word for it on the command line; of a reader or converter the suffix of its files, of a recognizer
-            the library of its networks.
+        kind: "experiment", "control", "policy", "task", "model source", "recognizer" of
+            networks from Python, "exporter", "reader" of mesh files, or "converter" of
+            files to glTF.
+        name: the word for it on the command line; of a reader or converter the suffix
+            of its files, of a recognizer the library of its networks.
         target: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """
@@ -45,7 +47,8 @@ BUILT_INS = (
     ),
     BuiltIn(
         "experiment", "sweep", f"{_EXPERIMENTS}.sweep:sweep",
-        "measure how often the model is right over a grid or a random sample of configurations",
+        "measure how often the model is right over a grid or a random sample of "
+        "configurations",
     ),
     BuiltIn(
         "experiment", "render", f"{_EXPERIMENTS}.render:render",
@@ -57,11 +60,13 @@ BUILT_INS = (
     ),
     BuiltIn(
         "experiment", "explain", f"{_EXPERIMENTS}.explain:explain",
-        "say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders",
+        "say in words where a model is wrong, from the rows of sweeps, and confirm it "
+        "by fresh renders",
     ),
     BuiltIn(
         "experiment", "compare", f"{_EXPERIMENTS}.compare:compare",
-        "compare models, objects or adversarial scenes on the same pictures, pair by pair",
+        "compare models, objects or adversarial scenes on the same pictures, pair by "
+        "pair",
     ),
     BuiltIn(
         "experiment", "recipe", f"{_EXPERIMENTS}.recipe:recipe",
@@ -69,19 +74,23 @@ BUILT_INS = (
     ),
     BuiltIn(
         "experiment", "harden", f"{_EXPERIMENTS}.harden:harden",
-        "train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw",
+        "train a copy of a model on its worst cases, and measure it before and after "
+        "on scenes that training never saw",
     ),
     BuiltIn(
         "experiment", "test", f"{_EXPERIMENTS}.test:test",
-        "test claims about a model, each found held, failed or undecided: a gate at every change",
+        "test claims about a model, each found held, failed or undecided: a gate at "
+        "every change",
     ),
     BuiltIn(
         "experiment", "replay", f"{_EXPERIMENTS}.replay:replay",
-        "render the adversarial scene of a run again under other conditions, beside the clean scene",
+        "render the adversarial scene of a run again under other conditions, beside "
+        "the clean scene",
     ),
     BuiltIn(
         "experiment", "check", f"{_EXPERIMENTS}.check:check",
-        "check every gradient against differences; show how a search gets them and what it leaves out",
+        "check every gradient against differences; show how a search gets them and "
+        "what it leaves out",
     ),
     BuiltIn(
         "experiment", "precision", f"{_EXPERIMENTS}.precision:precision",
@@ -105,7 +114,8 @@ BUILT_INS = (
     ),
     BuiltIn(
         "control", "texture", f"{_CONTROLS}.texture:TextureControl",
-        "the base-colour map of the object or another mesh, inside a ball around the original",
+        "the base-colour map of the object or another mesh, inside a ball around the "
+        "original",
     ),
     BuiltIn(
         "control", "material", f"{_CONTROLS}.material:MaterialControl",
@@ -129,11 +139,13 @@ BUILT_INS = (
     ),
     BuiltIn(
         "control", "environment", f"{_CONTROLS}.environment:EnvironmentControl",
-        "which environment lights the scene, how it is turned, how bright it is, and its colour",
+        "which environment lights the scene, how it is turned, how bright it is, and "
+        "its colour",
     ),
     BuiltIn(
         "control", "sky", f"{_CONTROLS}.sky:SkyControl",
-        "a clear sky instead of the environment: where the sun stands, and how hazy the air is",
+        "a clear sky instead of the environment: where the sun stands, and how hazy "
+        "the air is",
     ),
     BuiltIn(
         "control", "geometry", f"{_CONTROLS}.geometry:GeometryControl",
@@ -141,11 +153,13 @@ BUILT_INS = (
     ),
     BuiltIn(
         "control", "things", f"{_CONTROLS}.things:ThingsControl",
-        "where the things beside the object stand, how they are turned, and whether they are there",
+        "where the things beside the object stand, how they are turned, and whether "
+        "they are there",
     ),
     BuiltIn(
         "control", "body", f"{_CONTROLS}.body:BodyControl",
-        "what a person is like, how they stand or walk, and how a rigged file of your own moves",
+        "what a person is like, how they stand or walk, and how a rigged file of your "
+        "own moves",
     ),
     BuiltIn(
         "control", "patch", f"{_CONTROLS}.patch:PatchControl",
@@ -169,11 +183,13 @@ BUILT_INS = (
     ),
     BuiltIn(
         "control", "lens", f"{_CONTROLS}.lens:LensControl",
-        "translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities",
+        "translucent, blurred dots on the camera's lens: their places, sizes, colours, "
+        "opacities",
     ),
     BuiltIn(
         "control", "sensor", f"{_CONTROLS}.sensor:SensorControl",
-        "what a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG",
+        "what a camera adds: noise, mosaic, white balance, chromatic aberration, "
+        "vignetting, JPEG",
     ),
     BuiltIn(
         "control", "corruption", f"{_CONTROLS}.corruption:CorruptionControl",
@@ -217,19 +233,23 @@ BUILT_INS = (
     ),
     BuiltIn(
         "policy", "portfolio", f"{_POLICIES}.auto:Portfolio",
-        "lets several policies search side by side and goes on with those that reached more",
+        "lets several policies search side by side and goes on with those that reached "
+        "more",
     ),
     BuiltIn(
         "policy", "random", f"{_POLICIES}.sampling:Random",
-        "independent samples within the budget, by turns at the extremes of the norm balls and in their interior",
+        "independent samples within the budget, by turns at the extremes of the norm "
+        "balls and in their interior",
     ),
     BuiltIn(
         "policy", "restarts", f"{_POLICIES}.auto:Restarts",
-        "lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step",
+        "lets a policy search `times` times, each with an equal share of the renders; "
+        "they take turns, step by step",
     ),
     BuiltIn(
         "policy", "sobol", f"{_POLICIES}.sampling:Sobol",
-        "a scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by Owen 1998, Matousek 1998)",
+        "a scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by "
+        "Owen 1998, Matousek 1998)",
     ),
     BuiltIn(
         "task", "classification", f"{_TASKS}.classification:Classification",
@@ -237,31 +257,38 @@ BUILT_INS = (
     ),
     BuiltIn(
         "task", "detection", f"{_TASKS}.detection:Detection",
-        "a model finds the object: one of its boxes has a right name, a score of `confidence`, overlaps the true box",
+        "a model finds the object: one of its boxes has a right name, a score of "
+        "`confidence`, overlaps the true box",
     ),
     BuiltIn(
         "task", "segmentation", f"{_TASKS}.segmentation:Segmentation",
-        "a model gives at least `accuracy` of the object's pixels a right class; pixels beside it don't count",
+        "a model gives at least `accuracy` of the object's pixels a right class; "
+        "pixels beside it don't count",
     ),
     BuiltIn(
         "task", "depth", f"{_TASKS}.depth:Depth",
-        "a model judges how far the object is: off by less than a factor of 1 + `tolerance`, on average",
+        "a model judges how far the object is: off by less than a factor of 1 + "
+        "`tolerance`, on average",
     ),
     BuiltIn(
         "task", "similarity", f"{_TASKS}.similarity:Similarity",
-        "the object is what the nearest reference pictures show, or what the clean picture shows",
+        "the object is what the nearest reference pictures show, or what the clean "
+        "picture shows",
     ),
     BuiltIn(
         "task", "answer", f"{_TASKS}.answers:FreeAnswer",
-        "a model's answer has one of the right words in it, as a whole word, in any case",
+        "a model's answer has one of the right words in it, as a whole word, in any "
+        "case",
     ),
     BuiltIn(
         "task", "command", f"{_TASKS}.command:Command",
-        "a policy commands about the action that it commands in the clean scene: open loop, one picture, one action",
+        "a policy commands about the action that it commands in the clean scene: open "
+        "loop, one picture, one action",
     ),
     BuiltIn(
         "task", "rig", f"{_TASKS}.rig:Rig",
-        "several cameras take pictures of one configuration, and one prediction is made of what a model says of each",
+        "several cameras take pictures of one configuration, and one prediction is "
+        "made of what a model says of each",
     ),
     BuiltIn(
         "model source", "torchvision", f"{_MODELS}.zoo:load_torchvision",
@@ -334,7 +361,9 @@ BUILT_INS = (
 
 
 def is_present(module: str) -> bool:
-    """Return whether there is such a module. Neither it nor a package that it is in is imported."""
+    """Return whether there is such a module. Neither it nor a package that it is in is
+    imported.
+    """
     names = module.split(".")
     path: Sequence[str] | None = None
     for depth in range(1, len(names) + 1):
@@ -358,6 +387,10 @@ def _find_spec(module: str, path: Sequence[str] | None) -> ModuleSpec | None:
 
 @cache
 def list_built_ins(kind: str) -> dict[str, BuiltIn]:
-    """Return the built-in parts of one kind by name, without those whose module is missing."""
+    """Return the built-in parts of one kind by name, without those whose module is
+    missing.
+    """
     parts = (part for part in BUILT_INS if part.kind == kind)
-    return {part.name: part for part in parts if is_present(part.target.partition(":")[0])}
+    return {
+        part.name: part for part in parts if is_present(part.target.partition(":")[0])
+    }

@@ -1,8 +1,9 @@
 """The typed description of a run: what YAML files, flags and Python calls all become.
 
-Each setting states its flag, unit, range and default once; the command line's help and the docs are made from that
-(`settings`). Here is what many commands need to know, and what `render` does; the rest is with each question. Names of
-objects, controls, policies and the rest are checked by whoever looks them up, so that settings stay light.
+Each setting states its flag, unit, range and default once; the command line's help and
+the docs are made from that (`settings`). Here is what many commands need to know, and
+what `render` does; the rest is with each question. Names of objects, controls, policies
+and the rest are checked by whoever looks them up, so that settings stay light.
 """
 
 from __future__ import annotations
@@ -24,15 +25,22 @@ from advsearch.settings import values as written
 from advsearch.trust import powers
 
 FOLDERS = ("references", "state")
-"""Options that may be a folder or a file. It is kept by its absolute path, so that a run may go on from anywhere."""
+"""Options that may be a folder or a file. It is kept by its absolute path, so that a
+run may go on from anywhere.
+"""
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:
-    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping,
-    which may leave out the name `otherwise`."""
+    """Return a name, or a mapping with a `name` and options, from ``NAME``,
+    ``NAME={OPTION: VALUE}`` or such a mapping, which may leave out the name
+    `otherwise`.
+    """
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
-        value = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
+        value = {
+            "name": name,
+            **(options if isinstance(options, Mapping) else {"": options}),
+        }
     if not isinstance(value, Mapping):
         return value
     options = {option: given for option, given in value.items() if option != "name"}
@@ -45,26 +53,48 @@ def read_named(value: Any, setting: str, otherwise: str) -> Any:
 
 
 def read_joined(value: Any, setting: str, otherwise: str) -> Any:
-    """Return what `read_named` returns, of one or of several joined with + or in a list: the names with + between them,
-    and under each name its options: ``{"name": "detection+depth", "detection": {"iou": 0.7}}``."""
+    """Return what `read_named` returns, of one or of several joined with + or in a
+    list: the names with + between them, and under each name its options: ``{"name":
+    "detection+depth", "detection": {"iou": 0.7}}``.
+    """
     parts = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(parts, (list, tuple)) or len(parts) < 2:
         return read_named(value, setting, otherwise)
-    read = [read_named(part.strip() if isinstance(part, str) else part, setting, otherwise) for part in parts]
+    read = [
+        read_named(part.strip() if isinstance(part, str) else part, setting, otherwise)
+        for part in parts
+    ]
     mappings = [part if isinstance(part, Mapping) else {"name": part} for part in read]
-    names = [name for part in mappings if isinstance(name := part.get("name"), str) and name]
+    names = [
+        name for part in mappings if isinstance(name := part.get("name"), str) and name
+    ]
     if len(names) < len(read):
         return value
-    options = {part["name"]: {k: v for k, v in part.items() if k != "name"} for part in mappings if len(part) > 1}
+    options = {
+        part["name"]: {k: v for k, v in part.items() if k != "name"}
+        for part in mappings
+        if len(part) > 1
+    }
     last = options.get(names[-1], {})
-    if last.keys() <= set(names):  # as a command is written back: detection+depth={depth: {seek: gone}}
-        options = {**options, **last} if names[-1] in last else {**options, names[-1]: {}, **last}
-    return read_named({**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)}, setting, otherwise)
+    # as a command is written back: detection+depth={depth: {seek: gone}}
+    if last.keys() <= set(names):
+        options = (
+            {**options, **last}
+            if names[-1] in last
+            else {**options, names[-1]: {}, **last}
+        )
+    return read_named(
+        {**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)},
+        setting,
+        otherwise,
+    )
 
 
 def has_address(model: str) -> bool:
     """Whether a model's name is an address, or names one among several."""
-    return any(re.match("https?:", name, re.IGNORECASE) for name in written.split_names(model))
+    return any(
+        re.match("https?:", name, re.IGNORECASE) for name in written.split_names(model)
+    )
 
 
 def name_in(named: str | Mapping[str, object]) -> str:
@@ -73,25 +103,42 @@ def name_in(named: str | Mapping[str, object]) -> str:
 
 
 DEFAULT_ENVIRONMENT = "studio"
-"""What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
-SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
+"""What lights a scene of which nothing is said:
+`scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to.
+"""
+SEVERAL = (
+    "object",
+    "environment",
+    "model",
+    "labels",
+    "label",
+    "target",
+    "held_out",
+    "held_out_environment",
+)
 """The settings that may be several names, where a command takes several."""
 TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
-ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
+# controls as they are asked for: their names, each with its settings
+ControlsByName = dict[str, dict[str, object]]
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none, with the denoiser and without."""
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
-CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, while it is not clearly worse than the best
+# then a candidate is rendered so many times more, at most, while it is not clearly
+# worse than the best
+CLOSE_LOOKS = 4
 
 
 class SceneConfig(Config):
-    """What every command over a scene and a model needs to know. A file is looked for relative to the current
-    directory. None means "choose for me", and the description says how."""
+    """What every command over a scene and a model needs to know. A file is looked for
+    relative to the current directory. None means "choose for me", and the description
+    says how.
+    """
 
     free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
     default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
-    several: ClassVar[tuple[str, ...]] = ()  # which of object, environment and model may be several, with commas
+    # which of object, environment and model may be several, with commas
+    several: ClassVar[tuple[str, ...]] = ()
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
@@ -100,7 +147,8 @@ class SceneConfig(Config):
         ),
         Clash(
             "overwrite", lambda one: one.run is None,
-            "replaces the run that `run` names, and none is named; name it, or leave `overwrite` out",
+            "replaces the run that `run` names, and none is named; name it, or leave "
+            "`overwrite` out",
         ),
     )
 
@@ -109,7 +157,8 @@ class SceneConfig(Config):
     )
     environment: str | None = setting(
         None, "scene", "the environment map that lights the scene",
-        "the name of an environment, a .hdr or .exr file, the .yaml file of a place, or none",
+        "the name of an environment, a .hdr or .exr file, the .yaml file of a place, "
+        "or none",
         otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(
@@ -117,34 +166,45 @@ class SceneConfig(Config):
         otherwise="as the format says, or else the axis along which it stands best",
     )
     facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
-        None, "scene", "which axis of an imported object's file its front faces, turned towards +x here",
-        otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in others",
+        None, "scene", "which axis of an imported object's file its front faces, "
+                       "turned towards +x here",
+        otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in "
+                  "others",
     )
     size: float | None = setting(
-        None, "scene", "how large the object is: its longest side; distances are then in metres",
-        "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file says: glTF is in metres", ge=1e-4,
+        None, "scene", "how large the object is: its longest side; distances are then "
+                       "in metres",
+        "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file "
+                                                         "says: glTF is in metres", ge=1e-4,
         le=1e4,
     )
     unit: Literal["mm", "cm", "m", "in"] | None = setting(
-        None, "scene", "unit of the coordinates of the object's file, which says how large it is",
+        None, "scene", "unit of the coordinates of the object's file, which says how "
+                       "large it is",
         otherwise="as its file says: glTF is in metres",
     )
     camera: str | None = setting(
         None, "scene",
-        "which camera takes the picture: one of a scene file, or the one around the object, mounted somewhere or with "
+        "which camera takes the picture: one of a scene file, or the one around the "
+        "object, mounted somewhere or with "
         "a lens of its own",
-        "a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera file of "
+        "a name that advsearch import lists, orbit, dashcam, robot, fisheye, "
+        "equirectangular, or a camera file of "
         "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
-        metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* describes", min_length=1,
+        metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* "
+                                  "describes", min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
-        dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
+        dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may "
+                       "be repeated",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
         metavar="PARAMETER=VALUE",
     )
     things: str | None = setting(
-        None, "scene", "what stands beside the object, in metres from it: x forwards, y to its left",
-        "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after it, several with ; between them",
+        None, "scene", "what stands beside the object, in metres from it: x forwards, "
+                       "y to its left",
+        "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after "
+        "it, several with ; between them",
         flag="--with", otherwise="nothing",
     )
     judge: str = setting(
@@ -155,42 +215,50 @@ class SceneConfig(Config):
         0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
     )
     resolution: tuple[int, int] | None = setting(
-        None, "scene", "size of the rendered picture", "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
+        None, "scene", "size of the rendered picture", "SIDE or HEIGHTxWIDTH, each "
+                                                       "from 8 to 4096",
         otherwise="what the model takes", unit="pixels",
     )
 
     model: str = setting(
         "reference", "model", "the network under test",
-        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, an address such as "
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, "
+        "hf:REPOSITORY, an address such as "
         "http://localhost:8000, or package.module:callable",
     )
     labels: str | None = setting(
         None, "model", "names of the model's classes",
-        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, or the names with commas between "
+        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, "
+        "or the names with commas between "
         "them",
         metavar="FILE", otherwise="the model's own",
     )
     prompt: str | None = setting(
         None, "model",
-        "text for a model that takes text beside the picture: for CLIP what a picture is compared with, one text for "
+        "text for a model that takes text beside the picture: for CLIP what a picture "
+        "is compared with, one text for "
         "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?", metavar="TEXT",
     )
     value_range: tuple[float, float] | None = setting(
-        None, "model", "which values black and white have in the pictures that the model takes",
+        None, "model", "which values black and white have in the pictures that the "
+                       "model takes",
         "LOW,HIGH with LOW below HIGH, such as 0,255", otherwise="what the model says, or 0,1", metavar="LOW,HIGH",
     )
     ask: dict[str, float] = setting(
         dict, "model",
-        "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
-        "an answer (120), requests at_once (4), and the prices per_call, per_million_in and per_million_out; may be "
+        "a limit for a model behind an address, such as calls=500: calls (2000), "
+        "tokens and money of a run, seconds of "
+        "an answer (120), requests at_once (4), and the prices per_call, "
+        "per_million_in and per_million_out; may be "
         "repeated",
         "LIMIT=NUMBER", metavar="LIMIT=NUMBER",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification", "model",
-        "what the model does, and how its predictions are judged; for several models one task each, with + between "
+        "what the model does, and how its predictions are judged; for several models "
+        "one task each, with + between "
         "them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
@@ -200,7 +268,8 @@ class SceneConfig(Config):
     )
 
     controls: ControlsByName = setting(
-        lambda: {"texture": {}}, "search", "what may change in the scene, separated by commas",
+        lambda: {"texture": {}}, "search", "what may change in the scene, separated by "
+                                           "commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}", flag="--control", metavar="NAME",
         read_texts=written.read_controls, min_length=1,
     )
@@ -210,14 +279,17 @@ class SceneConfig(Config):
     )
     spp: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] | None = setting(
         None, "search",
-        "samples per pixel of a render of the search; auto takes half of the default, and renders the best candidates "
+        "samples per pixel of a render of the search; auto takes half of the default, "
+        "and renders the best candidates "
         "again while they are close",
-        "a whole number from 1 to 65536, or auto", otherwise="8 with the denoiser, 16 without", unit="samples",
+        "a whole number from 1 to 65536, or auto", otherwise="8 with the denoiser, 16 "
+                                                             "without", unit="samples",
     )
     denoise: Literal["oidn", "none"] = setting("oidn", "search", "denoiser of every render, in search and verification")
     pixel_sampler: Literal["independent", "multijitter"] = setting(
         "multijitter", "search",
-        "how samples are spread over a pixel, in search and verification; multijitter has less noise and rounds the "
+        "how samples are spread over a pixel, in search and verification; multijitter "
+        "has less noise and rounds the "
         "number of samples up to a product of two near numbers",
     )
 
@@ -225,29 +297,38 @@ class SceneConfig(Config):
         0, "run", "seed of all random numbers", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
     )
     threads: int | None = setting(None, "run", "number of processor threads", otherwise="all", ge=1, le=1024)
-    deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
+    deterministic: bool = setting(False, "run", "use one thread, so that a run repeats "
+                                                "bit for bit; slower")
     run: str | None = setting(
-        None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
+        None, "run", "where the run is stored", "a name (kept in runs/) or the path of "
+                                                "a folder",
         otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=powers.place,
     )
     # fmt: on
-    overwrite: bool = setting(False, "run", "replace a run that is already there", power=powers.replacing)
+    overwrite: bool = setting(
+        False, "run", "replace a run that is already there", power=powers.replacing
+    )
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
         for name in ("object", "environment", "model"):
-            names, tasks = written.split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
+            names = written.split_names(getattr(self, name) or "")
+            tasks = self.task_name.split(JOINED)
             if name == "model" and len(tasks) > 1:
                 if len(names) != len(tasks):
                     raise InputError(
-                        f"model: expected {len(tasks)} with commas between them, one for each of {', '.join(tasks)}, "
+                        f"model: expected {len(tasks)} with commas between them, one "
+                        f"for each of {', '.join(tasks)}, "
                         f"got {len(names)}"
                     )
                 continue
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
         if self.size is not None and len(self.objects) > 1:
-            raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
+            raise InputError(
+                "size: it is the size of one object, and there are "
+                "several; leave it out, or give `unit`"
+            )
         return self
 
     @property
@@ -270,13 +351,17 @@ class SceneConfig(Config):
 
     @property
     def kinds_of_controls(self) -> tuple[str, ...]:
-        """What says of which kind the controls are: their names, or the `kind` among their settings."""
+        """What says of which kind the controls are: their names, or the `kind` among
+        their settings.
+        """
         named = {**self.controls, **getattr(self, "over", {})}
         return tuple(str(given.get("kind", name)) for name, given in named.items())
 
     @property
     def search_spp(self) -> int:
-        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
+        """Samples a pixel of the search: what was asked for, or the default for the
+        denoiser.
+        """
         if self.spp == "auto":
             return SEARCH_SPP[self.denoise] // AUTO_SHARE
         return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
@@ -293,7 +378,9 @@ class SceneConfig(Config):
 
     @property
     def close_looks(self) -> int:
-        """Renders more of a search's best configurations, at most, while it is close between them."""
+        """Renders more of a search's best configurations, at most, while it is close
+        between them.
+        """
         return CLOSE_LOOKS if self.spp == "auto" else 0
 
     @property
@@ -303,7 +390,11 @@ class SceneConfig(Config):
     @property
     def models(self) -> tuple[str, ...]:
         """The models by name; those of several tasks are one together."""
-        return (self.model,) if JOINED in self.task_name else written.split_names(self.model)
+        return (
+            (self.model,)
+            if JOINED in self.task_name
+            else written.split_names(self.model)
+        )
 
     @field_validator(*TEXTS, mode="before", check_fields=False)
     @classmethod
@@ -323,7 +414,9 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        if isinstance(value, (list, tuple)) and all(isinstance(text, str) for text in value):
+        if isinstance(value, (list, tuple)) and all(
+            isinstance(text, str) for text in value
+        ):
             value = " | ".join(value)
         if isinstance(value, str) and not all(map(str.strip, value.split("|"))):
             raise ValueError("no text")
@@ -339,7 +432,10 @@ class SceneConfig(Config):
     def _controls_with_options(cls, value: Any) -> Any:
         if not isinstance(value, Mapping):
             return value
-        return {name: {} if options is None else options for name, options in by_key(value).items()}
+        return {
+            name: {} if options is None else options
+            for name, options in by_key(value).items()
+        }
 
     @field_validator("resolution", mode="before")
     @classmethod
@@ -347,7 +443,11 @@ class SceneConfig(Config):
         parts = value.lower().split("x") if isinstance(value, str) else value
         if isinstance(parts, int):
             parts = [parts]
-        return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
+        return (
+            [*parts, *parts]
+            if isinstance(parts, (list, tuple)) and len(parts) == 1
+            else parts
+        )
 
     @field_validator("resolution")
     @classmethod
@@ -363,7 +463,9 @@ class SceneConfig(Config):
 
     @field_validator("value_range")
     @classmethod
-    def _range_in_order(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+    def _range_in_order(
+        cls, value: tuple[float, float] | None
+    ) -> tuple[float, float] | None:
         if value is not None and value[0] >= value[1]:
             raise ValueError("out of order")
         return value
@@ -373,13 +475,17 @@ class SceneConfig(Config):
     def _numbers_from_text(cls, value: Any) -> Any:
         if not isinstance(value, Mapping):
             return value
-        return {name: written.number_or_text(given) for name, given in value.items()}  # YAML takes 1e-3 for text
+        # YAML takes 1e-3 for text
+        return {name: written.number_or_text(given) for name, given in value.items()}
 
 
 def one_only(name: str, names: Sequence[str]) -> InputError:
     """The error for several objects, environments or models where one is looked at."""
     listed = written.shown(",".join(names))
-    return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")
+    return InputError(
+        f"{name}: expected one {name}, got {listed}; give one, or "
+        "compare several with advsearch sweep"
+    )
 
 
 PICTURE_SPP = 64  # samples a pixel of a picture that is made to be looked at
@@ -387,7 +493,9 @@ PICTURES = (".png", ".exr")  # that can be written
 
 
 class RenderConfig(SceneConfig):
-    """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
+    """Everything that decides what `render` does: pictures of a scene, and what the
+    model says of them.
+    """
 
     command: ClassVar[str] = "render"
     without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
@@ -395,21 +503,25 @@ class RenderConfig(SceneConfig):
     # fmt: off
     controls: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict, group="picture",
-        description="what differs from the scene, separated by commas; a range stays where a search would start",
+        description="what differs from the scene, separated by commas; a range stays "
+                    "where a search would start",
         expects="names of controls, or NAME={PARAMETER: VALUE}", min_length=None,
     )
     around: int | None = setting(
-        None, "picture", "one sheet of so many views, from azimuths all around the object", otherwise="one view",
+        None, "picture", "one sheet of so many views, from azimuths all around the "
+                         "object", otherwise="one view",
         unit="views", ge=2, le=64,
     )
     spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
     aov: str | None = setting(
         None, "picture",
-        "write ground truth of each pixel, names separated by commas, as layers of an EXR beside the picture",
+        "write ground truth of each pixel, names separated by commas, as layers of an "
+        "EXR beside the picture",
         "names among mask, depth, normal, uv, id", otherwise="none", metavar="NAMES",
     )
     out: str = setting(
-        ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
+        ..., "picture", "the file to write: a .png holds what the model sees, an .exr "
+                        "linear radiance times the gain",
         "the path of a .png or .exr file",
     )
     # fmt: on
@@ -418,16 +530,23 @@ class RenderConfig(SceneConfig):
     @classmethod
     def _picture_file(cls, value: Any) -> Any:
         text = str(value) if isinstance(value, Path) else value
-        if not isinstance(text, str) or "\0" in text or Path(text).suffix.lower() not in PICTURES:
+        if (
+            not isinstance(text, str)
+            or "\0" in text
+            or Path(text).suffix.lower() not in PICTURES
+        ):
             raise ValueError("not a picture")
         return text
 
 
-LARGEST_EPSILON = 1e6  # no control has a distance of that size; far above it, its square is none in float32
+# no control has a distance of that size; far above it, its square is none in float32
+LARGEST_EPSILON = 1e6
 
 
 class DerivativeConfig(SceneConfig):
-    """What every command that differentiates a scene needs to know: budgets of the controls, and what is maximised."""
+    """What every command that differentiates a scene needs to know: budgets of the
+    controls, and what is maximised.
+    """
 
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
@@ -441,7 +560,8 @@ class DerivativeConfig(SceneConfig):
     object: str = setting_as_in(SceneConfig, "object", default="mug")
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
         None, "search",
-        "how far a control may move from its start, in its own unit (for several controls CONTROL=NUMBER,...; in "
+        "how far a control may move from its start, in its own unit (for several "
+        "controls CONTROL=NUMBER,...; in "
         "`attack` also NUMBER,NUMBER,... for a curve)",
         f"a number greater than 0 and at most {LARGEST_EPSILON:g}", otherwise="the control's own",
     )
@@ -450,7 +570,8 @@ class DerivativeConfig(SceneConfig):
     )
     estimators: dict[str, str] = setting(
         dict, "search", "force a gradient estimator",
-        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch check` shows the names",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch "
+        "check` shows the names",
         alias="estimator", flag="--estimator", metavar="NAME",
         read_texts=written.parse_choices,
     )
@@ -460,7 +581,8 @@ class DerivativeConfig(SceneConfig):
     )
     specialise: bool = setting(
         True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
-        switched="compute everything, also what this search does not need; `advsearch check` shows what is left out "
+        switched="compute everything, also what this search does not need; `advsearch "
+                 "check` shows what is left out "
         "otherwise",
     )
     # fmt: on
@@ -468,7 +590,9 @@ class DerivativeConfig(SceneConfig):
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
-        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in range, and none twice."""
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in
+        range, and none twice.
+        """
         if isinstance(value, str):
             parts = [part.strip() for part in value.split(",")]
             if "=" in value:
@@ -480,7 +604,11 @@ class DerivativeConfig(SceneConfig):
         if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
         numbers = value.values() if isinstance(value, Mapping) else value
-        numbers = numbers if isinstance(value, (Mapping, list, tuple)) else [1.0 if value is None else value]
+        numbers = (
+            numbers
+            if isinstance(value, (Mapping, list, tuple))
+            else [1.0 if value is None else value]
+        )
         read = [_positive(number) for number in numbers]
         if isinstance(value, (list, tuple)):
             written.check_once((f"{number:g}" for number in read), "epsilon")
@@ -499,7 +627,8 @@ def _positive(value: Any) -> float:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, OverflowError):
         raise ValueError("not a number") from None
-    if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
+    # what is smaller has no square in float32
+    if not 1e-30 < number <= LARGEST_EPSILON:
         raise ValueError("out of range")
     return number
 
@@ -509,7 +638,9 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted(registry.EXPERIMENTS, key=lambda name: (name not in FIRST, name)))
+        return iter(
+            sorted(registry.EXPERIMENTS, key=lambda name: (name not in FIRST, name))
+        )
 
     def __len__(self) -> int:
         return len(registry.EXPERIMENTS)
@@ -520,5 +651,6 @@ class _Configs(Mapping[str, type[Config]]):
 
 
 CONFIGS: Mapping[str, type[Config]] = _Configs()
-"""What the settings of each command are, in the order in which the docs show them; those of a question are read when
-somebody first asks for them."""
+"""What the settings of each command are, in the order in which the docs show them;
+those of a question are read when somebody first asks for them.
+"""

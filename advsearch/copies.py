@@ -1,4 +1,6 @@
-"""What code of others is handed is its own copy, so that nothing that it writes into is looked at again."""
+"""What code of others is handed is its own copy, so that nothing that it writes into is
+looked at again.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,11 @@ Value = TypeVar("Value")
 
 
 def copied(value: Value) -> Value:
-    """Return a copy of all tensors, with their graphs, and arrays in a value, and of the lists, mappings and
-    dataclasses that hold them. Anything else is as it is, and so is a dataclass that `gives_copies` of what it holds
-    (`Facts`) and a mapping that nobody can write into and that makes its values on demand."""
+    """Return a copy of all tensors, with their graphs, and arrays in a value, and of
+    the lists, mappings and dataclasses that hold them. Anything else is as it is, and
+    so is a dataclass that `gives_copies` of what it holds (`Facts`) and a mapping that
+    nobody can write into and that makes its values on demand.
+    """
     original: Any = value
     made: Any = original
     if hasattr(original, "requires_grad"):
@@ -34,10 +38,18 @@ def copied(value: Value) -> Value:
         made[:] = map(copied, original)
     elif isinstance(original, tuple):
         parts = map(copied, original)
-        made = type(original)(*parts) if hasattr(original, "_fields") else type(original)(parts)
+        made = (
+            type(original)(*parts)
+            if hasattr(original, "_fields")
+            else type(original)(parts)
+        )
     elif isinstance(original, SimpleNamespace):
         made = SimpleNamespace(**copied(vars(original)))
-    elif is_dataclass(original) and not isinstance(original, type) and not getattr(original, "gives_copies", False):
+    elif (
+        is_dataclass(original)
+        and not isinstance(original, type)
+        and not getattr(original, "gives_copies", False)
+    ):
         made = copy.copy(original)
         for field in fields(original):
             object.__setattr__(made, field.name, copied(getattr(original, field.name)))
@@ -50,8 +62,9 @@ def is_ours(kind: type) -> bool:
 
 
 def hand_copies(kind: type, **places: slice) -> None:
-    """Have methods that a class outside of this package defines called with copies of their arguments: by name, of
-    which after `self`, and of all by keyword."""
+    """Have methods that a class outside of this package defines called with copies of
+    their arguments: by name, of which after `self`, and of all by keyword.
+    """
     if is_ours(kind):
         return
     for name, which in places.items():

@@ -1,5 +1,7 @@
-"""Distributions of a parameter's values, as settings have them: those of `scipy.stats` by name, such as
-`{distribution: norm, loc: 30, scale: 10}`, choices with weights, and functions that only this session has."""
+"""Distributions of a parameter's values, as settings have them: those of `scipy.stats`
+by name, such as `{distribution: norm, loc: 30, scale: 10}`, choices with weights, and
+functions that only this session has.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,28 @@ from typing import Any
 
 from advsearch.errors import InputError
 
-DISTRIBUTION, CHOICES, WEIGHTS = "distribution", "choices", "weights"
+DISTRIBUTION = "distribution"
+CHOICES = "choices"
+WEIGHTS = "weights"
 FROM_PYTHON = "from Python"  # the name of one that no file can hold
-QUANTILES = (0.05, 0.5, 0.95)  # shares at which settings tell one function from another of its name
+# shares at which settings tell one function from another of its name
+QUANTILES = (0.05, 0.5, 0.95)
 
 
 class OwnQuantiles(dict[str, object]):
-    """What settings say of an inverse CDF from Python, from shares in [0, 1] to values, which it still has."""
+    """What settings say of an inverse CDF from Python, from shares in [0, 1] to values,
+    which it still has.
+    """
 
     def __init__(self, name: str, function: Callable[[float], float]) -> None:
         try:
             seen = [float(f"{float(function(share)):.6g}") for share in QUANTILES]
         except Exception as error:  # the user's code may raise anything
             raise InputError(
-                f"distribution {name}: expected a function from a share in [0, 1] to a value (an inverse CDF), or an "
-                f"object with such an `icdf` or `ppf`; it raised {type(error).__name__}: {error}"
+                f"distribution {name}: expected a function from a share in [0, 1] to a "
+                "value (an inverse CDF), or an "
+                "object with such an `icdf` or `ppf`; it raised "
+                f"{type(error).__name__}: {error}"
             ) from error
         super().__init__({DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": seen})
         self.function = function
@@ -35,7 +44,10 @@ def _loc_scale(d: Any) -> dict[str, Any]:
 
 
 TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
-    **{of: (to, _loc_scale) for of, to in (("Normal", "norm"), ("Laplace", "laplace"), ("Cauchy", "cauchy"))},
+    **{
+        of: (to, _loc_scale)
+        for of, to in (("Normal", "norm"), ("Laplace", "laplace"), ("Cauchy", "cauchy"))
+    },
     "Gumbel": ("gumbel_r", _loc_scale),
     "Uniform": ("uniform", lambda d: {"loc": d.low, "scale": d.high - d.low}),
     "LogNormal": ("lognorm", lambda d: {"s": d.scale, "scale": d.loc.exp()}),
@@ -50,15 +62,23 @@ TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
 
 
 def as_setting(given: object) -> object:
-    """Return what a file says of a parameter's distribution: one of torch, a frozen one of scipy, anything else with an
-    `icdf` or a `ppf`, a function from a share in [0, 1] to a value (an inverse CDF), or a mapping from choices to their
-    weights; anything else as it is. Raises InputError: it is of several numbers, or of whole ones, or a function that
-    is no inverse CDF."""
+    """Return what a file says of a parameter's distribution: one of torch, a frozen one
+    of scipy, anything else with an `icdf` or a `ppf`, a function from a share in [0, 1]
+    to a value (an inverse CDF), or a mapping from choices to their weights; anything
+    else as it is. Raises InputError: it is of several numbers, or of whole ones, or a
+    function that is no inverse CDF.
+    """
     if isinstance(given, Mapping):
-        weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in given.values()]  # numpy's, torch's
-        numbers = all(isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights)
+        # numpy's, torch's
+        weights = [
+            w.item() if getattr(w, "ndim", 1) == 0 else w for w in given.values()
+        ]
+        numbers = all(
+            isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
+        )
         if given and numbers and not given.keys() & {DISTRIBUTION, CHOICES}:
-            with suppress(OverflowError):  # of no float: whoever reads the setting says what it takes
+            # of no float: whoever reads the setting says what it takes
+            with suppress(OverflowError):
                 return {CHOICES: list(given), WEIGHTS: list(map(float, weights))}
         return given
     kind = type(given)
@@ -68,20 +88,33 @@ def as_setting(given: object) -> object:
     family = getattr(given, "dist", given)
     if hasattr(family, "pmf") and hasattr(family, "ppf"):
         raise InputError(
-            f"distribution {getattr(family, 'name', kind.__name__)}: expected one of real numbers, got one of whole "
+            f"distribution {getattr(family, 'name', kind.__name__)}: expected one of "
+            "real numbers, got one of whole "
             "ones; give its values as {choices: [...], weights: [...]}"
         )
     # one's own may have the name of scipy's, too
-    of_scipy = getattr(sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented)
+    of_scipy = getattr(
+        sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented
+    )
     if family is not given and type(family) is type(of_scipy):
         frozen: Any = given
         shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
-        names = [name.strip() for name in (frozen.dist.shapes or "").split(",") if name.strip()]
-        return _named(frozen.dist.name, {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale})
+        names = [
+            name.strip()
+            for name in (frozen.dist.shapes or "").split(",")
+            if name.strip()
+        ]
+        return _named(
+            frozen.dist.name,
+            {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale},
+        )
     quantile = getattr(given, "icdf", None) or getattr(given, "ppf", None)
     if quantile and kind.__module__.startswith("torch"):
         torch = sys.modules["torch"]  # it is there: the distribution is one of its own
-        return OwnQuantiles(kind.__name__, lambda share: float(quantile(torch.tensor(share, dtype=torch.float64))))
+        return OwnQuantiles(
+            kind.__name__,
+            lambda share: float(quantile(torch.tensor(share, dtype=torch.float64))),
+        )
     if quantile:
         return OwnQuantiles(kind.__name__, quantile)
     if callable(given) and not isinstance(given, type):
@@ -91,9 +124,13 @@ def as_setting(given: object) -> object:
 
 def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
     try:
-        return {DISTRIBUTION: name, **{key: float(f"{float(value):.12g}") for key, value in parameters.items()}}
+        return {
+            DISTRIBUTION: name,
+            **{key: float(f"{float(value):.12g}") for key, value in parameters.items()},
+        }
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
-            f"distribution {name}: expected one of a single number, got parameters of several; give one for each "
+            f"distribution {name}: expected one of a single number, got parameters of "
+            "several; give one for each "
             "parameter"
         ) from None

@@ -1,9 +1,10 @@
 """The one tree of errors that a user can cause.
 
 Every message says what was expected, what was got and what to do, and names the file or the setting as Python has it:
-``epsilon: ...`` at its beginning, and in backticks elsewhere, as in "use `denoise=none`" or "`grid` pose.yaw". The
-command line writes flags instead (`cli.flags.with_flags`) in one line on standard error, with exit status 2; anything
-but an `AdvsearchError` is a bug and keeps its traceback.
+``epsilon: ...`` at its beginning, and in backticks elsewhere, as in "use
+`denoise=none`" or "`grid` pose.yaw". The command line writes flags instead
+(`cli.flags.with_flags`) in one line on standard error, with exit status 2; anything but
+an `AdvsearchError` is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -15,40 +16,57 @@ from collections.abc import Iterable, Sequence
 FELL_SHORT = 3
 """Exit status of a command whose check fell short."""
 
-SIMILAR, SIMILAR_WORD = 0.6, 0.75  # least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
+# least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
+SIMILAR = 0.6
+SIMILAR_WORD = 0.75
 
 
 class AdvsearchError(Exception):
-    """Base of every error that is the input's fault or the machine's, not a bug of advsearch."""
+    """Base of every error that is the input's fault or the machine's, not a bug of
+    advsearch.
+    """
 
 
 class InputError(AdvsearchError):
-    """A value given on the command line, in a file or in a call is outside what is allowed."""
+    """A value given on the command line, in a file or in a call is outside what is
+    allowed.
+    """
 
 
 class UnknownNameError(InputError):
-    """A name of a kind ("object", say) that is not among the known ones; the message lists near matches, and may end in
-    a hint: a sentence about how to give a path instead, say."""
+    """A name of a kind ("object", say) that is not among the known ones; the message
+    lists near matches, and may end in a hint: a sentence about how to give a path
+    instead, say.
+    """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
+    def __init__(
+        self, kind: str, name: str, known: Iterable[str], hint: str = ""
+    ) -> None:
         names = sorted(known)
         near = resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-        listed, more = ", ".join(names) or "none", f" {hint}" if hint else ""
+        listed = ", ".join(names) or "none"
+        more = f" {hint}" if hint else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {listed}.{more}")
         self.near = tuple(near)
 
 
 class FileFormatError(InputError):
-    """A file that is missing, empty, truncated, or not what it should be. The message names the path."""
+    """A file that is missing, empty, truncated, or not what it should be. The message
+    names the path.
+    """
 
 
 class ModelError(AdvsearchError):
-    """A model that cannot be loaded, or whose output is not logits of shape (N, classes)."""
+    """A model that cannot be loaded, or whose output is not logits of shape (N,
+    classes).
+    """
 
 
 class CodeNotAllowedError(InputError, ModelError):
-    """Python code, weights or an address that only a file names, and that a person has to allow."""
+    """Python code, weights or an address that only a file names, and that a person has
+    to allow.
+    """
 
 
 class RunExistsError(InputError):
@@ -56,11 +74,15 @@ class RunExistsError(InputError):
 
 
 class StorageError(AdvsearchError):
-    """The run directory cannot be written (full disk, read-only file system, no permission)."""
+    """The run directory cannot be written (full disk, read-only file system, no
+    permission).
+    """
 
 
 class EnvironmentSetupError(AdvsearchError):
-    """A part of the machine is missing or unusable (no usable LLVM, say). The message holds the command to type."""
+    """A part of the machine is missing or unusable (no usable LLVM, say). The message
+    holds the command to type.
+    """
 
 
 class ClusterError(AdvsearchError):
@@ -68,12 +90,19 @@ class ClusterError(AdvsearchError):
 
 
 def resembling(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are like `name`, whatever their case, best first. First those with all of its words
-    ("coffee mug" for "mug"; a plural s is no difference), then those with words that begin like them, then those that
-    contain it; of equals, those with fewer other words, and with its last word last. Where there is none, those of
-    nearly the same spelling, as a whole or in one word."""
-    asked, names = _words(name), list(dict.fromkeys(known))
-    ranks = {known: rank for known in names if (rank := _rank(asked, _words(known))) is not None}
+    """Return the known names that are like `name`, whatever their case, best first.
+    First those with all of its words ("coffee mug" for "mug"; a plural s is no
+    difference), then those with words that begin like them, then those that contain it;
+    of equals, those with fewer other words, and with its last word last. Where there is
+    none, those of nearly the same spelling, as a whole or in one word.
+    """
+    asked = _words(name)
+    names = list(dict.fromkeys(known))
+    ranks = {
+        known: rank
+        for known in names
+        if (rank := _rank(asked, _words(known))) is not None
+    }
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
@@ -83,11 +112,16 @@ def resembling(name: str, known: Iterable[str]) -> list[str]:
 
 def _words(name: str) -> list[str]:
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
-    return [re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word for word in words]
+    return [
+        re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word
+        for word in words
+    ]
 
 
 def _rank(asked: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
-    """Where a name with these words stands among those that are like what was asked for; None if it isn't."""
+    """Where a name with these words stands among those that are like what was asked
+    for; None if it isn't.
+    """
     if not asked or not words:
         return None
     place = len(words) - len(asked), words[-1] != asked[-1]
@@ -99,10 +133,19 @@ def _rank(asked: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
 
 
 def _similarity(asked: difflib.SequenceMatcher[str], name: str) -> float:
-    """How near a name's spelling is to what was asked for, as a whole or in one word; 0 where it is not."""
+    """How near a name's spelling is to what was asked for, as a whole or in one word; 0
+    where it is not.
+    """
     best = 0.0
-    for text, least in [(name.casefold(), SIMILAR), *((word, SIMILAR_WORD) for word in _words(name))]:
+    for text, least in [
+        (name.casefold(), SIMILAR),
+        *((word, SIMILAR_WORD) for word in _words(name)),
+    ]:
         asked.set_seq1(text)
-        if asked.real_quick_ratio() >= least and asked.quick_ratio() >= least and asked.ratio() >= least:
+        if (
+            asked.real_quick_ratio() >= least
+            and asked.quick_ratio() >= least
+            and asked.ratio() >= least
+        ):
             best = max(best, asked.ratio())
     return best

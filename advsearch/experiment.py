@@ -1,11 +1,13 @@
-"""An experiment: a function that answers a question about a model, with its settings and its result.
+"""An experiment: a function that answers a question about a model, with its settings
+and its result.
 
     @experiment("count --runs mug-texture-001", positional_args=("runs",))
     def count(context: RunContext[CountConfig]) -> CountResult: ...
 
-The command, the Python function, the run directory and the page are made from it. Built-in experiments are listed in
-`advsearch.catalog`; a package adds its own by an entry point of the group `advsearch.experiments`. The module of an
-experiment imports what is heavy inside functions, since the command line reads it for its help.
+The command, the Python function, the run directory and the page are made from it.
+Built-in experiments are listed in `advsearch.catalog`; a package adds its own by an
+entry point of the group `advsearch.experiments`. The module of an experiment imports
+what is heavy inside functions, since the command line reads it for its help.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ SHARED_RESULT_FIELDS = {
     "policy": "policy_name",
     "seed": "seed",
 }
-"""Fields of a result that are filled from the settings, with the attribute of the settings."""
+"""Fields of a result that are filled from the settings, with the attribute of the
+settings.
+"""
 
 PYTHON_TYPES = {
     "object": "Scene | str | Path",
@@ -58,7 +62,8 @@ PYTHON_TYPES = {
 
 
 class RunContext(ExitStack, Generic[Settings]):
-    """What the function of an experiment works with: settings, progress, and the run directory.
+    """What the function of an experiment works with: settings, progress, and the run
+    directory.
 
     Attributes:
         config: the settings.
@@ -67,7 +72,12 @@ class RunContext(ExitStack, Generic[Settings]):
         ending: how the run ends, "done" or "interrupted".
     """
 
-    def __init__(self, config: Settings, progress: Progress | None = None, resumed: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: Settings,
+        progress: Progress | None = None,
+        resumed: Path | None = None,
+    ) -> None:
         super().__init__()
         self.config = config
         self.progress = progress or NullProgress()
@@ -77,7 +87,9 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @cached_property
     def run(self) -> RunDirectory:
-        """The run directory. The first access creates it, so check everything that may be wrong before."""
+        """The run directory. The first access creates it, so check everything that may
+        be wrong before.
+        """
         return self.enter_context(RunDirectory.of(self.config, self.resumed))
 
     @cached_property
@@ -92,7 +104,9 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:
-        """Run a block that Ctrl-C ends; the experiment continues behind it with `ending` "interrupted"."""
+        """Run a block that Ctrl-C ends; the experiment continues behind it with
+        `ending` "interrupted".
+        """
         try:
             with interruptible():
                 yield
@@ -100,23 +114,32 @@ class RunContext(ExitStack, Generic[Settings]):
             self.ending = INTERRUPTED
 
     def run_part(self, name: str, config: Config) -> Result:
-        """Run an experiment in a folder of its own within this run, or read its result if it has ended."""
-        return run_part(RunDirectory.locate_part(self.run.path, name), config, self.progress)
+        """Run an experiment in a folder of its own within this run, or read its result
+        if it has ended.
+        """
+        return run_part(
+            RunDirectory.locate_part(self.run.path, name), config, self.progress
+        )
 
     def open_measurements(self, seconds: float | None = None) -> Measurements:
-        """Return what the run has measured, and what measures the rest; none begins after so many seconds."""
+        """Return what the run has measured, and what measures the rest; none begins
+        after so many seconds.
+        """
         return Measurements(self, seconds)
 
     @property
     def machine(self) -> dict[str, Any]:
-        """What measured times depend on: the processor's name, and the cores that this process may use."""
+        """What measured times depend on: the processor's name, and the cores that this
+        process may use.
+        """
         return {"cpu": threads.read_processor_name(), "cores": threads.cores()}
 
     def result(self, result_type: type[Made], **fields: Any) -> Made:
         """Return a result with the given fields and those that every result has.
 
-        These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it ended, the command line and the
-        total seconds, which are added to the `seconds` that are given.
+        These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it
+        ended, the command line and the total seconds, which are added to the `seconds`
+        that are given.
         """
         settings = self.config
         shared = {
@@ -127,7 +150,10 @@ class RunContext(ExitStack, Generic[Settings]):
         for name in ("objects", "controls"):
             if name in shared:
                 shared[name] = list(shared[name])
-        seconds = {"total": time.perf_counter() - self._start_time, **fields.pop("seconds", {})}
+        seconds = {
+            "total": time.perf_counter() - self._start_time,
+            **fields.pop("seconds", {}),
+        }
         shared |= {
             "run": str(self.run.path),
             "ending": self.ending,
@@ -138,21 +164,29 @@ class RunContext(ExitStack, Generic[Settings]):
         return result_type(**{**shared, **fields})
 
 
-def run_and_save(function: Callable[[RunContext[Settings]], AnyResult], context: RunContext[Settings]) -> AnyResult:
-    """Call the function of an experiment, and save its result, page and figure in its run directory.
+def run_and_save(
+    function: Callable[[RunContext[Settings]], AnyResult], context: RunContext[Settings]
+) -> AnyResult:
+    """Call the function of an experiment, and save its result, page and figure in its
+    run directory.
 
-    Nothing is saved where the function made no run through the context: then it has saved its result itself.
+    Nothing is saved where the function made no run through the context: then it has
+    saved its result itself.
     """
     with context:
         result = function(context)
         if not context.has_run:
             return result
         for suffix, data in result_figure(shown(result)).items():
-            write_bytes(context.run.path / "images" / f"{context.config.command}.{suffix}", data)
+            write_bytes(
+                context.run.path / "images" / f"{context.config.command}.{suffix}", data
+            )
         return keep_result(context.run, result)
 
 
-def run_experiment(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
+def run_experiment(
+    config: Config, *, progress: Progress | None = None, resumed: Path | None = None
+) -> Result:
     """Run the experiment that the settings are of.
 
     Args:
@@ -167,22 +201,31 @@ def run_experiment(config: Config, *, progress: Progress | None = None, resumed:
 
     check_names(config)
     writes_run = resumed is None and getattr(config, "out", None) is None
-    # The folder is made before heavy imports, so that a run that is stopped early can be listed.
+    # The folder is made before heavy imports, so that a run that is stopped early can
+    # be listed.
     with begun(config) if writes_run else nullcontext(resumed) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
 
 
 def find_stopped_run(config: Config) -> Path | None:
-    """Return the folder of the run that the settings name; None where there is none yet."""
+    """Return the folder of the run that the settings name; None where there is none
+    yet.
+    """
     place, _ = config.place
     if place is None or not is_run(run_path(place)):
         return None
     return run_path(place)
 
 
-def run_part(folder: Path, config: Config, progress: Progress, run: Callable[..., Result] | None = None) -> Result:
-    """Run an experiment in a folder, continue it there, or read its result if it has ended.
+def run_part(
+    folder: Path,
+    config: Config,
+    progress: Progress,
+    run: Callable[..., Result] | None = None,
+) -> Result:
+    """Run an experiment in a folder, continue it there, or read its result if it has
+    ended.
 
     Args:
         folder: of the run; a run that has begun there keeps its own settings.
@@ -192,10 +235,17 @@ def run_part(folder: Path, config: Config, progress: Progress, run: Callable[...
     """
     run = run or run_experiment
     if not is_run(folder) or not (folder / CONFIG).is_file():
-        return run(config.model_copy(update={"run": str(folder), "overwrite": True}), progress=progress)
+        return run(
+            config.model_copy(update={"run": str(folder), "overwrite": True}),
+            progress=progress,
+        )
     if finished(folder):
         return read_result(folder)
-    return run(type(config).from_yaml(folder / CONFIG, config.asked), progress=progress, resumed=folder)
+    return run(
+        type(config).from_yaml(folder / CONFIG, config.asked),
+        progress=progress,
+        resumed=folder,
+    )
 
 
 class PositionalArgument(NamedTuple):
@@ -213,7 +263,8 @@ def succeed(result: Any) -> int:
 
 @dataclass(frozen=True)
 class Experiment(Generic[AnyResult]):
-    """An experiment: its function, the classes of its settings and its result, and how it is presented.
+    """An experiment: its function, the classes of its settings and its result, and how
+    it is presented.
 
     Attributes:
         function: ``(context: RunContext[NameConfig]) -> NameResult``.
@@ -222,22 +273,31 @@ class Experiment(Generic[AnyResult]):
         examples: lines of a shell for its help, without `advsearch`.
         positional_args: settings that the Python function takes by position.
         about: the setting that names a run or a file which the experiment is about.
-        positional: how the command line takes `about` without its flag; None for not at all.
-        defaults_from_run: ``(run.yaml, typed arguments) -> settings`` that the run in `about` provides.
-        python_function: "module:function" that Python calls, where it is not the one made of the settings.
-        python_arguments: "module:function" whose keyword-only parameters Python callers may pass beside settings; those
-            that they pass go to `function`. A positional setting that is among them may be a loaded object.
-        resumes_in_python: whether Python callers may continue the run that `run` names, with `resume=True`.
+        positional: how the command line takes `about` without its flag; None for not at
+            all.
+        defaults_from_run: ``(run.yaml, typed arguments) -> settings`` that the run in
+            `about` provides.
+        python_function: "module:function" that Python calls, where it is not the one
+            made of the settings.
+        python_arguments: "module:function" whose keyword-only parameters Python callers
+            may pass beside settings; those that they pass go to `function`. A
+            positional setting that is among them may be a loaded object.
+        resumes_in_python: whether Python callers may continue the run that `run` names,
+            with `resume=True`.
         help_suffix: what its help adds to the line in the catalog.
         exit_status: ``result -> int``, the exit status of the command.
-        choices: "module:function" that returns the names that `about` may have, each with a line of help.
-        choice_description: "module:function" from one of these names to a text and its facts as JSON values, for
-            `advsearch show`.
-        view: ``result -> ShownResult``, what terminal, page and notebook show; None shows all fields.
+        choices: "module:function" that returns the names that `about` may have, each
+            with a line of help.
+        choice_description: "module:function" from one of these names to a text and its
+            facts as JSON values, for `advsearch show`.
+        view: ``result -> ShownResult``, what terminal, page and notebook show; None
+            shows all fields.
         claims: ``result -> claims`` that a run supports, for `advsearch report`.
-        triggering: ``result -> lines``, conditions under which the model is wrong more often, for `advsearch report`.
-        noted_settings: ``(run, result) -> {kind: {name: settings}}`` of what a run tried beside its own settings, as it
-            noted them, for `advsearch report`; a kind is missing where its note cannot be read.
+        triggering: ``result -> lines``, conditions under which the model is wrong more
+            often, for `advsearch report`.
+        noted_settings: ``(run, result) -> {kind: {name: settings}}`` of what a run
+            tried beside its own settings, as it noted them, for `advsearch report`; a
+            kind is missing where its note cannot be read.
         page: ``(run, result) -> HTML or None``, for a page of its own kind.
         other_results: further classes of results, each by a field that it alone has.
     """
@@ -260,15 +320,26 @@ class Experiment(Generic[AnyResult]):
     view: Callable[[Any], ShownResult] | None = None
     claims: Callable[[Any], Iterable[Claim]] | None = None
     triggering: Callable[[Any], Iterable[str]] | None = None
-    noted_settings: Callable[[Path, Any], Mapping[str, Mapping[str, Mapping[str, Any]]]] | None = None
+    noted_settings: (
+        Callable[[Path, Any], Mapping[str, Mapping[str, Mapping[str, Any]]]] | None
+    ) = None
     page: Callable[[Path, Any], str | None] | None = None
     other_results: Mapping[str, type[Result]] = field(default_factory=dict)
 
     def run(
-        self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **arguments: Any
+        self,
+        config: Any,
+        *,
+        progress: Progress | None = None,
+        resumed: Path | None = None,
+        **arguments: Any,
     ) -> AnyResult:
-        """Run the experiment with settings, and save its result; `arguments` go to the function."""
-        return run_and_save(partial(self.function, **arguments), RunContext(config, progress, resumed))
+        """Run the experiment with settings, and save its result; `arguments` go to the
+        function.
+        """
+        return run_and_save(
+            partial(self.function, **arguments), RunContext(config, progress, resumed)
+        )
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
         result: AnyResult = self.python(*args, **settings)
@@ -288,21 +359,41 @@ class Experiment(Generic[AnyResult]):
         kinds = inspect.Parameter
         own = self._find_python_arguments()
 
-        def function(*args: Any, progress: Any = None, resume: bool = False, **settings: Any) -> AnyResult:
+        def function(
+            *args: Any, progress: Any = None, resume: bool = False, **settings: Any
+        ) -> AnyResult:
             given = {**dict(zip(self.positional_args, args, strict=False)), **settings}
             arguments = {name: given[name] for name in own if name in given}
-            given = {name: value for name, value in given.items() if name not in own or name in self.positional_args}
+            given = {
+                name: value
+                for name, value in given.items()
+                if name not in own or name in self.positional_args
+            }
             config = configured(self.settings, **given)
             resumed = find_stopped_run(config) if resume else None
-            return self.run(config, progress=watcher(progress), resumed=resumed, **arguments)
+            return self.run(
+                config, progress=watcher(progress), resumed=resumed, **arguments
+            )
 
-        parameters = [self._make_positional_parameter(name) for name in self.positional_args]
-        parameters += [parameter for name, parameter in own.items() if name not in self.positional_args]
+        parameters = [
+            self._make_positional_parameter(name) for name in self.positional_args
+        ]
+        parameters += [
+            parameter
+            for name, parameter in own.items()
+            if name not in self.positional_args
+        ]
         if self.resumes_in_python:
-            parameters.append(kinds("resume", kinds.KEYWORD_ONLY, default=False, annotation="bool"))
-        parameters.append(kinds("progress", kinds.KEYWORD_ONLY, default=None, annotation="Watched"))
+            parameters.append(
+                kinds("resume", kinds.KEYWORD_ONLY, default=False, annotation="bool")
+            )
+        parameters.append(
+            kinds("progress", kinds.KEYWORD_ONLY, default=None, annotation="Watched")
+        )
         parameters.append(kinds("settings", kinds.VAR_KEYWORD))
-        signature = inspect.Signature(parameters, return_annotation=self.result.__name__)
+        signature = inspect.Signature(
+            parameters, return_annotation=self.result.__name__
+        )
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__ = self.settings.command
         function.__qualname__ = self.settings.command
@@ -311,26 +402,40 @@ class Experiment(Generic[AnyResult]):
         return asks(self.settings)(function)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters that Python callers may pass beside settings, by name."""
+        """Return the parameters that Python callers may pass beside settings, by
+        name.
+        """
         if not self.python_arguments:
             return {}
-        parameters = inspect.signature(registry.imported(self.python_arguments)).parameters
-        return {name: one for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
+        parameters = inspect.signature(
+            registry.imported(self.python_arguments)
+        ).parameters
+        return {
+            name: one
+            for name, one in parameters.items()
+            if one.kind is one.KEYWORD_ONLY
+        }
 
     def _make_positional_parameter(self, name: str) -> inspect.Parameter:
         setting = self.settings.model_fields[name]
         return inspect.Parameter(
             name,
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=inspect.Parameter.empty if setting.is_required() else setting.default,
+            default=inspect.Parameter.empty
+            if setting.is_required()
+            else setting.default,
             annotation=PYTHON_TYPES.get(name, "str | Path"),
         )
 
 
-def experiment(*examples: str, **attributes: Any) -> Callable[[Callable[..., AnyResult]], Experiment[AnyResult]]:
-    """Make an `Experiment` of a function ``(context: RunContext[NameConfig]) -> NameResult``.
+def experiment(
+    *examples: str, **attributes: Any
+) -> Callable[[Callable[..., AnyResult]], Experiment[AnyResult]]:
+    """Make an `Experiment` of a function ``(context: RunContext[NameConfig]) ->
+    NameResult``.
 
-    Settings and result are read from the annotations; of a union of results the first is the main one.
+    Settings and result are read from the annotations; of a union of results the first
+    is the main one.
 
     Args:
         examples: lines of a shell for its help, without `advsearch`.

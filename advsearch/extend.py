@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
     from advsearch.controls.support import images as images
-    from advsearch.controls.support.picture_control import PictureControl as PictureControl
+    from advsearch.controls.support.picture_control import (
+        PictureControl as PictureControl,
+    )
     from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import InputError as InputError

@@ -1,4 +1,6 @@
-"""Names of files: their endings, and how a sentence lists them; and the types of what JSON holds."""
+"""Names of files: their endings, and how a sentence lists them; and the types of what
+JSON holds.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +9,23 @@ from collections.abc import Sequence
 
 from advsearch.catalog import list_built_ins
 
-JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None  # whatever JSON can hold
-JsonObject = dict[str, JsonValue]  # A JSON object, before a type has taken it or once it has been written out
-MESHES = tuple(f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter")))
-"""Endings of the files that an object can be read from, but for those of other packages' readers."""
+# whatever JSON can hold
+JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
+# A JSON object, before a type has taken it or once it has been written out
+JsonObject = dict[str, JsonValue]
+MESHES = tuple(
+    f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter"))
+)
+"""Endings of the files that an object can be read from, but for those of other
+packages' readers.
+"""
 
 
 def either(names: Sequence[str], word: str = "or") -> str:
     """Return names as a sentence lists them: ".a, .b or .c"."""
-    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
+    return f" {word} ".join(
+        [*([", ".join(names[:-1])] if names[1:] else []), names[-1]]
+    )
 
 
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
@@ -23,9 +33,13 @@ PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
 
 
 def split_paths(name: str) -> list[str]:
-    """Return both parts of ``camera.csv+object.csv``, ``approach+object.csv`` or ``camera.csv+orbit``, the path of the
-    camera and that of the object; any other name as it is."""
+    """Return both parts of ``camera.csv+object.csv``, ``approach+object.csv`` or
+    ``camera.csv+orbit``, the path of the camera and that of the object; any other name
+    as it is.
+    """
     first, _, second = name.partition("+")
     camera, thing = (one.lower().endswith(PATH_ENDINGS) for one in (first, second))
-    both = second and (camera or (thing and "/" not in first)) and not os.path.isfile(name)
+    both = (
+        second and (camera or (thing and "/" not in first)) and not os.path.isfile(name)
+    )
     return [first, second] if both else [name]

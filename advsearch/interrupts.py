@@ -1,6 +1,8 @@
-"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code may come to nothing, and
-modules that are being imported make other errors of it. So all that renders, asks a model, waits for workers or tells
-how far it is looks (`INTERRUPTS.look`) whether there was one that nobody has handled."""
+"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code
+may come to nothing, and modules that are being imported make other errors of it. So all
+that renders, asks a model, waits for workers or tells how far it is looks
+(`INTERRUPTS.look`) whether there was one that nobody has handled.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-ONE = 0.5  # seconds within which a second signal is the same Ctrl-C: programs pass on what the terminal has sent to all
+# seconds within which a second signal is the same Ctrl-C: programs pass on what the
+# terminal has sent to all
+ONE = 0.5
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts signals; once it has `ended`, nothing is left to interrupt."""
+    """A handler of Ctrl-C as Python's own, which counts signals; once it has `ended`,
+    nothing is left to interrupt.
+    """
 
     def __init__(self) -> None:
         self.count = self.handled = 0
@@ -26,7 +32,8 @@ class Interrupts:
         self._last = -ONE
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        before, self._last = self._last, time.monotonic()
+        before = self._last
+        self._last = time.monotonic()
         if self._last - before < ONE:
             return
         self.count += 1
@@ -39,7 +46,9 @@ class Interrupts:
         return self.count > self.handled
 
     def look(self) -> None:
-        """Raise an interrupt that has come already and was not handled; in the main thread, where it belongs."""
+        """Raise an interrupt that has come already and was not handled; in the main
+        thread, where it belongs.
+        """
         if self.waiting and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
@@ -49,11 +58,14 @@ INTERRUPTS = Interrupts()  # those of this process
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise an interrupt that comes inside the block, whatever was made of it, once: what follows the block handles it.
-    Raises KeyboardInterrupt where one waits at the end of the block, and in place of any error inside it."""
+    """Raise an interrupt that comes inside the block, whatever was made of it, once:
+    what follows the block handles it. Raises KeyboardInterrupt where one waits at the
+    end of the block, and in place of any error inside it.
+    """
     handler = signal.getsignal(signal.SIGINT)
     in_main = threading.current_thread() is threading.main_thread()
-    counted = in_main and handler is signal.default_int_handler  # where Python's own would raise them: in a notebook
+    # where Python's own would raise them: in a notebook
+    counted = in_main and handler is signal.default_int_handler
     if counted:
         INTERRUPTS.handled = INTERRUPTS.count
         signal.signal(signal.SIGINT, INTERRUPTS)
@@ -74,13 +86,17 @@ def interruptible() -> Iterator[None]:
 
 
 def end_at_the_second() -> None:
-    """Let a second Ctrl-C end this process at once, wherever it is: a thread hears of it, also while native code runs.
-    What is stored is kept, as with a kill. Call it in the main thread, once."""
+    """Let a second Ctrl-C end this process at once, wherever it is: a thread hears of
+    it, also while native code runs. What is stored is kept, as with a kill. Call it in
+    the main thread, once.
+    """
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     # `theirs` must live as long as the thread
-    threading.Thread(target=_hear, args=(ours, theirs), name="interrupts", daemon=True).start()
+    threading.Thread(
+        target=_hear, args=(ours, theirs), name="interrupts", daemon=True
+    ).start()
 
 
 def _hear(ours: socket.socket, theirs: socket.socket) -> None:
@@ -91,12 +107,15 @@ def _hear(ours: socket.socket, theirs: socket.socket) -> None:
         now = time.monotonic()
         if first is not None and now - first >= ONE and not INTERRUPTS.ended:
             with suppress(OSError):
-                os.write(2, b"\x1b[?25h" * os.isatty(2) + b"advsearch: interrupted\n")  # bars hide the cursor
+                # bars hide the cursor
+                os.write(2, b"\x1b[?25h" * os.isatty(2) + b"advsearch: interrupted\n")
             os._exit(128 + signal.SIGINT)
         first = now if first is None else first
 
 
 def unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
-    """Tell an exception that a destructor or a callback could not raise, but for an interrupt: that is counted."""
+    """Tell an exception that a destructor or a callback could not raise, but for an
+    interrupt: that is counted.
+    """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

@@ -1,11 +1,13 @@
-"""Losses for an objective or a loop of one's own, ready to be added up: `advsearch.losses`.
+"""Losses for an objective or a loop of one's own, ready to be added up:
+`advsearch.losses`.
 
     def smooth(logits, images, labels, texture):
         return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
 
-Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or the indices of a label set of
-which every label is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
-differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.judging`.
+Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or
+the indices of a label set of which every label is right; each is an objective by
+itself. Those of colours are a **cost**. All return (N,) and are differentiable;
+formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.judging`.
 """
 
 from __future__ import annotations
@@ -25,37 +27,48 @@ __all__ = [
     "total_variation",
 ]  # fmt: skip
 
-Labels = Tensor | Sequence[int]  # (N,) int64, the right label of each picture; or indices, all of which are right
+# (N,) int64, the right label of each picture; or indices, all of which are right
+Labels = Tensor | Sequence[int]
 
 
-# ---- of logits (N, C), to be maximised ------------------------------------------------------------------------------
+# ---- of logits (N, C), to be maximised
+# ------------------------------------------------------------------------------
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:
-    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where the prediction is wrong."""
+    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where
+    the prediction is wrong.
+    """
     return _by_label(of_logits.margin, logits, labels)
 
 
 def targeted_margin(logits: Tensor, target: Labels) -> Tensor:
-    """The largest logit of the target minus the largest other one, (N,): over 0 exactly where the prediction is
-    there."""
+    """The largest logit of the target minus the largest other one, (N,): over 0 exactly
+    where the prediction is there.
+    """
     return _by_label(of_logits.targeted_margin, logits, target)
 
 
-def carlini_wagner(logits: Tensor, labels: Labels, *, confidence: float = 0.0) -> Tensor:
-    """`margin`, but no more than a confidence: beyond it, other terms alone are followed (Carlini and Wagner 2017, f_6
-    with its hinge)."""
+def carlini_wagner(
+    logits: Tensor, labels: Labels, *, confidence: float = 0.0
+) -> Tensor:
+    """`margin`, but no more than a confidence: beyond it, other terms alone are
+    followed (Carlini and Wagner 2017, f_6 with its hinge).
+    """
     return margin(logits, labels).clamp(max=confidence)
 
 
-def targeted_carlini_wagner(logits: Tensor, target: Labels, *, confidence: float = 0.0) -> Tensor:
+def targeted_carlini_wagner(
+    logits: Tensor, target: Labels, *, confidence: float = 0.0
+) -> Tensor:
     """`targeted_margin`, but no more than a confidence; see `carlini_wagner`."""
     return targeted_margin(logits, target).clamp(max=confidence)
 
 
 def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
-    """Minus the logarithm of the probability of the right labels, (N,), in nats; that of torch for one right label,
-    but with a gradient where the model is sure."""
+    """Minus the logarithm of the probability of the right labels, (N,), in nats; that
+    of torch for one right label, but with a gradient where the model is sure.
+    """
     return _by_label(of_logits.cross_entropy, logits, labels)
 
 
@@ -75,40 +88,48 @@ def targeted_log_odds(logits: Tensor, target: Labels) -> Tensor:
 
 
 def dlr(logits: Tensor, labels: Labels) -> Tensor:
-    """`margin` over a distance between logits, (N,): difference of logits ratio (Croce and Hein 2020, section 4)."""
+    """`margin` over a distance between logits, (N,): difference of logits ratio (Croce
+    and Hein 2020, section 4).
+    """
     return _by_label(of_logits.dlr, logits, labels)
 
 
 def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
-    """`targeted_margin` over a distance between logits, (N,) (Croce and Hein 2020, section 4)."""
+    """`targeted_margin` over a distance between logits, (N,) (Croce and Hein 2020,
+    section 4).
+    """
     return _by_label(of_logits.targeted_dlr, logits, target)
 
 
-# ---- of colours (N, h, w, 3), a cost --------------------------------------------------------------------------------
+# ---- of colours (N, h, w, 3), a cost
+# --------------------------------------------------------------------------------
 
 
 def total_variation(colors: Tensor) -> Tensor:
-    """Mean length of the step from a pixel to its right and lower neighbours, by channel, (N,), in sRGB.
+    """Mean length of the step from a pixel to its right and lower neighbours, by
+    channel, (N,), in sRGB.
 
-    After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so that a weight means the same at
-    every resolution.
+    After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so
+    that a weight means the same at every resolution.
 
     Args:
-        colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of which only pixels with a last
-            channel over 0 count.
+        colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of
+            which only pixels with a last channel over 0 count.
     """
     return torch.stack([judging.variation(one) for one in _pictures(colors)])
 
 
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
-    """Mean Euclidean distance in sRGB of the pixels from the nearest colour that can be printed, (N,).
+    """Mean Euclidean distance in sRGB of the pixels from the nearest colour that can be
+    printed, (N,).
 
-    After the non-printability score of Sharif et al. 2016, section 5.2.3, which is a product of distances to all
-    printable colours: it is zero at the same colours.
+    After the non-printability score of Sharif et al. 2016, section 5.2.3, which is a
+    product of distances to all printable colours: it is zero at the same colours.
 
     Args:
         colors: as for `total_variation`.
-        palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the 125 of `printable`.
+        palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the
+            125 of `printable`.
     """
     return torch.stack([judging.off_print(one, palette) for one in _pictures(colors)])
 
@@ -116,44 +137,67 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
 nps = non_printability  # its usual short name
 
 
-# ---- as objectives --------------------------------------------------------------------------------------------------
+# ---- as objectives
+# --------------------------------------------------------------------------------------------------
 
 
 def check_aim(objective: object, *, targeted: bool) -> None:
-    """Check that one of these losses, or of torch's, leads where a search is to go; any other objective passes. Raises
-    InputError: it needs a target that is not there, or would lead away from the one that is."""
+    """Check that one of these losses, or of torch's, leads where a search is to go; any
+    other objective passes. Raises InputError: it needs a target that is not there, or
+    would lead away from the one that is.
+    """
     function = getattr(objective, "func", objective)  # of functools.partial
     module = str(getattr(function, "__module__", None) or type(function).__module__)
-    if targeted and module.startswith(("torch.nn.functional", "torch.nn.modules", "torch._C")):
+    if targeted and module.startswith(
+        ("torch.nn.functional", "torch.nn.modules", "torch._C")
+    ):
         name = getattr(function, "__name__", type(function).__name__)
         raise InputError(
-            f"objective: it is maximised, and torch's {name} falls towards the `target`; take "
-            "losses.targeted_cross_entropy, or negate it: lambda logits, labels: -loss(logits, labels)"
+            f"objective: it is maximised, and torch's {name} falls towards the "
+            "`target`; take "
+            "losses.targeted_cross_entropy, or negate it: lambda logits, labels: "
+            "-loss(logits, labels)"
         )
     for name in (one for one in __all__ if f"targeted_{one}" in __all__):
         if function is globals()[name] and targeted:
-            raise InputError(f"objective: losses.{name} leads away from the `target`; take losses.targeted_{name}")
+            raise InputError(
+                f"objective: losses.{name} leads away from the `target`; "
+                f"take losses.targeted_{name}"
+            )
         if function is globals()[f"targeted_{name}"] and not targeted:
-            raise InputError(f"objective: losses.targeted_{name} needs a `target`; name one, or take losses.{name}")
+            raise InputError(
+                f"objective: losses.targeted_{name} needs a `target`; "
+                f"name one, or take losses.{name}"
+            )
 
 
-# ---- parts ----------------------------------------------------------------------------------------------------------
+# ---- parts
+# ----------------------------------------------------------------------------------------------------------
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
-            f"labels: expected (N,) int64 or the indices of a label set, got {type(labels).__name__}, the truth of "
+            "labels: expected (N,) int64 or the indices of a label set, got "
+            f"{type(labels).__name__}, the truth of "
             "another task than classification; a loss of your own takes it as it is"
         )
     if not isinstance(labels, Tensor):
         return loss(logits, logits, tuple(labels))
     each = [(int(one),) for one in labels.flatten()]
     if len(each) not in (1, len(logits)):
-        raise InputError(f"labels: expected {len(logits)}, one for each row of logits, got {len(each)}")
+        raise InputError(
+            f"labels: expected {len(logits)}, one for each row of logits, "
+            f"got {len(each)}"
+        )
     if len(set(each)) == 1:
         return loss(logits, logits, each[0])
-    return torch.cat([loss(row[None], row[None], label) for row, label in zip(logits, each, strict=True)])
+    return torch.cat(
+        [
+            loss(row[None], row[None], label)
+            for row, label in zip(logits, each, strict=True)
+        ]
+    )
 
 
 def _pictures(colors: Tensor) -> Tensor:

@@ -1,10 +1,12 @@
-"""Models and datasets of MAITE (https://mit-ll-ai-technology.github.io/maite), by its protocols: `advsearch.maite`.
+"""Models and datasets of MAITE (https://mit-ll-ai-technology.github.io/maite), by its
+protocols: `advsearch.maite`.
 
     from advsearch import maite
 
     model = maite.load_model(theirs, input_size=224, value_range=(0, 1))
     advsearch.attack("mug", model, controls="camera", label="coffee mug,cup")
-    maite_tasks.evaluate(model=theirs, dataset=maite.Scenes("mug", "camera", 100, labels=model.labels))
+    maite_tasks.evaluate(model=theirs, dataset=maite.Scenes("mug", "camera", 100,
+    labels=model.labels))
 
 The protocols are duck types, so nothing of MAITE is imported.
 """
@@ -39,14 +41,18 @@ class _Theirs(nn.Module):
 
     def __init__(self, model: Any, task: str) -> None:
         super().__init__()
-        self.model, self.task = model, task
+        self.model = model
+        self.task = task
         if isinstance(model, nn.Module):
             model.eval()
 
     def forward(self, images: Tensor) -> Any:
         said = list(self.model(list(images)))
         if len(said) != len(images):
-            raise InputError(f"MAITE model: expected a target for each of {len(images)} images, got {len(said)}")
+            raise InputError(
+                "MAITE model: expected a target for each of "
+                f"{len(images)} images, got {len(said)}"
+            )
         if self.task == "classification":
             return torch.stack([torch.as_tensor(scores).float() for scores in said])
         return [_detected(target) for target in said]
@@ -55,22 +61,36 @@ class _Theirs(nn.Module):
 def _detected(target: Any) -> dict[str, Tensor]:
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # of every class; `labels` has the likeliest
-        scores = scores.amax(dim=1) if scores.shape[1] else scores.new_zeros(len(scores))
+        scores = (
+            scores.amax(dim=1) if scores.shape[1] else scores.new_zeros(len(scores))
+        )
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
-    return {"boxes": boxes, "labels": torch.as_tensor(target.labels).long(), "scores": scores}
+    return {
+        "boxes": boxes,
+        "labels": torch.as_tensor(target.labels).long(),
+        "scores": scores,
+    }
 
 
 def load_model(
-    model: Any, *, input_size: int | tuple[int, int], task: str = "classification", labels: Any = None, **options: Any
+    model: Any,
+    *,
+    input_size: int | tuple[int, int],
+    task: str = "classification",
+    labels: Any = None,
+    **options: Any,
 ) -> models.Model:
-    """Return a model of MAITE, an image classifier or an object detector, as a model of ours.
+    """Return a model of MAITE, an image classifier or an object detector, as a model of
+    ours.
 
-    It is called with a list of images (3, H, W), float32 tensors. MAITE does not say what size and range of values a
-    model takes: say it by `input_size` and `value_range`. Where its output is no tensor with a graph back to these,
-    searches without gradients are left (`policy="random"`, `"cmaes"`).
+    It is called with a list of images (3, H, W), float32 tensors. MAITE does not say
+    what size and range of values a model takes: say it by `input_size` and
+    `value_range`. Where its output is no tensor with a graph back to these, searches
+    without gradients are left (`policy="random"`, `"cmaes"`).
 
     Args:
-        model: called with a sequence of images; returns for each its scores (classes,), or an `ObjectDetectionTarget`.
+        model: called with a sequence of images; returns for each its scores (classes,),
+            or an `ObjectDetectionTarget`.
         input_size: side, or (height, width), in pixels.
         task: "classification" or "detection".
         labels: names by index; None takes `index2label` of its metadata.
@@ -80,13 +100,25 @@ def load_model(
         InputError: another task, or names with gaps.
     """
     if task not in ("classification", "detection"):
-        raise InputError(f"task: expected classification or detection, which MAITE has protocols of, got {task!r}")
+        raise InputError(
+            "task: expected classification or detection, which MAITE has "
+            f"protocols of, got {task!r}"
+        )
     metadata = getattr(model, "metadata", {})
     if labels is None and (named := metadata.get("index2label")):
-        labels = [named.get(number, f"class {number}") for number in range(max(named) + 1)]
+        labels = [
+            named.get(number, f"class {number}") for number in range(max(named) + 1)
+        ]
     name = options.pop("name", str(metadata.get("id", type(model).__name__)))
     made = _Theirs(model, task)
-    return models.load_model(made, task=make_task(task), input_size=input_size, labels=labels, name=name, **options)
+    return models.load_model(
+        made,
+        task=make_task(task),
+        input_size=input_size,
+        labels=labels,
+        name=name,
+        **options,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +133,10 @@ class Detections:
 class Scenes:
     """Pictures of a scene, drawn from its controls, as a dataset of MAITE.
 
-    Item k is an image (3, H, W) float32, sRGB in [0, 1] rounded to 8 bits; its target; and its metadata: `id`, and the
-    configuration by parameter. The target is one-hot (classes,), or the `Detections` of what is seen and has a name
-    among the labels. An item is rendered when it is asked for, and is the same every time.
+    Item k is an image (3, H, W) float32, sRGB in [0, 1] rounded to 8 bits; its target;
+    and its metadata: `id`, and the configuration by parameter. The target is one-hot
+    (classes,), or the `Detections` of what is seen and has a name among the labels. An
+    item is rendered when it is asked for, and is the same every time.
 
     Args:
         scene: from `load_scene`, or what that takes.
@@ -134,37 +167,60 @@ class Scenes:
         seed: int = 0,
     ) -> None:
         if task not in ("classification", "detection"):
-            raise InputError(f"task: expected classification or detection, which MAITE has protocols of, got {task!r}")
+            raise InputError(
+                "task: expected classification or detection, which MAITE "
+                f"has protocols of, got {task!r}"
+            )
         if count < 1:
             raise InputError(f"count: expected a whole number from 1, got {count}")
         made = scene if isinstance(scene, loading.Scene) else loading.load_scene(scene)
         self.renderer = made.renderer(controls, resolution=resolution, seed=seed)
-        self.labels, self.task, self.spp, self.seed = tuple(labels), task, spp, seed
+        self.labels = tuple(labels)
+        self.task = task
+        self.spp = spp
+        self.seed = seed
         description = self.renderer.scene.made[0]
-        self.right = find_label_set(label or description.object.label or description.object_name, self.labels)
+        self.right = find_label_set(
+            label or description.object.label or description.object_name, self.labels
+        )
         self.space = cast("Any", self.renderer.space)
         domain = domain_of(self.space.controls)
         self.us = domain.sample(torch.Generator().manual_seed(seed), count)
         index2label = dict(enumerate(self.labels))
-        self.metadata = {"id": f"advsearch-{description.object_name}-{seed}", "index2label": index2label}
+        self.metadata = {
+            "id": f"advsearch-{description.object_name}-{seed}",
+            "index2label": index2label,
+        }
 
     def __len__(self) -> int:
         return len(self.us)
 
-    def __getitem__(self, number: int) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
-        number = range(len(self))[number]  # raises IndexError, which ends a loop over it
+    def __getitem__(
+        self, number: int
+    ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
+        # raises IndexError, which ends a loop over it
+        number = range(len(self))[number]
         u = self.us[number]
         with torch.no_grad():
-            picture = to_8_bit(self.renderer(u, seed=number, spp=self.spp)).permute(2, 0, 1).contiguous()
+            picture = (
+                to_8_bit(self.renderer(u, seed=number, spp=self.spp))
+                .permute(2, 0, 1)
+                .contiguous()
+            )
         values = self.space.describe(u)
-        metadata = {"id": number, **{name: value["value"] for name, value in values.items()}}
+        metadata = {
+            "id": number,
+            **{name: value["value"] for name, value in values.items()},
+        }
         return picture, self._target(u), metadata
 
     def _target(self, u: Tensor) -> Tensor | Detections:
         right = self.right.indices[0]
         if self.task == "classification":
             return nn.functional.one_hot(torch.tensor(right), len(self.labels)).float()
-        meshes, boxes, classes = self.renderer.scene.made[0].meshes, [], []
+        meshes = self.renderer.scene.made[0].meshes
+        boxes = []
+        classes = []
         for thing in seen_things(self.renderer, u):
             name = meshes[thing.name].label or thing.name
             named = right if thing.name == "object" else _index(name, self.labels)
@@ -172,7 +228,9 @@ class Scenes:
                 boxes.append(thing.box)
                 classes.append(named)
         shaped = torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4)
-        return Detections(shaped, torch.tensor(classes, dtype=torch.int64), torch.ones(len(boxes)))
+        return Detections(
+            shaped, torch.tensor(classes, dtype=torch.int64), torch.ones(len(boxes))
+        )
 
 
 def _index(name: str, labels: Sequence[str]) -> int | None:

@@ -1,4 +1,6 @@
-"""Picture files that others have made: only formats that are pictures, and none that takes too much to decode."""
+"""Picture files that others have made: only formats that are pictures, and none that
+takes too much to decode.
+"""
 
 from __future__ import annotations
 
@@ -17,44 +19,64 @@ from advsearch.trust import stored_files
 from advsearch.trust.stored_files import scaled, too_large
 
 FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
-"""Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
+"""Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs
+other programs.
+"""
 LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `scaled`
-LARGEST_PIXELS = 1 << 26  # of a picture (8192 x 8192), before `scaled`; decoded they take 4 bytes each
-MOST_SCANS = 64  # scans of a progressive JPEG, each of which takes as long to decode as a picture; usual are ten
+# of a picture (8192 x 8192), before `scaled`; decoded they take 4 bytes each
+LARGEST_PIXELS = 1 << 26
+# scans of a progressive JPEG, each of which takes as long to decode as a picture; usual
+# are ten
+MOST_SCANS = 64
 
 
 @contextlib.contextmanager
 def without_pillows_limit() -> Iterator[None]:
-    """Let Pillow open, but not decode, pictures of any size: what is decoded is up to `check_pixels`."""
-    kept, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    """Let Pillow open, but not decode, pictures of any size: what is decoded is up to
+    `check_pixels`.
+    """
+    kept = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
     try:
         yield
     finally:
         Image.MAX_IMAGE_PIXELS = kept
 
 
-def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS) -> None:
-    """Refuse a picture with too many pixels before it is decoded. Raises FileFormatError where it has more than
-    `limit`, before `scaled`."""
+def check_pixels(
+    path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS
+) -> None:
+    """Refuse a picture with too many pixels before it is decoded. Raises
+    FileFormatError where it has more than `limit`, before `scaled`.
+    """
     if width * height > scaled(limit):
         expected = f"a picture of at most {scaled(limit):,} pixels"
         raise too_large(path, expected, f"{width} x {height}")
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
-    """Refuse an opened picture that takes too much to decode. Raises FileFormatError for too many pixels or scans, or a
-    format that is not one of `FORMATS`."""
+    """Refuse an opened picture that takes too much to decode. Raises FileFormatError
+    for too many pixels or scans, or a format that is not one of `FORMATS`.
+    """
     check_pixels(path, *image.size)
-    if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
-        raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
+    # an MPO is a JPEG with a second picture
+    if image.format not in (None, "MPO", *FORMATS):
+        raise FileFormatError(
+            f"{path}: expected a picture such as PNG or JPEG, got "
+            f"{image.format}; convert it"
+        )
     if image.format in ("JPEG", "MPO") and _scans(image) > scaled(MOST_SCANS):
-        raise too_large(path, f"a JPEG of at most {scaled(MOST_SCANS)} scans", f"{_scans(image)}")
+        raise too_large(
+            path, f"a JPEG of at most {scaled(MOST_SCANS)} scans", f"{_scans(image)}"
+        )
 
 
 @contextlib.contextmanager
 def opened(path: Path, limit: int) -> Iterator[Image.Image]:
-    """Open a picture file of at most `limit` bytes for the block, which may decode it. Raises FileFormatError: it is
-    missing, no ordinary file, no picture, too large or damaged."""
+    """Open a picture file of at most `limit` bytes for the block, which may decode it.
+    Raises FileFormatError: it is missing, no ordinary file, no picture, too large or
+    damaged.
+    """
     try:
         data = stored_files.read_bytes(path, "a picture file such as PNG", limit)
         with warnings.catch_warnings(), without_pillows_limit():
@@ -63,7 +85,9 @@ def opened(path: Path, limit: int) -> Iterator[Image.Image]:
                 yield image
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         reason = getattr(error, "strerror", None) or "one that cannot be read"
-        raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
+        raise FileFormatError(
+            f"{path}: expected a picture file such as PNG, got {reason}; check the path"
+        ) from error
 
 
 def png_of(levels: npt.NDArray[np.uint8]) -> bytes:
@@ -73,27 +97,39 @@ def png_of(levels: npt.NDArray[np.uint8]) -> bytes:
 
 
 def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
-    """Read a picture as a viewer shows it, averaged down where it is larger than a longest side: (H, W, 3) float32
-    display-referred values in [0, 1], row 0 on top; what is transparent is as if it were not. Raises FileFormatError:
-    as for `opened` and `check_decodable`."""
+    """Read a picture as a viewer shows it, averaged down where it is larger than a
+    longest side: (H, W, 3) float32 display-referred values in [0, 1], row 0 on top;
+    what is transparent is as if it were not. Raises FileFormatError: as for `opened`
+    and `check_decodable`.
+    """
     with opened(path, LARGEST_FILE) as image:
         check_decodable(image, path)
         turned = ImageOps.exif_transpose(image)
         shown = Image.fromarray(steps_of(turned, alpha=False))
         if max(shown.size) > side:
             shown.thumbnail((side, side), Image.Resampling.BOX)
-        values: npt.NDArray[np.float32] = np.asarray(shown, np.float32) / np.float32(255.0)
+        values: npt.NDArray[np.float32] = np.asarray(shown, np.float32) / np.float32(
+            255.0
+        )
         return values
 
 
 def steps_of(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
-    """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W, 4)."""
+    """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W,
+    4).
+    """
     if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
-        grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(1.0 if image.mode == "F" else 65535.0)
-        steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(np.uint8)
+        grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(
+            1.0 if image.mode == "F" else 65535.0
+        )
+        steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(
+            np.uint8
+        )
         steps = steps[:, :, None].repeat(3, axis=2)
     else:
-        steps = np.asarray(image.convert("RGBA" if alpha or "transparency" in image.info else "RGB"))
+        steps = np.asarray(
+            image.convert("RGBA" if alpha or "transparency" in image.info else "RGB")
+        )
     if alpha and steps.shape[2] == 3:
         steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
     return steps if alpha else steps[:, :, :3]

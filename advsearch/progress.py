@@ -1,4 +1,6 @@
-"""How far a question is: what the API tells whoever watches, in a terminal or a notebook (`progress=True`)."""
+"""How far a question is: what the API tells whoever watches, in a terminal or a
+notebook (`progress=True`).
+"""
 
 from __future__ import annotations
 
@@ -15,21 +17,33 @@ from advsearch.errors import InputError
 
 
 class Progress(Protocol):
-    """A watcher of a run. Its methods return at once and never raise because of what they are shown."""
+    """A watcher of a run. Its methods return at once and never raise because of what
+    they are shown.
+    """
 
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+    def stage(
+        self,
+        name: str,
+        total: int | None = None,
+        *,
+        hint: str = "",
+        at_most: bool = False,
+    ) -> None:
         """End the stage before and begin another.
 
         Args:
             name: what is being done, in a user's words: "searching", say.
             total: steps that it has; None where nothing counts them.
-            hint: what it consists of, and in backticks the setting that shortens it: "40 pictures; lower `steps`".
+            hint: what it consists of, and in backticks the setting that shortens it:
+                "40 pictures; lower `steps`".
             at_most: `total` is an upper bound: the stage may end before.
         """
         return
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        """Report `n` more steps of the stage done. `info` is shown beside the bar: ``best=0.31``."""
+        """Report `n` more steps of the stage done. `info` is shown beside the bar:
+        ``best=0.31``.
+        """
         return
 
     def message(self, text: str) -> None:
@@ -42,7 +56,9 @@ class NullProgress(Progress):
 
 
 class Stages:
-    """Reports the stages of a run to its watcher, and measures the seconds of each by name."""
+    """Reports the stages of a run to its watcher, and measures the seconds of each by
+    name.
+    """
 
     def __init__(self, progress: Progress) -> None:
         self.progress = progress
@@ -50,15 +66,27 @@ class Stages:
         self._name = ""
         self._started = self._begun = time.perf_counter()
 
-    def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
+    def begin(
+        self,
+        name: str,
+        title: str,
+        total: int | None = None,
+        *,
+        hint: str = "",
+        at_most: bool = False,
+    ) -> None:
+        """End the stage before and begin another; a `name` that comes twice adds up.
+        The rest: `Progress.stage`.
+        """
         self.end()
         self._name, self._begun = name, time.perf_counter()
         self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
         if self._name:
-            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+            self.seconds[self._name] = (
+                self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+            )
             self._name = ""
 
     @property
@@ -67,37 +95,56 @@ class Stages:
 
 
 Watched = Progress | bool | None
-"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a terminal."""
+"""Who watches, as a caller says it: True is a bar, False nobody, None a bar on a
+terminal.
+"""
 
 
 def watcher(watched: Watched) -> Progress:
-    """Return who is told how far it is: the watcher that was given, and nobody where none was."""
+    """Return who is told how far it is: the watcher that was given, and nobody where
+    none was.
+    """
     return NullProgress() if watched is None or isinstance(watched, bool) else watched
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-PATIENCE = 2.0  # seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line
+# seconds after which a stage is announced where there is no terminal; a shorter one is
+# not worth a line
+PATIENCE = 2.0
 MOST_BARS = 5  # stages that a terminal shows at once
 UPDATE = 0.2  # least seconds between two changes of a notebook's line
-LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
-"""Seconds between two lines where there is no terminal, and the share of a stage's time so far that they are at least.
+LINE_INTERVAL = 5.0
+LINE_SHARE = 0.1
+"""Seconds between two lines where there is no terminal, and the share of a stage's time
+so far that they are at least.
 """
 
 
-def watched(asked: Watched, written: Callable[[str], str] = str) -> AbstractContextManager[Progress]:
-    """Return the progress that a call asked for, see `Watched`, for a `with` block. `written` writes the settings that
-    a text names as whoever reads it does. Raises InputError where something else was asked for."""
+def watched(
+    asked: Watched, written: Callable[[str], str] = str
+) -> AbstractContextManager[Progress]:
+    """Return the progress that a call asked for, see `Watched`, for a `with` block.
+    `written` writes the settings that a text names as whoever reads it does. Raises
+    InputError where something else was asked for.
+    """
     stream = sys.stderr
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if asked not in (None, True, False):
         if not callable(getattr(asked, "stage", None)):
-            raise InputError(f"progress: expected True, False, None or a Progress, got {asked!r:.80}")
+            raise InputError(
+                f"progress: expected True, False, None or a Progress, got {asked!r:.80}"
+            )
         return nullcontext(asked)  # type: ignore[arg-type]
     if asked and getattr(shell, "kernel", None) is not None:  # a notebook asks
         return NotebookProgress(written)
     if asked is not False and stream is not None and stream.isatty():
-        return BarProgress(getattr(stream, "stream", stream), written)  # behind a screen, which escapes all
-    return LineProgress(stream, written) if asked and stream is not None else nullcontext(NullProgress())
+        # behind a screen, which escapes all
+        return BarProgress(getattr(stream, "stream", stream), written)
+    return (
+        LineProgress(stream, written)
+        if asked and stream is not None
+        else nullcontext(NullProgress())
+    )
 
 
 def shows_progress(function: Function) -> Function:
@@ -112,24 +159,50 @@ def shows_progress(function: Function) -> Function:
 
 
 class LineProgress:
-    """Plain lines on a stream: what a stage is once it has lasted `PATIENCE` seconds, then how far it is every
-    `LINE_INTERVAL` seconds or more, inside a `with` block also of one that is silent; messages at once."""
+    """Plain lines on a stream: what a stage is once it has lasted `PATIENCE` seconds,
+    then how far it is every `LINE_INTERVAL` seconds or more, inside a `with` block also
+    of one that is silent; messages at once.
+    """
 
     def __init__(
-        self, stream: IO[str], written: Callable[[str], str] = str, clock: Callable[[], float] = time.monotonic
+        self,
+        stream: IO[str],
+        written: Callable[[str], str] = str,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._stream, self._written, self._clock, self._lock = stream, written, clock, threading.RLock()
+        self._stream, self._written, self._clock, self._lock = (
+            stream,
+            written,
+            clock,
+            threading.RLock(),
+        )
         self._ended = threading.Event()
-        self._name, self._begin, self._info = "", "", ""
+        self._name = ""
+        self._begin = ""
+        self._info = ""
         self._total: int | None = None
         self._printed: float | None = None
         self._at_most, self._done, self._began = False, 0, clock()
 
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+    def stage(
+        self,
+        name: str,
+        total: int | None = None,
+        *,
+        hint: str = "",
+        at_most: bool = False,
+    ) -> None:
         with self._lock:
-            self._name, self._total, self._at_most = name, total, at_most
+            self._name = name
+            self._total = total
+            self._at_most = at_most
             self._begin = name + (f": {self._written(hint)}" if hint else "")
-            self._done, self._info, self._began, self._printed = 0, "", self._clock(), None
+            self._done, self._info, self._began, self._printed = (
+                0,
+                "",
+                self._clock(),
+                None,
+            )
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         with self._lock:
@@ -149,17 +222,28 @@ class LineProgress:
                 if self._name and now - self._began >= PATIENCE:
                     self._printed = now
                     self._print(self._begin)
-            elif now - self._printed >= max(LINE_INTERVAL, LINE_SHARE * (now - self._began)):
+            elif now - self._printed >= max(
+                LINE_INTERVAL, LINE_SHARE * (now - self._began)
+            ):
                 self._printed = now
                 self._print(f"{self._name}: {self._far()}")
 
     def _far(self) -> str:
         # 12 of at most 40, 10 s, at most 25 s left, best 0.31
-        done, total, elapsed = self._done, self._total, self._clock() - self._began
+        done = self._done
+        total = self._total
+        elapsed = self._clock() - self._began
         most = "at most " if self._at_most else ""
-        parts = [f"{done} of {most}{total}" if total is not None else f"{done} done" if done else ""]
+        parts = [
+            f"{done} of {most}{total}"
+            if total is not None
+            else f"{done} done"
+            if done
+            else ""
+        ]
         times = _seconds(elapsed)
-        # below a tenth of an upper bound nothing is said of what is left: most such stages end long before
+        # below a tenth of an upper bound nothing is said of what is left: most such
+        # stages end long before
         if total and 0 < done < total and not (self._at_most and 10 * done < total):
             times += f", {most}{_seconds(elapsed / done * (total - done))} left"
         return ", ".join(filter(None, [*parts, times, self._info]))
@@ -182,7 +266,9 @@ class LineProgress:
 
 
 class NotebookProgress(LineProgress):
-    """One line below the cell of a notebook, which goes at the end of a `with` block, and messages, which stay."""
+    """One line below the cell of a notebook, which goes at the end of a `with` block,
+    and messages, which stay.
+    """
 
     def __init__(self, written: Callable[[str], str] = str) -> None:
         super().__init__(sys.stdout, written)
@@ -194,7 +280,9 @@ class NotebookProgress(LineProgress):
         with self._lock:
             if self._clock() - self._drawn >= UPDATE:
                 self._drawn = self._clock()
-                self._handle.update({"text/plain": f"{self._name}, {self._far()}"}, raw=True)
+                self._handle.update(
+                    {"text/plain": f"{self._name}, {self._far()}"}, raw=True
+                )
 
     def _print(self, text: str) -> None:
         print(text, flush=True)
@@ -205,7 +293,9 @@ class NotebookProgress(LineProgress):
 
 
 class BarProgress:
-    """The bars of rich on a terminal, one for each stage, which are gone behind the `with` block."""
+    """The bars of rich on a terminal, one for each stage, which are gone behind the
+    `with` block.
+    """
 
     def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
         # late, so that --help answers at once
@@ -213,25 +303,49 @@ class BarProgress:
         from rich.console import Console
 
         columns = (
-            *(bars.TextColumn("{task.description}", markup=False), bars.BarColumn(bar_width=12)),
-            *(bars.MofNCompleteColumn(separator=" of "), bars.TimeElapsedColumn(), bars.TimeRemainingColumn()),
+            *(
+                bars.TextColumn("{task.description}", markup=False),
+                bars.BarColumn(bar_width=12),
+            ),
+            *(
+                bars.MofNCompleteColumn(separator=" of "),
+                bars.TimeElapsedColumn(),
+                bars.TimeRemainingColumn(),
+            ),
             bars.TextColumn("{task.fields[info]}", markup=False),
         )
-        self.bars = bars.Progress(*columns, console=Console(file=terminal), transient=True)
+        self.bars = bars.Progress(
+            *columns, console=Console(file=terminal), transient=True
+        )
         self._written = written
 
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+    def stage(
+        self,
+        name: str,
+        total: int | None = None,
+        *,
+        hint: str = "",
+        at_most: bool = False,
+    ) -> None:
         for task in self.bars.tasks[-1:]:
-            self.bars.update(task.id, total=max(task.completed, 1), completed=max(task.completed, 1))
+            self.bars.update(
+                task.id, total=max(task.completed, 1), completed=max(task.completed, 1)
+            )
         for task in self.bars.tasks[: 1 - MOST_BARS]:
             self.bars.update(task.id, visible=False)
         if hint:
             self._print(f"{name}: {self._written(hint)}", style="dim")
-        self.bars.add_task(escaped(name + (", at most" if at_most else "")), total=total, info="")
+        self.bars.add_task(
+            escaped(name + (", at most" if at_most else "")), total=total, info=""
+        )
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         for task in self.bars.tasks[-1:]:
-            self.bars.update(task.id, advance=n, info=escaped(info_text(info)) if info else task.fields["info"])
+            self.bars.update(
+                task.id,
+                advance=n,
+                info=escaped(info_text(info)) if info else task.fields["info"],
+            )
 
     def message(self, text: str) -> None:
         self._print(self._written(text))
@@ -248,26 +362,37 @@ class BarProgress:
 
 
 def _seconds(seconds: float) -> str:
-    from advsearch.report.wording import seconds_text  # late, so that --help answers at once
+    # late, so that --help answers at once
+    from advsearch.report.wording import seconds_text
 
     return f"{seconds:.0f} s" if seconds < 99.5 else seconds_text(seconds)
 
 
 def info_text(info: dict[str, float | str]) -> str:
     """Return ``best 0.31, epsilon 0.1``."""
-    values = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in info.items()}
+    values = {
+        name: f"{value:.3g}" if isinstance(value, float) else value
+        for name, value in info.items()
+    }
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def escaped(text: str, encoding: str = "utf-8") -> str:
-    """Return `text` with everything but line ends and tabs that a terminal would not show, or that would steer it,
-    written as an escape: names in it are others'."""
+    """Return `text` with everything but line ends and tabs that a terminal would not
+    show, or that would steer it, written as an escape: names in it are others'.
+    """
 
     def shown(sign: str) -> str:
         if sign in "\n\t" or sign.isprintable() or unicodedata.category(sign) == "Zs":
             return sign
         code = ord(sign)
-        return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+        return (
+            f"\\x{code:02x}"
+            if code < 0x100
+            else f"\\u{code:04x}"
+            if code < 0x10000
+            else f"\\U{code:08x}"
+        )
 
     if not text.isascii() or not text.isprintable():
         text = "".join(map(shown, text))

@@ -1,17 +1,20 @@
 """Where a model is wrong, as rules over a table of rows.
 
-Rules are nodes of decision trees (Breiman et al. 1984) of one half of the rows, the best by weighted relative accuracy
-(Lavrac, Flach and Zupan 1999), made shorter where that costs nothing, one after the other (sequential covering;
-Friedman and Fisher 1999). The other half says whether a rule holds.
+Rules are nodes of decision trees (Breiman et al. 1984) of one half of the rows, the
+best by weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where
+that costs nothing, one after the other (sequential covering; Friedman and Fisher 1999).
+The other half says whether a rule holds.
 
     table = rules.make_table(rows, ["pose.yaw", "light.power"])
     choosing, counting = rules.split_in_halves(table, seed=0)
     for rule in rules.find_rules(choosing, counting, seed=0).accepted:
-        print([condition.row.text for condition in rule.conditions], rules.estimate_share(rule.inside))
+        print([condition.row.text for condition in rule.conditions],
+        rules.estimate_share(rule.inside))
 
-A *table* is a pandas frame with a column for each factor, float64 or a category of names in alphabetical order;
-`correct`, whether the model was right; and `unit`, of what draw a row is: rows of one unit are not independent
-(`runs.tables.Units`). ``attrs["units"]`` has the unit of each factor, so its keys are the factors.
+A *table* is a pandas frame with a column for each factor, float64 or a category of
+names in alphabetical order; `correct`, whether the model was right; and `unit`, of what
+draw a row is: rows of one unit are not independent (`runs.tables.Units`).
+``attrs["units"]`` has the unit of each factor, so its keys are the factors.
 """
 
 from __future__ import annotations
@@ -32,7 +35,12 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.runs.results import ConditionRow
-from advsearch.statistics.clustered import fewer_by_chance, mean_share, per_unit, share_interval
+from advsearch.statistics.clustered import (
+    fewer_by_chance,
+    mean_share,
+    per_unit,
+    share_interval,
+)
 
 MIN_ROWS = 100  # rows of which one half can choose and the other can count
 MAX_RULES = 5
@@ -41,35 +49,47 @@ N_TREES = 24
 MIN_COVERED_SHARE = 0.01
 MIN_COVERED_ROWS = 12
 MIN_COVERED_UNITS = 3
-"""Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
+"""Of the rows that choose, a rule covers at least so many, and as many as so many units
+have.
+"""
 RETAINED_ACCURACY = 0.97
-"""Share of its weighted relative accuracy that a rule retains when a condition is left out."""
+"""Share of its weighted relative accuracy that a rule retains when a condition is left
+out.
+"""
 N_ADJUSTMENTS = 3  # how often all bounds of a rule are adjusted
 N_BOUNDS = 250  # to how many quantiles of their factor
 SIGNIFICANCE = 0.01
-"""Probability that any rule is accepted that is none. Rules are tested one after the other, each only where all before
-it were accepted, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
+"""Probability that any rule is accepted that is none. Rules are tested one after the
+other, each only where all before it were accepted, so that each may be tested at all of
+it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995).
+"""
 MAX_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
 MIN_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere
 MIN_ANGLE_RANGE = 270.0
-"""Degrees that the values of an angle span where it goes all the way round: a grid of four values does."""
+"""Degrees that the values of an angle span where it goes all the way round: a grid of
+four values does.
+"""
 ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
-"""Of an angle that goes all the way round, trees have it once more by turn and zero, degrees: an arc through 0 is one
-interval there, and so is what lies end-on, at 0 and at 180."""
+"""Of an angle that goes all the way round, trees have it once more by turn and zero,
+degrees: an arc through 0 is one interval there, and so is what lies end-on, at 0 and at
+180.
+"""
 
 Mask = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 
-# ---- tables ---------------------------------------------------------------------------------------------------------
+# ---- tables
+# ---------------------------------------------------------------------------------------------------------
 
 
 def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return the rows of a sweep as a table of some parameters.
 
     Args:
-        rows: of a sweep (`runs.tables.sweep_frame`); a prediction that was not judged is not right.
+        rows: of a sweep (`runs.tables.sweep_frame`); a prediction that was not judged
+            is not right.
         names: of parameters; the table has those that vary and that all rows have.
     """
     columns = dict[str, pd.Series]()
@@ -84,7 +104,9 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
             units[name] = "" if has_names else rows.attrs["units"][name]
     if "outcome" in rows:
         columns.setdefault("outcome", rows["outcome"])
-    table = pd.DataFrame({**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]})
+    table = pd.DataFrame(
+        {**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]}
+    )
     table.attrs["units"] = units
     return table
 
@@ -95,11 +117,17 @@ def is_in_view(rows: pd.DataFrame) -> Mask:
 
 
 def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
-    """Count the outcomes of the rows that are not right, by name; None where rows have no outcomes."""
+    """Count the outcomes of the rows that are not right, by name; None where rows have
+    no outcomes.
+    """
     if "outcome" not in rows:
         return None
     counts = rows.loc[rows["correct"] != 1, "outcome"].astype(str).value_counts()
-    counts_by_name = {outcome.value: int(counts[outcome.value]) for outcome in Outcome if outcome.value in counts}
+    counts_by_name = {
+        outcome.value: int(counts[outcome.value])
+        for outcome in Outcome
+        if outcome.value in counts
+    }
     return counts_by_name or None
 
 
@@ -111,7 +139,9 @@ def estimate_interval(table: pd.DataFrame) -> tuple[float, float]:
 
 
 def estimate_share(table: pd.DataFrame) -> float:
-    """Return the mean over units of the share of right predictions of each; NaN where there is no row."""
+    """Return the mean over units of the share of right predictions of each; NaN where
+    there is no row.
+    """
     return mean_share(*count_per_unit(table))
 
 
@@ -123,16 +153,23 @@ def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
 
 
 def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table in which units with a configuration in common are one unit: it is the same draw, come twice.
+    """Return a table in which units with a configuration in common are one unit: it is
+    the same draw, come twice.
 
-    This is done only where two draws are never the same by chance: where some factor is a number with at least half as
-    many values as there are rows. Values of a grid, and names, come again in independent draws too.
+    This is done only where two draws are never the same by chance: where some factor is
+    a number with at least half as many values as there are rows. Values of a grid, and
+    names, come again in independent draws too.
     """
     factors = list(table.attrs["units"])
-    is_continuous = any(table[name].dtype != "category" and 2 * table[name].nunique() >= len(table) for name in factors)
+    is_continuous = any(
+        table[name].dtype != "category" and 2 * table[name].nunique() >= len(table)
+        for name in factors
+    )
     if not is_continuous:
         return table
-    configuration = table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
+    configuration = (
+        table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
+    )
     n_configurations = int(configuration.max()) + 1
     if n_configurations == len(table):
         return table
@@ -143,7 +180,9 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_connected(first: IntArray, second: IntArray) -> IntArray:
-    """Return the group (n,) of each row: rows with the same number (n,) from 0 of either kind are in one group."""
+    """Return the group (n,) of each row: rows with the same number (n,) from 0 of
+    either kind are in one group.
+    """
     group = first
     while True:
         linked = group
@@ -156,8 +195,12 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
         group = linked
 
 
-def split_in_halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return two halves of the units, drawn by a seed: one to choose on and one to count on."""
+def split_in_halves(
+    table: pd.DataFrame, seed: int
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return two halves of the units, drawn by a seed: one to choose on and one to
+    count on.
+    """
     table = merge_repeats(table)
     units, unit_index = np.unique(table["unit"], return_inverse=True)
     order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(len(units))
@@ -165,20 +208,22 @@ def split_in_halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.Da
     return table[is_in_first], table[~is_in_first]
 
 
-# ---- rules ----------------------------------------------------------------------------------------------------------
+# ---- rules
+# ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor: over `low` and at most `high`, or some of its names.
+    """A part of the values of one factor: over `low` and at most `high`, or some of its
+    names.
 
     Attributes:
         factor: its name.
         unit: of the factor.
         low, high: bounds of numbers.
         options: names; None for numbers.
-        turn: 360 or 180 degrees after which values of an angle repeat; then, where `low` is over `high`, the part goes
-            through 0. Else 0.
+        turn: 360 or 180 degrees after which values of an angle repeat; then, where
+            `low` is over `high`, the part goes through 0. Else 0.
     """
 
     factor: str
@@ -204,11 +249,15 @@ class RuleCondition:
 
     @property
     def arcs(self) -> tuple[tuple[float, float], ...]:
-        """Where it holds of an angle, from and to in degrees, each once in a turn of 360; none without a `turn`."""
+        """Where it holds of an angle, from and to in degrees, each once in a turn of
+        360; none without a `turn`.
+        """
         if not self.turn:
             return ()
         width = (self.high - self.low) % self.turn
-        begins = [self.low + offset for offset in np.arange(0.0, 360.0, self.turn).tolist()]
+        begins = [
+            self.low + offset for offset in np.arange(0.0, 360.0, self.turn).tolist()
+        ]
         return tuple((begin, begin + width) for begin in begins)
 
     @property
@@ -230,7 +279,11 @@ class RuleCondition:
             return " or ".join(sorted(self.options))
         bounds = []
         if self.turn:
-            bounds = [" or ".join(f"from {begin % 360:g} to {end % 360:g}" for begin, end in self.arcs)]
+            bounds = [
+                " or ".join(
+                    f"from {begin % 360:g} to {end % 360:g}" for begin, end in self.arcs
+                )
+            ]
         else:
             if np.isfinite(self.low):
                 bounds.append(f"over {self.low:g}")
@@ -240,7 +293,8 @@ class RuleCondition:
         return " and ".join(bounds) + unit
 
 
-RuleConditions = tuple[RuleCondition, ...]  # all of which hold, at most one for each factor
+# all of which hold, at most one for each factor
+RuleConditions = tuple[RuleCondition, ...]
 
 
 def find_covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
@@ -253,7 +307,9 @@ def find_covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class CountedRule:
-    """A rule, and the rows inside it and elsewhere, of those that did not choose it and lie under no rule before."""
+    """A rule, and the rows inside it and elsewhere, of those that did not choose it and
+    lie under no rule before.
+    """
 
     conditions: RuleConditions
     inside: pd.DataFrame
@@ -261,14 +317,18 @@ class CountedRule:
 
     @property
     def gap(self) -> float:
-        """By how much more often the model is right elsewhere than under it, with equal weight of all units."""
+        """By how much more often the model is right elsewhere than under it, with equal
+        weight of all units.
+        """
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
         return estimate_share(self.elsewhere) - estimate_share(self.inside)
 
     @cached_property
     def p_value(self) -> float:
-        """The probability of so few right predictions under it, or fewer, if they were spread by chance."""
+        """The probability of so few right predictions under it, or fewer, if they were
+        spread by chance.
+        """
         return self._compute_p_value(1.0)
 
     @property
@@ -277,7 +337,9 @@ class CountedRule:
         return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
     def find_needed_factor(self) -> float | None:
-        """Return how many times as many rows, of the same shares, would show it; None where no number would."""
+        """Return how many times as many rows, of the same shares, would show it; None
+        where no number would.
+        """
         factor = 1.0
         n_rows = len(self.inside) + len(self.elsewhere)
         while self.gap >= MIN_GAP and n_rows * factor <= MAX_NEEDED:
@@ -295,7 +357,9 @@ class CountedRule:
         rows_inside = per_unit(is_inside, units)
         right_elsewhere = per_unit(~is_inside & is_right, units)
         rows_elsewhere = per_unit(~is_inside, units)
-        return fewer_by_chance(right_inside, rows_inside, right_elsewhere, rows_elsewhere, factor)
+        return fewer_by_chance(
+            right_inside, rows_inside, right_elsewhere, rows_elsewhere, factor
+        )
 
 
 @dataclass(frozen=True)
@@ -312,7 +376,8 @@ class FoundRules:
 
 
 def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
-    """Find rules under which the model is wrong more often, chosen on some rows and counted on others.
+    """Find rules under which the model is wrong more often, chosen on some rows and
+    counted on others.
 
     Raises:
         InputError: scikit-learn is missing.
@@ -332,11 +397,13 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
     return FoundRules(accepted, None)
 
 
-# ---- the best conditions --------------------------------------------------------------------------------------------
+# ---- the best conditions
+# --------------------------------------------------------------------------------------------
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
-    """Find the conditions of the largest weighted relative accuracy, and leave out what adds little to it.
+    """Find the conditions of the largest weighted relative accuracy, and leave out what
+    adds little to it.
 
     There are none where no condition is worth anything.
     """
@@ -355,12 +422,16 @@ def find_min_rows(table: pd.DataFrame) -> int:
     """Return how many rows a rule has to cover."""
     min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
     if not table["unit"].is_unique:
-        min_rows = max(min_rows, round(MIN_COVERED_UNITS * len(table) / table["unit"].nunique()))
+        min_rows = max(
+            min_rows, round(MIN_COVERED_UNITS * len(table) / table["unit"].nunique())
+        )
     return min_rows
 
 
 class ConditionScorer:
-    """Scores conditions by their weighted relative accuracy in a table: of the model's being wrong."""
+    """Scores conditions by their weighted relative accuracy in a table: of the model's
+    being wrong.
+    """
 
     def __init__(self, table: pd.DataFrame, min_rows: int) -> None:
         self.table = table
@@ -376,15 +447,22 @@ class ConditionScorer:
         return float(self._excess[is_covered].sum()) / len(self.table)
 
 
-def shorten_conditions(conditions: RuleConditions, scorer: ConditionScorer) -> RuleConditions:
+def shorten_conditions(
+    conditions: RuleConditions, scorer: ConditionScorer
+) -> RuleConditions:
     """Leave conditions out, one at a time, where that costs little of their score."""
     table = scorer.table
     score = scorer.score(conditions)
     variance = float(table["correct"].to_numpy().var())
     while len(conditions) > 1:
-        candidates = [conditions[:index] + conditions[index + 1 :] for index in range(len(conditions))]
+        candidates = [
+            conditions[:index] + conditions[index + 1 :]
+            for index in range(len(conditions))
+        ]
         shorter = max(candidates, key=scorer.score)
-        n_added = int((find_covered(shorter, table) & ~find_covered(conditions, table)).sum())
+        n_added = int(
+            (find_covered(shorter, table) & ~find_covered(conditions, table)).sum()
+        )
         # the standard error of the loss, so that few rows choose few conditions
         standard_error = math.sqrt(n_added * variance) / len(table)
         loss = score - scorer.score(shorter)
@@ -394,8 +472,12 @@ def shorten_conditions(conditions: RuleConditions, scorer: ConditionScorer) -> R
     return conditions
 
 
-def adjust_bounds(conditions: RuleConditions, scorer: ConditionScorer) -> RuleConditions:
-    """Move the bounds of conditions to where their score is largest, one condition at a time."""
+def adjust_bounds(
+    conditions: RuleConditions, scorer: ConditionScorer
+) -> RuleConditions:
+    """Move the bounds of conditions to where their score is largest, one condition at a
+    time.
+    """
     for _ in range(N_ADJUSTMENTS):
         for index in range(len(conditions)):
             adjusted = [
@@ -406,8 +488,12 @@ def adjust_bounds(conditions: RuleConditions, scorer: ConditionScorer) -> RuleCo
     return conditions
 
 
-def list_adjusted(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondition]:
-    """Yield a condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
+def list_adjusted(
+    condition: RuleCondition, table: pd.DataFrame
+) -> Iterator[RuleCondition]:
+    """Yield a condition with its bounds elsewhere: nodes of trees lie where the nodes
+    above them left them.
+    """
     if condition.options is not None:
         return
     values = table[condition.factor].to_numpy()
@@ -423,7 +509,8 @@ def list_adjusted(condition: RuleCondition, table: pd.DataFrame) -> Iterator[Rul
             yield replace(condition, high=bound)
 
 
-# ---- candidates from trees ------------------------------------------------------------------------------------------
+# ---- candidates from trees
+# ------------------------------------------------------------------------------------------
 
 
 class TreeColumn(NamedTuple):
@@ -459,15 +546,22 @@ class TreeColumn(NamedTuple):
         return replace(condition, low=low % turn, high=high % turn or turn)
 
 
-def find_candidates(table: pd.DataFrame, min_rows: int, seed: int) -> Iterator[RuleConditions]:
+def find_candidates(
+    table: pd.DataFrame, min_rows: int, seed: int
+) -> Iterator[RuleConditions]:
     """Yield the conditions of all nodes of trees, each once."""
     seen_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
         for node in walk_tree(tree, columns):
-            conditions_of_factor: dict[str, list[RuleCondition]] = {name: [] for name in table.attrs["units"]}
+            conditions_of_factor: dict[str, list[RuleCondition]] = {
+                name: [] for name in table.attrs["units"]
+            }
             for column, condition in node.items():
-                conditions_of_factor[condition.factor].append(column.to_factor(condition))
-            # of several parts of one angle, each in turn: their bounds are adjusted later
+                conditions_of_factor[condition.factor].append(
+                    column.to_factor(condition)
+                )
+            # of several parts of one angle, each in turn: their bounds are adjusted
+            # later
             for conditions in product(*filter(None, conditions_of_factor.values())):
                 if conditions not in seen_conditions:
                     seen_conditions.add(conditions)
@@ -487,12 +581,19 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
             continue
         columns.append(TreeColumn(full_condition))
         if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
-            columns += [TreeColumn(replace(full_condition, turn=turn), zero=zero) for turn, zero in ARCS]
+            columns += [
+                TreeColumn(replace(full_condition, turn=turn), zero=zero)
+                for turn, zero in ARCS
+            ]
     return columns
 
 
-def grow_trees(table: pd.DataFrame, min_rows: int, seed: int) -> list[tuple[Any, list[TreeColumn]]]:
-    """Return trees of scikit-learn that predict whether the model is right, and the columns of each."""
+def grow_trees(
+    table: pd.DataFrame, min_rows: int, seed: int
+) -> list[tuple[Any, list[TreeColumn]]]:
+    """Return trees of scikit-learn that predict whether the model is right, and the
+    columns of each.
+    """
     make_tree = import_library("sklearn.tree").DecisionTreeClassifier
     make_forest = import_library("sklearn.ensemble").RandomForestClassifier
     columns = list_columns(table)
@@ -501,17 +602,24 @@ def grow_trees(table: pd.DataFrame, min_rows: int, seed: int) -> list[tuple[Any,
     shape = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
     random_state = seed % 2**32
     single_tree = make_tree(**shape, random_state=random_state).fit(data, is_right)
-    forest = make_forest(N_TREES, **shape, max_features=0.6, random_state=random_state).fit(data, is_right)
-    trees = [(estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)]
+    forest = make_forest(
+        N_TREES, **shape, max_features=0.6, random_state=random_state
+    ).fit(data, is_right)
+    trees = [
+        (estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)
+    ]
     for index, column in enumerate(columns):
         if column.full_condition.turn:
-            # by itself too: in a tree of all columns other splits of the same angle come first
+            # by itself too: in a tree of all columns other splits of the same angle
+            # come first
             tree = make_tree(**shape).fit(data[:, [index]], is_right).tree_
             trees.append((tree, [column]))
     return trees
 
 
-def walk_tree(tree: Any, columns: list[TreeColumn]) -> Iterator[dict[TreeColumn, RuleCondition]]:
+def walk_tree(
+    tree: Any, columns: list[TreeColumn]
+) -> Iterator[dict[TreeColumn, RuleCondition]]:
     """Yield the conditions of each node of a tree, by column without a name."""
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:
@@ -536,10 +644,13 @@ def walk_tree(tree: Any, columns: list[TreeColumn]) -> Iterator[dict[TreeColumn,
 
 
 def import_library(name: str) -> Any:
-    """Return a module of scikit-learn, such as ``sklearn.tree``. Raises InputError: it is missing."""
+    """Return a module of scikit-learn, such as ``sklearn.tree``. Raises InputError: it
+    is missing.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
+            "explain needs scikit-learn, which cannot be imported: pip install "
+            "'advsearch[explain]'"
         ) from error

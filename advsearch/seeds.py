@@ -1,7 +1,7 @@
 """Independent random streams, all derived from one root seed (docs/design.md, "Seeds").
 
-A stream is named, so that the primal, gradient, search, baseline and verification seeds of a run never meet, whatever
-their number. `numpy.random.SeedSequence` does the mixing.
+A stream is named, so that the primal, gradient, search, baseline and verification seeds
+of a run never meet, whatever their number. `numpy.random.SeedSequence` does the mixing.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import numpy as np
 
 
 def stream(root: int, name: str, index: int = 0) -> int:
-    """Return the seed number `index` of a stream such as "primal", "gradient" or "verification" under a root seed; both
-    numbers are at least 0. It is in [0, 2**32), and the same for the same arguments on every machine."""
+    """Return the seed number `index` of a stream such as "primal", "gradient" or
+    "verification" under a root seed; both numbers are at least 0. It is in [0, 2**32),
+    and the same for the same arguments on every machine.
+    """
     sequence = np.random.SeedSequence([root, zlib.crc32(name.encode()), index])
     return int(sequence.generate_state(1, dtype=np.uint32)[0])

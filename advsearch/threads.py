@@ -1,10 +1,12 @@
-"""How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do not fight.
+"""How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do
+not fight.
 
-Idle OpenMP threads poll at their barriers, and hold the core that the awaited one needs, so they sleep at
-once. Right after a render Dr.Jit's workers still poll too, so while there is rendering torch gets half of the
-cores, and all of them only where it works alone (training). OpenMP reads its environment once, when torch is
-imported: this module has to come before torch. What the user has set is left alone. Imports the standard
-library only.
+Idle OpenMP threads poll at their barriers, and hold the core that the awaited one
+needs, so they sleep at once. Right after a render Dr.Jit's workers still poll too, so
+while there is rendering torch gets half of the cores, and all of them only where it
+works alone (training). OpenMP reads its environment once, when torch is imported: this
+module has to come before torch. What the user has set is left alone. Imports the
+standard library only.
 """
 
 from __future__ import annotations
@@ -19,12 +21,15 @@ from pathlib import Path
 from advsearch.errors import InputError
 
 OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
-"""Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for LLVM's and Intel's (macOS)."""
+"""Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for
+LLVM's and Intel's (macOS).
+"""
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _CPU_INFO = Path("/proc/cpuinfo")
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
-if "GOMP_SPINCOUNT" not in os.environ:  # a user who has set this has decided about waiting
+# a user who has set this has decided about waiting
+if "GOMP_SPINCOUNT" not in os.environ:
     for _name, _value in OPENMP_DEFAULTS.items():
         os.environ.setdefault(_name, _value)
 
@@ -32,9 +37,15 @@ _chosen: int | None = None
 
 
 def cores(quota: Path = _CPU_MAX) -> int:
-    """The number of cores this process may use: those it is pinned to, and no more than a container's quota allows. The
-    file has the quota and its period in microseconds (control groups, version 2)."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """The number of cores this process may use: those it is pinned to, and no more than
+    a container's quota allows. The file has the quota and its period in microseconds
+    (control groups, version 2).
+    """
+    allowed = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
     try:
         limit, period = quota.read_text(encoding="ascii").split()
         allowed = min(allowed, max(1, round(int(limit) / int(period))))
@@ -44,7 +55,9 @@ def cores(quota: Path = _CPU_MAX) -> int:
 
 
 def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
-    """Return the processor's name; what the system says where Linux's description has none."""
+    """Return the processor's name; what the system says where Linux's description has
+    none.
+    """
     try:
         for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
             key, _, value = line.partition(":")
@@ -55,14 +68,18 @@ def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
     return platform.processor() or platform.machine() or "unknown"
 
 
-MOST = 4  # of threads for each core: more only wait for each other, and somebody else's file may ask for any number
+# of threads for each core: more only wait for each other, and somebody else's file may
+# ask for any number
+MOST = 4
 
 
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
-    """Give Dr.Jit a number of threads and torch half as many, or all where nothing is rendered, now and (Dr.Jit) when
-    Mitsuba is imported later; return the number that Dr.Jit gets. At most `MOST` for each core are taken. None means
-    what ``OMP_NUM_THREADS`` said when this module was imported, and without it every core that this process may use.
-    Raises InputError: fewer than one thread was asked for."""
+    """Give Dr.Jit a number of threads and torch half as many, or all where nothing is
+    rendered, now and (Dr.Jit) when Mitsuba is imported later; return the number that
+    Dr.Jit gets. At most `MOST` for each core are taken. None means what
+    ``OMP_NUM_THREADS`` said when this module was imported, and without it every core
+    that this process may use. Raises InputError: fewer than one thread was asked for.
+    """
     global _chosen
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
@@ -79,10 +96,15 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 
 @contextmanager
 def given_back() -> Iterator[None]:
-    """Let torch and Dr.Jit have after the block the threads that they had before it, whatever is configured inside."""
+    """Let torch and Dr.Jit have after the block the threads that they had before it,
+    whatever is configured inside.
+    """
     global _chosen
-    chosen, torch, drjit = _chosen, sys.modules.get("torch"), sys.modules.get("drjit")
-    for_torch, for_drjit = torch and torch.get_num_threads(), drjit and drjit.thread_count()
+    chosen = _chosen
+    torch = sys.modules.get("torch")
+    drjit = sys.modules.get("drjit")
+    for_torch = torch and torch.get_num_threads()
+    for_drjit = drjit and drjit.thread_count()
     try:
         yield
     finally:
@@ -97,7 +119,9 @@ def given_back() -> Iterator[None]:
 
 @contextmanager
 def all_for_torch() -> Iterator[None]:
-    """Give torch every thread inside the `with`, in which nothing is rendered: a training takes half of the time."""
+    """Give torch every thread inside the `with`, in which nothing is rendered: a
+    training takes half of the time.
+    """
     configure(_chosen, rendering=False)
     try:
         yield
@@ -106,7 +130,9 @@ def all_for_torch() -> Iterator[None]:
 
 
 def apply_to_drjit() -> None:
-    """Set the size of Dr.Jit's pool to what `configure` chose, or to every core. Called after Mitsuba was imported."""
+    """Set the size of Dr.Jit's pool to what `configure` chose, or to every core. Called
+    after Mitsuba was imported.
+    """
     drjit = sys.modules["drjit"]
     wanted = _chosen if _chosen is not None else _default()
     if drjit.thread_count() != wanted:
@@ -114,4 +140,8 @@ def apply_to_drjit() -> None:
 
 
 def _default() -> int:
-    return int(_USERS_COUNT) if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0 else cores()
+    return (
+        int(_USERS_COUNT)
+        if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0
+        else cores()
+    )

@@ -1,12 +1,15 @@
-"""A picture and an attack in the avenue, which is geometry, over the street, which is a ball around a road.
+"""A picture and an attack in the avenue, which is geometry, over the street, which is a
+ball around a road.
 
     python benchmarks/avenue.py [--size 300] [--spp 16] [--rounds 5] [--steps 40]
     python benchmarks/avenue.py --attacks                              # whole attacks alone
 
-It prints processor time as ratios: a warm picture (a primal render with the denoiser's guides), the gradient of a
-texture, and a search of `--steps` steps with both; and the seconds and the memory of loading each. Left out are the
-model, the random search beside, verification and the report, which do not know where the car stands. Last come whole
-attacks on the texture with all of that, each in a process of its own, and the most memory that each process has had.
+It prints processor time as ratios: a warm picture (a primal render with the denoiser's
+guides), the gradient of a texture, and a search of `--steps` steps with both; and the
+seconds and the memory of loading each. Left out are the model, the random search
+beside, verification and the report, which do not know where the car stands. Last come
+whole attacks on the texture with all of that, each in a process of its own, and the
+most memory that each process has had.
 """
 
 from __future__ import annotations
@@ -31,20 +34,40 @@ PLACES = ("street", "avenue")
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=int, default=300, help="pixels along each side (default 300)")
-    parser.add_argument("--spp", type=int, default=16, help="samples per pixel (default 16)")
-    parser.add_argument("--rounds", type=int, default=5, help="pictures and gradients of each, in turn (default 5)")
-    parser.add_argument("--steps", type=int, default=40, help="steps of the search (default 40)")
-    parser.add_argument("--distance", type=float, default=15.0, help="of the camera, metres (default 15)")
+    parser.add_argument(
+        "--size", type=int, default=300, help="pixels along each side (default 300)"
+    )
+    parser.add_argument(
+        "--spp", type=int, default=16, help="samples per pixel (default 16)"
+    )
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        default=5,
+        help="pictures and gradients of each, in turn (default 5)",
+    )
+    parser.add_argument(
+        "--steps", type=int, default=40, help="steps of the search (default 40)"
+    )
+    parser.add_argument(
+        "--distance",
+        type=float,
+        default=15.0,
+        help="of the camera, metres (default 15)",
+    )
     parser.add_argument("--attacks", action="store_true", help="whole attacks alone")
     args = parser.parse_args(argv)
     if not args.attacks:
         _compare(args)
     costs = {place: _in_a_process(place, args) for place in PLACES}
-    _tell(f"attack of {args.steps} steps", {place: seconds for place, (seconds, _) in costs.items()})
+    _tell(
+        f"attack of {args.steps} steps",
+        {place: seconds for place, (seconds, _) in costs.items()},
+    )
     most = {place: memory for place, (_, memory) in costs.items()}
     print(
-        f"memory of the attack: avenue / street = {most['avenue'] / most['street']:.2f}   "
+        "memory of the attack: avenue / street = "
+        f"{most['avenue'] / most['street']:.2f}   "
         f"(MB at most: {', '.join(f'{place} {memory:.0f}' for place, memory in most.items())})"
     )
     return 0
@@ -54,8 +77,13 @@ def _compare(args: argparse.Namespace) -> None:
     """Pictures, gradients and searches in this process."""
     renderers: dict[str, Renderer] = {}
     for place in PLACES:
-        before, begin = _memory(), time.perf_counter()
-        scene = load_scene("car", place, settings={"camera.elevation": 8.0, "camera.distance": args.distance})
+        before = _memory()
+        begin = time.perf_counter()
+        scene = load_scene(
+            "car",
+            place,
+            settings={"camera.elevation": 8.0, "camera.distance": args.distance},
+        )
         read = time.perf_counter() - begin
         renderers[place] = scene.renderer(["texture"], resolution=args.size)
         loaded = time.perf_counter() - begin
@@ -63,22 +91,42 @@ def _compare(args: argparse.Namespace) -> None:
         _gradient(renderers[place], 0, args.spp)
         print(
             f"{place}: described in {read:.2f} s, loaded in {loaded:.2f} s; "
-            f"{_memory() - before:.0f} MB more than before at most, with a picture and a gradient"
+            f"{_memory() - before:.0f} MB more than before at most, with a picture and "
+            "a gradient"
         )
     for name, act in (("picture", _picture), ("gradient", _gradient)):
         seconds: dict[str, list[float]] = {place: [] for place in PLACES}
         for number in range(args.rounds):
             for place in PLACES:
-                seconds[place].append(_timed(act, renderers[place], number + 1, args.spp))
+                seconds[place].append(
+                    _timed(act, renderers[place], number + 1, args.spp)
+                )
         _tell(name, {place: statistics.median(one) for place, one in seconds.items()})
-    searched = {place: _timed(_search, renderers[place], args.spp, args.steps) for place in PLACES}
+    searched = {
+        place: _timed(_search, renderers[place], args.spp, args.steps)
+        for place in PLACES
+    }
     _tell(f"search of {args.steps} steps", searched)
 
 
 def _in_a_process(place: str, args: argparse.Namespace) -> tuple[float, float]:
-    """Processor seconds and the most memory, MB, of an attack in a process of its own."""
-    asked = json.dumps({"place": place, "steps": args.steps, "resolution": args.size, "distance": args.distance})
-    done = subprocess.run([sys.executable, "-c", ATTACK, asked], check=True, stdout=subprocess.PIPE, text=True)
+    """Processor seconds and the most memory, MB, of an attack in a process of its
+    own.
+    """
+    asked = json.dumps(
+        {
+            "place": place,
+            "steps": args.steps,
+            "resolution": args.size,
+            "distance": args.distance,
+        }
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", ATTACK, asked],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     seconds, memory = json.loads(done.stdout.splitlines()[-1])
     return seconds, memory
 
@@ -123,7 +171,10 @@ def _timed(act: Callable[..., None], *arguments: object) -> float:
 
 def _tell(name: str, seconds: dict[str, float]) -> None:
     told = ", ".join(f"{place} {one:.2f}" for place, one in seconds.items())
-    print(f"{name}: avenue / street = {seconds['avenue'] / seconds['street']:.2f}   (processor seconds: {told})")
+    print(
+        f"{name}: avenue / street = {seconds['avenue'] / seconds['street']:.2f}   "
+        f"(processor seconds: {told})"
+    )
 
 
 def _memory() -> float:

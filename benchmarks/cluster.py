@@ -1,22 +1,28 @@
-"""Many workers: what two real ones gain on one, and what the coordinator can feed of thousands that are simulated.
+"""Many workers: what two real ones gain on one, and what the coordinator can feed of
+thousands that are simulated.
 
-    python benchmarks/cluster.py [--turns 3] [--pictures 512] [--rows 100000] [--figure FILE.png] [--only KIND]
+    python benchmarks/cluster.py [--turns 3] [--pictures 512] [--rows 100000] [--figure
+    FILE.png] [--only KIND]
 
 Kinds: real, searches, simulated.
 
-Real: the rate of a sweep between its first and its last row, so that loading does not count, with no workers on one
-thread, with one and with two; ratios of rates of the same turn, their medians. Asked: two over one 1.9, one over none
+Real: the rate of a sweep between its first and its last row, so that loading does not
+count, with no workers on one thread, with one and with two; ratios of rates of the same
+turn, their medians. Asked: two over one 1.9, one over none
 0.97, on a machine that does nothing else.
 
-Searches: the same rate of an attack whose four restarts have workers side by side, and of one whose steps wait for the
-matrices of a bank of conditions.
+Searches: the same rate of an attack whose four restarts have workers side by side, and
+of one whose steps wait for the matrices of a bank of conditions.
 
-Simulated: workers of 0.5 s a picture (exponential around it, with a fixed seed) and an answer that takes 5 ms to come,
-in simulated time, to which the time is added that the coordinator really takes: it gives out, takes back, makes rows
-and writes them to a real `results.sqlite`. Nothing is rendered; rows have real values and predictions. Asked: 0.95 of
-linear up to 1,000 workers, 4,000 rows a second stored, memory that stays (`--rows 1000000`). Each worker has 40 batches
-to do, since some wait at the end for the last ones. The question is that of 3DB (Leclerc et al. 2021, appendix F.7).
-What is not in it: Dask's own scheduler and network; a task is 16 pictures, so 1,000 workers make 125 tasks a second.
+Simulated: workers of 0.5 s a picture (exponential around it, with a fixed seed) and an
+answer that takes 5 ms to come, in simulated time, to which the time is added that the
+coordinator really takes: it gives out, takes back, makes rows and writes them to a real
+`results.sqlite`. Nothing is rendered; rows have real values and predictions. Asked:
+0.95 of linear up to 1,000 workers, 4,000 rows a second stored, memory that stays
+(`--rows 1000000`). Each worker has 40 batches to do, since some wait at the end for the
+last ones. The question is that of 3DB (Leclerc et al. 2021, appendix F.7). What is not
+in it: Dask's own scheduler and network; a task is 16 pictures, so 1,000 workers make
+125 tasks a second.
 """
 
 from __future__ import annotations
@@ -54,7 +60,8 @@ from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.runs.store import NAME, Store  # noqa: E402
 from advsearch.tasks import Judgement, Prediction  # noqa: E402
 
-SECONDS, LAG = 0.5, 0.005
+SECONDS = 0.5
+LAG = 0.005
 """Of a picture, and until an answer has come."""
 
 BATCHES = 40
@@ -63,7 +70,10 @@ BATCHES = 40
 WORKERS = (1, 3, 10, 30, 100, 300, 1000)
 """Simulated ones."""
 
-ASKED_TWO, ASKED_ONE, ASKED_LINEAR, ASKED_ROWS = 1.9, 0.97, 0.95, 4000.0
+ASKED_TWO = 1.9
+ASKED_ONE = 0.97
+ASKED_LINEAR = 0.95
+ASKED_ROWS = 4000.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,26 +93,43 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if all(held) else 3
 
 
-# ---- real workers ---------------------------------------------------------------------------------------------------
+# ---- real workers
+# ---------------------------------------------------------------------------------------------------
 
 
 def real(turns: int, pictures: int) -> list[bool]:
     """Print what real workers gain."""
-    one_over_none, two_over_one = [], []
+    one_over_none = []
+    two_over_one = []
     for _ in range(turns):
         none, one, two = (rate(workers, pictures) for workers in (0, 1, 2))
         one_over_none.append(one / none)
         two_over_one.append(two / one)
-    one, two = statistics.median(one_over_none), statistics.median(two_over_one)
-    print(f"  real       {one:.3f} one worker over none (asked {ASKED_ONE}), of {turns}: {_listed(one_over_none)}")
-    print(f"  real       {two:.3f} two workers over one (asked {ASKED_TWO}), of {turns}: {_listed(two_over_one)}")
+    one = statistics.median(one_over_none)
+    two = statistics.median(two_over_one)
+    print(
+        f"  real       {one:.3f} one worker over none (asked {ASKED_ONE}), of "
+        f"{turns}: {_listed(one_over_none)}"
+    )
+    print(
+        f"  real       {two:.3f} two workers over one (asked {ASKED_TWO}), of "
+        f"{turns}: {_listed(two_over_one)}"
+    )
     return [one >= ASKED_ONE, two >= ASKED_TWO]
 
 
 def rate(workers: int, pictures: int) -> float:
     """Rows a second of a sweep, from its first batch to its last."""
     side = max(2, pictures // 8)
-    words = ["sweep", "--object", "mug", "--grid", f"pose.yaw=0:360:{side}", "--grid", "camera.elevation=5:60:8"]
+    words = [
+        "sweep",
+        "--object",
+        "mug",
+        "--grid",
+        f"pose.yaw=0:360:{side}",
+        "--grid",
+        "camera.elevation=5:60:8",
+    ]
     return rows_a_second([*words, "--trials", "0"], KIND, workers)
 
 
@@ -117,7 +144,11 @@ def rows_a_second(words: Sequence[str], kind: str, workers: int) -> float:
             f"{folder}/run",
             *(["--workers", str(workers)] if workers else []),
         ]
-        subprocess.run([sys.executable, "-m", "advsearch", *words, *more], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "advsearch", *words, *more],
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
         with Store(Path(folder) / "run" / NAME, read_only=True) as store:
             times = sorted(row.time or 0.0 for row in store.rows(kind))
     first = times.count(times[0])
@@ -133,22 +164,44 @@ SEARCHES = {
 def searches(turns: int) -> None:
     """Print what searches gain."""
     for name, words in SEARCHES.items():
-        asked = ["attack", "--object", "mug", *words.split(), "--trials", "6", "--no-baseline", "--measure", "no"]
-        rates = [[rows_a_second(asked, "search", workers) for workers in (0, 1, 2)] for _ in range(turns)]
-        for title, over, under in (("one worker over none", 1, 0), ("two workers over one", 2, 1)):
+        asked = [
+            "attack",
+            "--object",
+            "mug",
+            *words.split(),
+            "--trials",
+            "6",
+            "--no-baseline",
+            "--measure",
+            "no",
+        ]
+        rates = [
+            [rows_a_second(asked, "search", workers) for workers in (0, 1, 2)]
+            for _ in range(turns)
+        ]
+        for title, over, under in (
+            ("one worker over none", 1, 0),
+            ("two workers over one", 2, 1),
+        ):
             ratios = [each[over] / each[under] for each in rates]
-            print(f"  {name:10s} {statistics.median(ratios):.3f} {title}, of {turns}: {_listed(ratios)}")
+            print(
+                f"  {name:10s} {statistics.median(ratios):.3f} {title}, of {turns}: "
+                f"{_listed(ratios)}"
+            )
 
 
 def _listed(ratios: Sequence[float]) -> str:
     return " ".join(f"{one:.3f}" for one in ratios)
 
 
-# ---- simulated ones -------------------------------------------------------------------------------------------------
+# ---- simulated ones
+# -------------------------------------------------------------------------------------------------
 
 
 class Timed(Simulated):
-    """Simulated workers to whose time that of the process that gives out and stores is added."""
+    """Simulated workers to whose time that of the process that gives out and stores is
+    added.
+    """
 
     returned: float | None = None
 
@@ -159,8 +212,12 @@ class Timed(Simulated):
         self.returned = time.perf_counter()
 
 
-def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float, Simulated]:
-    """Sweep on simulated workers; return simulated seconds that loading is not in, real ones, and the pool."""
+def swept(
+    workers: int, pictures: int, watch: Any = None
+) -> tuple[float, float, Simulated]:
+    """Sweep on simulated workers; return simulated seconds that loading is not in, real
+    ones, and the pool.
+    """
     chance = random.Random(1)
     drawn = [chance.expovariate(1.0 / SECONDS) for _ in range(1009)]
     side = max(1, round(pictures / 10))
@@ -176,8 +233,13 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
 
     pool = Timed(call=seen, seconds=seconds_of, load=0.0, lag=LAG, again=None)
     pool.add(workers)
-    with tempfile.TemporaryDirectory() as folder, RunDirectory.create(Path(folder) / "run") as run:
-        sweep = Sweep(job_of(config), run, watch or NullProgress(), SimulatedWorkers(pool))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RunDirectory.create(Path(folder) / "run") as run,
+    ):
+        sweep = Sweep(
+            job_of(config), run, watch or NullProgress(), SimulatedWorkers(pool)
+        )
         sweep.carry_out()
         assert run.store.count(KIND) == sweep.total
         return pool.now, sweep.stages.seconds["sweep"], pool
@@ -186,13 +248,16 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
 def without_rendering() -> Any:
     """Patch what would load a scene into Mitsuba."""
     return mock.patch.object(
-        swept_scene, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(space, size)
+        swept_scene,
+        "make_renderer",
+        lambda scene, space, size, *more, **named: ConstantRenderer(space, size),
     )
 
 
 def simulated(figure: Path | None) -> list[bool]:
     """Print pictures a second against workers, and draw them."""
-    found, held = [], []
+    found = []
+    held = []
     with without_rendering():
         for workers in WORKERS:
             pictures = 16 * BATCHES * workers
@@ -201,7 +266,8 @@ def simulated(figure: Path | None) -> list[bool]:
             share = ideal / seconds
             found.append((workers, pictures / seconds))
             print(
-                f"  simulated  {workers:5d} workers: {pictures / seconds:8.1f} pictures a second, {share:.3f} of linear"
+                f"  simulated  {workers:5d} workers: {pictures / seconds:8.1f} "
+                f"pictures a second, {share:.3f} of linear"
             )
             held.append(share >= ASKED_LINEAR)
             assert pool.most <= workers
@@ -216,8 +282,16 @@ def draw(found: Sequence[tuple[int, float]], path: Path) -> None:
 
     axes = new_axes()
     workers = [one for one, _ in found]
-    axes.loglog(workers, [one / SECONDS for one in workers], color="0.7", label="linear")
-    axes.loglog(workers, [rate for _, rate in found], "o-", markersize=4, label="simulated workers, real coordinator")
+    axes.loglog(
+        workers, [one / SECONDS for one in workers], color="0.7", label="linear"
+    )
+    axes.loglog(
+        workers,
+        [rate for _, rate in found],
+        "o-",
+        markersize=4,
+        label="simulated workers, real coordinator",
+    )
     axes.set_xlabel(f"workers of {SECONDS} s a picture")
     axes.set_ylabel("pictures a second")
     axes.legend(frameon=False)
@@ -225,10 +299,13 @@ def draw(found: Sequence[tuple[int, float]], path: Path) -> None:
 
 
 def stored(rows: int) -> list[bool]:
-    """Print how many rows a second are stored where workers are never waited for, and how the memory grows."""
+    """Print how many rows a second are stored where workers are never waited for, and
+    how the memory grows.
+    """
 
     class Watch(NullProgress):
-        done, memory = 0, 0
+        done = 0
+        memory = 0
 
         def advance(self, n: int = 1, **info: float | str) -> None:
             self.done += n
@@ -238,10 +315,15 @@ def stored(rows: int) -> list[bool]:
     watch = Watch()
     with without_rendering():
         _, seconds, _ = swept(20_000, rows, watch)
-    speed, growth = rows / seconds, (resident() - watch.memory) / 2**20
-    print(f"  stored     {speed:.0f} rows a second (asked {ASKED_ROWS:.0f}), which bounds the number of workers:")
+    speed = rows / seconds
+    growth = (resident() - watch.memory) / 2**20
     print(
-        f"             {speed * SECONDS:.0f} of {SECONDS} s a picture; 10,000 want {10_000 / SECONDS:.0f} rows a second"
+        f"  stored     {speed:.0f} rows a second (asked {ASKED_ROWS:.0f}), which "
+        "bounds the number of workers:"
+    )
+    print(
+        f"             {speed * SECONDS:.0f} of {SECONDS} s a picture; 10,000 want "
+        f"{10_000 / SECONDS:.0f} rows a second"
     )
     print(f"  stored     {growth:+.1f} MiB over the last nine tenths of {rows} rows")
     return [speed >= ASKED_ROWS]

@@ -1,13 +1,17 @@
-"""Margins of textures found in equal CPU seconds, by a matrix of light transport and by rendering each step.
+"""Margins of textures found in equal CPU seconds, by a matrix of light transport and by
+rendering each step.
 
-    python benchmarks/equal_seconds.py [--object mug] [--environment studio] [--model reference] [--label mug]
-                                       [--epsilon 0.1] [--seconds 8] [--seeds 10]
+    python benchmarks/equal_seconds.py [--object mug] [--environment studio] [--model
+                                       reference] [--label mug] [--epsilon 0.1]
+                                       [--seconds 8] [--seeds 10]
 
-Each seed searches twice, turn by turn in one process: with a matrix, whose making and comparisons count, and with
-rendered pictures and the adjoint. Both use the default policy and plan as many steps as fit, by the time that a few
-take; the noisy search ranks its best four beyond the budget. CPU seconds of the process are what is equal, so that
-others on the machine disturb it little. Each configuration is then traced with fresh seeds, rounded to 8 bits, and its
-mean margin is the result. Printed are the quartiles of both.
+Each seed searches twice, turn by turn in one process: with a matrix, whose making and
+comparisons count, and with rendered pictures and the adjoint. Both use the default
+policy and plan as many steps as fit, by the time that a few take; the noisy search
+ranks its best four beyond the budget. CPU seconds of the process are what is equal, so
+that others on the machine disturb it little. Each configuration is then traced with
+fresh seeds, rounded to 8 bits, and its mean margin is the result. Printed are the
+quartiles of both.
 """
 
 from __future__ import annotations
@@ -36,20 +40,28 @@ from advsearch.tasks import Classification, Facts  # noqa: E402
 SPP = 8
 TIMED = 3
 """Evaluations that say how long one takes."""
-TRIALS, TRIAL_SPP = 8, 64
+TRIALS = 8
+TRIAL_SPP = 64
 MOST = 100_000
 
 
 def main() -> None:
     """Print the quartiles."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--object", default="mug")
     parser.add_argument("--environment", default="studio")
     parser.add_argument("--model", default="reference")
     parser.add_argument("--labels")
     parser.add_argument("--label", default="mug")
     parser.add_argument("--epsilon", type=float, default=0.1)
-    parser.add_argument("--seconds", type=float, default=8.0, help="CPU seconds of each search (default 8)")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=8.0,
+        help="CPU seconds of each search (default 8)",
+    )
     parser.add_argument("--seeds", type=int, default=10, help="at least 2 (default 10)")
     args = parser.parse_args()
     description = load_scene(args.object, args.environment).description
@@ -62,31 +74,60 @@ def main() -> None:
     for seed in range(args.seeds + 1):
         for way, margins in found.items():
             facts = Facts(args.label, args.label)
-            problem = Problem(renderer, space, model, task, lambda *_, f=facts: f, get_objective("margin"), SPP, seed)
+            problem = Problem(
+                renderer,
+                space,
+                model,
+                task,
+                lambda *_, f=facts: f,
+                get_objective("margin"),
+                SPP,
+                seed,
+            )
             u, count = searched(problem, way == "matrix", args.seconds)
             if seed:  # the first turn compiles kernels
                 margins.append(verified(problem, u))
                 steps[way].append(count)
-    print(f"{args.object}, epsilon {args.epsilon:g}, {args.seconds:g} CPU seconds, {args.seeds} seeds")
+    print(
+        f"{args.object}, epsilon {args.epsilon:g}, {args.seconds:g} CPU seconds, "
+        f"{args.seeds} seeds"
+    )
     print("              least  quarter  middle  3 quarters  most   steps")
     for way, margins in found.items():
-        ends = [min(margins), *statistics.quantiles(margins, n=4, method="inclusive"), max(margins)]
-        print(f"  {way:9s} " + "".join(f"{end:8.2f}" for end in ends) + f"  {statistics.median(steps[way]):g}")
+        ends = [
+            min(margins),
+            *statistics.quantiles(margins, n=4, method="inclusive"),
+            max(margins),
+        ]
+        print(
+            f"  {way:9s} "
+            + "".join(f"{end:8.2f}" for end in ends)
+            + f"  {statistics.median(steps[way]):g}"
+        )
 
 
 def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor, int]:
-    """Search for so many CPU seconds; returns the configuration and the evaluations that it took."""
+    """Search for so many CPU seconds; returns the configuration and the evaluations
+    that it took.
+    """
     end = time.process_time() + seconds
     evaluate = problem.evaluate
     if predicted:
         transport = Transport(problem, MOST)
         transport.prepare()
         evaluate = transport.evaluate
-    first = Query(problem.domain.start, seeds.stream(problem.seed, "search", 0), phase="search", gradient=True)
+    first = Query(
+        problem.domain.start,
+        seeds.stream(problem.seed, "search", 0),
+        phase="search",
+        gradient=True,
+    )
     begun = time.process_time()
     for _ in range(TIMED):
         evaluate(first)
-    steps = max(1, int((end - time.process_time()) * TIMED / (time.process_time() - begun)))
+    steps = max(
+        1, int((end - time.process_time()) * TIMED / (time.process_time() - begun))
+    )
     result = search(
         partial(map, evaluate),
         replace(problem.domain, exact=predicted),
@@ -102,7 +143,10 @@ def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor,
 
 def verified(problem: Problem, u: Tensor) -> float:
     """Mean margin of a configuration in traced pictures with fresh seeds."""
-    queries = [Query(u, seeds.stream(problem.seed, "trial", one), spp=TRIAL_SPP) for one in range(TRIALS)]
+    queries = [
+        Query(u, seeds.stream(problem.seed, "trial", one), spp=TRIAL_SPP)
+        for one in range(TRIALS)
+    ]
     return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
 
 

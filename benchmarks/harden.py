@@ -1,12 +1,14 @@
-"""The reference model hardened against texture, pose and light: robust and clean accuracy before and after.
+"""The reference model hardened against texture, pose and light: robust and clean
+accuracy before and after.
 
     python benchmarks/harden.py [--run FOLDER] [SETTING=VALUE ...]
 
-It is `advsearch harden --model reference --control texture,pose,light --epsilon texture=0.03` with its defaults of
-rounds, scenes and steps and a worker for each core; settings may be changed (`rounds=2 measured=14 controls=texture
-epsilon=0.03`). A run that was stopped goes on. Asked for, of each control: at least half of the way from the robust
-accuracy before to the clean accuracy, under the search and under the stronger one; of clean accuracy at most 2 points
-lost. Exit status 3 where that falls short.
+It is `advsearch harden --model reference --control texture,pose,light --epsilon
+texture=0.03` with its defaults of rounds, scenes and steps and a worker for each core;
+settings may be changed (`rounds=2 measured=14 controls=texture epsilon=0.03`). A run
+that was stopped goes on. Asked for, of each control: at least half of the way from the
+robust accuracy before to the clean accuracy, under the search and under the stronger
+one; of clean accuracy at most 2 points lost. Exit status 3 where that falls short.
 """
 
 from __future__ import annotations
@@ -25,7 +27,11 @@ from advsearch.questions.harden.result import HardenConfig, HardenResult, Share,
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
 from advsearch.settings import parse_assignment  # noqa: E402
 
-SETTINGS: dict[str, object] = {"controls": "texture,pose,light", "epsilon": "texture=0.03", "workers": threads.cores()}
+SETTINGS: dict[str, object] = {
+    "controls": "texture,pose,light",
+    "epsilon": "texture=0.03",
+    "workers": threads.cores(),
+}
 MOST_LOST = 0.02
 
 
@@ -43,12 +49,16 @@ def main() -> int:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
     with watched(True) as progress:
-        result = harden.run(config, progress=progress, resumed=args.run if there else None)
+        result = harden.run(
+            config, progress=progress, resumed=args.run if there else None
+        )
     before_and_after = shown(result).sections[0]
     print(" | ".join(before_and_after.heads))
     for row in before_and_after.rows:
         print(" | ".join(row))
-    spent = ", ".join(f"{part} {seconds / 60:.0f} minutes" for part, seconds in result.seconds.items())
+    spent = ", ".join(
+        f"{part} {seconds / 60:.0f} minutes" for part, seconds in result.seconds.items()
+    )
     print(f"{spent}; rounds: {[one.robust for one in result.rounds]}")
     short = falls_short(result)
     print("\n".join(short) or "all that is asked for is reached")
@@ -57,17 +67,26 @@ def main() -> int:
 
 def falls_short(result: HardenResult) -> list[str]:
     """Return a sentence for each thing that is asked for and not reached."""
-    before, after = result.clean_before, result.clean_after
+    before = result.clean_before
+    after = result.clean_after
     if before is None or after is None:
         return ["the run was interrupted"]
     found = []
     if after.accuracy < before.accuracy - MOST_LOST:
-        found.append(f"clean accuracy fell from {before.accuracy:.3f} to {after.accuracy:.3f}")
+        found.append(
+            f"clean accuracy fell from {before.accuracy:.3f} to {after.accuracy:.3f}"
+        )
     for row in result.table:
         asked = halfway(row.before, before)
-        for name, reached in (("the search", row.after), ("the stronger search", row.stronger)):
+        for name, reached in (
+            ("the search", row.after),
+            ("the stronger search", row.stronger),
+        ):
             if reached.accuracy < asked:
-                found.append(f"{row.control}: {reached.accuracy:.3f} under {name}, asked for {asked:.3f}")
+                found.append(
+                    f"{row.control}: {reached.accuracy:.3f} under {name}, "
+                    f"asked for {asked:.3f}"
+                )
     return found
 
 

@@ -1,11 +1,13 @@
-"""Kills workers, scheduler and the process that asked, in turn and at random moments; compares rows with a whole run's.
+"""Kills workers, scheduler and the process that asked, in turn and at random moments;
+compares rows with a whole run's.
 
     python benchmarks/kill_cluster.py [--kills 100] [--seconds 3600] [--resolution 32]
 
-A scheduler and two workers are started by Dask's own command line, and again when they were killed; a sweep and an
-attack on three objects take turns, and one that was killed is resumed. Every row of each must agree in every column but
-times, and be there once. After so many seconds nothing more is killed. The exit status is 3 if rows differ, or a run
-does not end.
+A scheduler and two workers are started by Dask's own command line, and again when they
+were killed; a sweep and an attack on three objects take turns, and one that was killed
+is resumed. Every row of each must agree in every column but times, and be there once.
+After so many seconds nothing more is killed. The exit status is 3 if rows differ, or a
+run does not end.
 """
 
 from __future__ import annotations
@@ -27,9 +29,27 @@ from kill import rows_of
 from advsearch.runs.store import NAME, Row
 
 COMMANDS = {
-    "sweep": ["--grid", "pose.yaw=0:360:50", "--grid", "camera.elevation=5:60:16", "--trials", "6"],
+    "sweep": [
+        "--grid",
+        "pose.yaw=0:360:50",
+        "--grid",
+        "camera.elevation=5:60:16",
+        "--trials",
+        "6",
+    ],
     "attack": [
-        *("--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8")
+        *(
+            "--control",
+            "camera,pose,light",
+            "--steps",
+            "8",
+            "--average",
+            "20",
+            "--trials",
+            "6",
+            "--verify-spp",
+            "8",
+        )
     ],
 }
 """What is carried out on bundled objects."""
@@ -39,8 +59,11 @@ OBJECTS = {"sweep": "mug", "attack": "mug,bowl,teapot"}
 VICTIMS = ("worker", "scheduler", "coordinator", "workers")
 """Who is killed in turn; the last are all workers at once."""
 
-PAUSE, MORE = 4.0, 6.0
-"""Mean seconds between two kills, and those that are added unless one worker died: so long takes a start."""
+PAUSE = 4.0
+MORE = 6.0
+"""Mean seconds between two kills, and those that are added unless one worker died: so
+long takes a start.
+"""
 
 OF_A_RUN = 20
 """Kills of a run at most, so that every command has its share."""
@@ -52,7 +75,8 @@ QUIET = subprocess.DEVNULL
 
 
 class Cluster:
-    """A scheduler and workers of their own, which are started again when they have ended.
+    """A scheduler and workers of their own, which are started again when they have
+    ended.
 
     Args:
         folder: for what workers keep.
@@ -64,9 +88,27 @@ class Cluster:
             one.bind(("127.0.0.1", 0))
             self.port = one.getsockname()[1]
         self.address = f"tcp://127.0.0.1:{self.port}"
-        worker = ("worker", self.address, "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder))
-        scheduler = ("scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
-        self._words = {"scheduler": scheduler, **{f"worker {number}": worker for number in range(workers)}}
+        worker = (
+            "worker",
+            self.address,
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--local-directory",
+            str(folder),
+        )
+        scheduler = (
+            "scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            str(self.port),
+            "--no-dashboard",
+        )
+        self._words = {
+            "scheduler": scheduler,
+            **{f"worker {number}": worker for number in range(workers)},
+        }
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def see_to_it(self) -> None:
@@ -74,11 +116,15 @@ class Cluster:
         for name, words in self._words.items():
             if name not in self._running or self._running[name].poll() is not None:
                 dask = [str(Path(sys.executable).parent / "dask"), *words]
-                self._running[name] = subprocess.Popen(dask, stdout=QUIET, stderr=QUIET, start_new_session=True)
+                self._running[name] = subprocess.Popen(
+                    dask, stdout=QUIET, stderr=QUIET, start_new_session=True
+                )
 
     def kill(self, kind: str, chance: random.Random) -> None:
         """Kill the scheduler, one worker with its nanny, or all of them."""
-        names = [name for name in self._words if name.startswith(kind.removesuffix("s"))]
+        names = [
+            name for name in self._words if name.startswith(kind.removesuffix("s"))
+        ]
         for name in names if kind == "workers" else [chance.choice(names)]:
             if self._running[name].poll() is None:
                 os.killpg(self._running[name].pid, signal.SIGKILL)
@@ -136,24 +182,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--resolution", type=int, default=32)
     args = parser.parse_args(argv)
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # what was started ends too
+    # what was started ends too
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
     shared = ["--resolution", str(args.resolution), "--spp", "2"]
-    commands = {name: [name, "--object", OBJECTS[name], *words, *shared] for name, words in COMMANDS.items()}
+    commands = {
+        name: [name, "--object", OBJECTS[name], *words, *shared]
+        for name, words in COMMANDS.items()
+    }
     held = []
     with tempfile.TemporaryDirectory() as name:
-        folder, whole = Path(name), {}
+        folder = Path(name)
+        whole = {}
         for one, words in commands.items():
             begin([*words, "--run", str(folder / one)]).wait()
             whole[one] = rows_below(folder / one)
-        kills, turn = Kills(args.kills, args.seconds), 0
+        kills = Kills(args.kills, args.seconds)
+        turn = 0
         cluster = Cluster(folder / "local")
         try:
             while turn < len(commands) or not kills.over:
-                one, run, before = list(commands)[turn % len(commands)], folder / f"killed-{turn}", kills.total
+                one = list(commands)[turn % len(commands)]
+                run = folder / f"killed-{turn}"
+                before = kills.total
                 ended = killed([*commands[one], "--run", str(run)], run, cluster, kills)
                 held.append(ended and rows_below(run) == whole[one])
-                rows, said = sum(map(len, whole[one].values())), "agree" if held[-1] else "DIFFER"
-                print(f"{one}: {rows} rows, {kills.total - before} kills, rows {said}", flush=True)
+                rows = sum(map(len, whole[one].values()))
+                said = "agree" if held[-1] else "DIFFER"
+                print(
+                    f"{one}: {rows} rows, {kills.total - before} kills, rows {said}",
+                    flush=True,
+                )
                 turn += 1
         finally:
             cluster.end()
@@ -163,7 +221,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def rows_below(run: Path) -> dict[str, list[Row]]:
     """Return the rows of a run and of its parts, by where they are."""
-    return {str(path.parent.relative_to(run)): rows_of(path.parent) for path in sorted(run.rglob(NAME))}
+    return {
+        str(path.parent.relative_to(run)): rows_of(path.parent)
+        for path in sorted(run.rglob(NAME))
+    }
 
 
 def begin(words: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -173,9 +234,12 @@ def begin(words: Sequence[str]) -> subprocess.Popen[bytes]:
 
 
 def killed(first: Sequence[str], run: Path, cluster: Cluster, kills: Kills) -> bool:
-    """Carry out a command until its end, killing on the way; return whether there was one."""
+    """Carry out a command until its end, killing on the way; return whether there was
+    one.
+    """
     child: subprocess.Popen[bytes] | None = None
-    before, end = kills.total, time.monotonic() + LONGEST
+    before = kills.total
+    end = time.monotonic() + LONGEST
     while time.monotonic() < end:
         cluster.see_to_it()
         if child is None or child.poll() is not None:
@@ -183,7 +247,9 @@ def killed(first: Sequence[str], run: Path, cluster: Cluster, kills: Kills) -> b
                 return True
             known = (run / "run.yaml").is_file()
             child = begin(
-                ["resume", str(run), f"cluster={cluster.address}"] if known else [*first, "--cluster", cluster.address]
+                ["resume", str(run), f"cluster={cluster.address}"]
+                if known
+                else [*first, "--cluster", cluster.address]
             )
         time.sleep(0.2)
         victim = kills.due() if kills.total - before < OF_A_RUN else None

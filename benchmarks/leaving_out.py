@@ -1,20 +1,26 @@
-"""What leaving things out brings, at equal gradient error, over pairs of scene and control; and that verdicts agree.
+"""What leaving things out brings, at equal gradient error, over pairs of scene and
+control; and that verdicts agree.
 
-    python benchmarks/leaving_out.py [--size 128] [--spp 8] [--repeats 5] [--configurations 200] [--json FILE]
+    python benchmarks/leaving_out.py [--size 128] [--spp 8] [--repeats 5]
+    [--configurations 200] [--json FILE]
 
-The gain of a pair is (squared error x time) of a gradient with nothing left out over that with everything left out,
-so that a smaller error counts as less time. Errors are those of the linear loss of `advsearch check`, against the mean
-of gradients of both at eight times the samples. Searches of 200 renders and more cut light paths too: the gain with the
-cut is in the last column but one. Verdicts are those of the reference model on random configurations of the first pair,
-each rendered at one seed with and without; beside them, how often another seed changes the verdict.
+The gain of a pair is (squared error x time) of a gradient with nothing left out over
+that with everything left out, so that a smaller error counts as less time. Errors are
+those of the linear loss of `advsearch check`, against the mean of gradients of both at
+eight times the samples. Searches of 200 renders and more cut light paths too: the gain
+with the cut is in the last column but one. Verdicts are those of the reference model on
+random configurations of the first pair, each rendered at one seed with and without;
+beside them, how often another seed changes the verdict.
 
-The last row is a search over cameras, whose steps render nothing where light on surfaces predicts them: milliseconds of
-a predicted picture, the gain over a rendered one (squared error x time), and how far both are off, in levels of 255.
-With `--predicted` it is all that is measured.
+The last row is a search over cameras, whose steps render nothing where light on
+surfaces predicts them: milliseconds of a predicted picture, the gain over a rendered
+one (squared error x time), and how far both are off, in levels of 255. With
+`--predicted` it is all that is measured.
 
-First every number of every setting is fixed at both ends of its range, alone, and those of one material in all
-combinations of ends: the picture with everything left out against `--no-specialise`, and against a control that has
-the same values, each of the same seed. With `--ends` that is all that is done.
+First every number of every setting is fixed at both ends of its range, alone, and those
+of one material in all combinations of ends: the picture with everything left out
+against `--no-specialise`, and against a control that has the same values, each of the
+same seed. With `--ends` that is all that is done.
 """
 
 from __future__ import annotations
@@ -58,7 +64,9 @@ PAIRS = (
     ("bottle", "kitchen", "pose"),
 )
 SAME = 0.3
-"""Levels of 255 by which pictures of one seed may differ: a metal of 0.999 for one of 1, and rounding."""
+"""Levels of 255 by which pictures of one seed may differ: a metal of 0.999 for one of
+1, and rounding.
+"""
 REFERENCES = 4
 """Gradients of each kind behind a reference."""
 
@@ -71,9 +79,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--configurations", type=int, default=200)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--predicted", action="store_true", help="the row of light on surfaces alone")
     parser.add_argument(
-        "--ends", action="store_true", help="the pictures with numbers at the ends of their range alone"
+        "--predicted", action="store_true", help="the row of light on surfaces alone"
+    )
+    parser.add_argument(
+        "--ends",
+        action="store_true",
+        help="the pictures with numbers at the ends of their range alone",
     )
     args = parser.parse_args(argv)
     if args.ends:
@@ -82,73 +94,119 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(predicted(args.size, args.spp, args.repeats))
         return 0
     rows = []
-    print("| scene and control | milliseconds | gain | error, of its size | with cut paths | segments |")
+    print(
+        "| scene and control | milliseconds | gain | error, of its size | with cut "
+        "paths | segments |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     for pair in PAIRS:
         row = measured(pair, args.size, args.spp, args.repeats)
         rows.append(row)
         print(
-            f"| {', '.join(pair)} | {1e3 * row['seconds']:.0f} | {row['gain']:.2f} | {row['error']:.3f} "
+            f"| {', '.join(pair)} | {1e3 * row['seconds']:.0f} | {row['gain']:.2f} | "
+            f"{row['error']:.3f} "
             f"| {row['gain_cut']:.2f} | {row['depth']} |",
             flush=True,
         )
     mean = math.exp(statistics.fmean(math.log(row["gain"]) for row in rows))
     with_cut = math.exp(statistics.fmean(math.log(row["gain_cut"]) for row in rows))
-    print(f"geometric mean {mean:.2f}, with cut paths {with_cut:.2f}; smallest {min(row['gain'] for row in rows):.2f}")
+    print(
+        f"geometric mean {mean:.2f}, with cut paths {with_cut:.2f}; smallest "
+        f"{min(row['gain'] for row in rows):.2f}"
+    )
     print(predicted(args.size, args.spp, args.repeats))
     verdicts = agreement(PAIRS[0], args.size, args.spp, args.configurations)
     print(
-        f"verdicts of {verdicts['configurations']} configurations: {verdicts['agree']} agree at one seed, "
+        f"verdicts of {verdicts['configurations']} configurations: {verdicts['agree']} "
+        "agree at one seed, "
         f"{verdicts['other_seed']} agree between two seeds"
     )
     if args.json:
-        args.json.write_text(json.dumps({"rows": rows, "mean": mean, "mean_cut": with_cut, "verdicts": verdicts}))
+        args.json.write_text(
+            json.dumps(
+                {"rows": rows, "mean": mean, "mean_cut": with_cut, "verdicts": verdicts}
+            )
+        )
     wrong = battery()
     return int(wrong or mean < 2.0 or min(row["gain"] for row in rows) < 1.0)
 
 
 def battery() -> int:
-    """Compare pictures with numbers at the ends of their range; 1 if some are not the same."""
+    """Compare pictures with numbers at the ends of their range; 1 if some are not the
+    same.
+    """
     cases: list[tuple[dict[str, Any], dict[str, Any]]] = []
     for family, some in FAMILIES.items():
-        cases += [({f"{family}.{one.name}": end}, {}) for one in some for end in ends(one)]
+        cases += [
+            ({f"{family}.{one.name}": end}, {}) for one in some for end in ends(one)
+        ]
     names = [f"material.{one.name}" for one in MATERIAL]
-    cases += [(dict(zip(names, each, strict=True)), {}) for each in itertools.product((0.0, 1.0), repeat=len(names))]
+    cases += [
+        (dict(zip(names, each, strict=True)), {})
+        for each in itertools.product((0.0, 1.0), repeat=len(names))
+    ]
     for kind in sorted(CONTROLS.own):
-        parameters = [one for one in CONTROLS[kind].parameters if f"{kind}.{one.name}" not in SETTINGS]
-        cases += [({}, {kind: {one.name: end}}) for one in parameters if not one.shape for end in ends(one)]
-    worst, asked = 0.0, 0
+        parameters = [
+            one
+            for one in CONTROLS[kind].parameters
+            if f"{kind}.{one.name}" not in SETTINGS
+        ]
+        cases += [
+            ({}, {kind: {one.name: end}})
+            for one in parameters
+            if not one.shape
+            for end in ends(one)
+        ]
+    worst = 0.0
+    asked = 0
     for fixed, controls in cases:
         try:
             found = ends_apart("ball", fixed, controls)
         except InputError as error:
             print(f"  {fixed or controls}: refused: {str(error).splitlines()[0][:90]}")
             continue
-        asked, worst = asked + 1, max(worst, found)
+        asked = asked + 1
+        worst = max(worst, found)
         if not found <= SAME:
             print(f"  {fixed or controls}: {found:.3f} levels apart", flush=True)
-    print(f"{asked} of {len(cases)} cases of numbers at the ends of their range: at most {worst:.4f} levels apart")
+    print(
+        f"{asked} of {len(cases)} cases of numbers at the ends of their range: at "
+        f"most {worst:.4f} levels apart"
+    )
     return int(not worst <= SAME)
 
 
 def ends(one: Parameter) -> list[float | str]:
-    """The ends of a setting's range, inside what can be rendered; every option of a choice."""
+    """The ends of a setting's range, inside what can be rendered; every option of a
+    choice.
+    """
     if one.options:
         return list(one.options)
     return list(one.search or (one.low, one.high))
 
 
-def ends_apart(thing: str, fixed: Mapping[str, Any], controls: Mapping[str, Any], size: int = 24) -> float:
-    """By how much the pictures of fixed numbers differ, in levels of 255: with everything left out and with nothing;
-    where all are of a material, also where a control has the values."""
-    ways, environment = (EVERYTHING, NOTHING), "studio"
+def ends_apart(
+    thing: str, fixed: Mapping[str, Any], controls: Mapping[str, Any], size: int = 24
+) -> float:
+    """By how much the pictures of fixed numbers differ, in levels of 255: with
+    everything left out and with nothing; where all are of a material, also where a
+    control has the values.
+    """
+    ways = (EVERYTHING, NOTHING)
+    environment = "studio"
     still = {**controls, "lens": controls.get("lens", {})}
     found = [picture(thing, environment, fixed, still, leave, size) for leave in ways]
     if fixed and all(name.startswith("material.") for name in fixed):
         moved = {"material": {name.partition(".")[2]: [0.0, 1.0] for name in fixed}}
-        found += [picture(thing, environment, fixed, moved, leave, size) for leave in ways]
-        other = {name: 1.0 - float(value) for name, value in fixed.items()}  # where the search starts, and goes away
-        found += [picture(thing, environment, other, moved, leave, size, fixed) for leave in ways]
+        found += [
+            picture(thing, environment, fixed, moved, leave, size) for leave in ways
+        ]
+        # where the search starts, and goes away
+        other = {name: 1.0 - float(value) for name, value in fixed.items()}
+        found += [
+            picture(thing, environment, other, moved, leave, size, fixed)
+            for leave in ways
+        ]
     return max(255.0 * float((one - found[0]).square().mean().sqrt()) for one in found)
 
 
@@ -161,19 +219,31 @@ def picture(
     size: int,
     at: Mapping[str, Any] | None = None,
 ) -> torch.Tensor:
-    """The picture (H, W, 3) of a scene with settings, as it is, or with a control `at` other values."""
-    scene = framed(load_scene(thing, environment, settings=dict(settings)).description, size)
+    """The picture (H, W, 3) of a scene with settings, as it is, or with a control `at`
+    other values.
+    """
+    scene = framed(
+        load_scene(thing, environment, settings=dict(settings)).description, size
+    )
     space = make_space(as_controls(dict(controls)), scene)
     renderer = make_renderer(scene, space, size, "none", 0, None, leave_out=leave_out)
-    u = renderer.start if at is None else torch.tensor([float(at[group.name]) for group in space.groups])
+    u = (
+        renderer.start
+        if at is None
+        else torch.tensor([float(at[group.name]) for group in space.groups])
+    )
     with torch.no_grad():
         return renderer(u, 3, 64)
 
 
-def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> dict[str, Any]:
+def measured(
+    pair: tuple[str, str, str], size: int, spp: int, repeats: int
+) -> dict[str, Any]:
     """One pair: times, errors, gains."""
     problem = problem_of(pair, size, pair[2])
-    lean, u, loss = problem.renderer, interior_point(problem.renderer), smooth_loss((size, size))
+    lean = problem.renderer
+    u = interior_point(problem.renderer)
+    loss = smooth_loss((size, size))
     full = lean.like(lean.scene.like(leave_out=NOTHING))
     depth = bounces_of(problem, 0).depth
     ways = [lean, full, lean.like(lean.scene.like(max_depth=depth))]
@@ -208,30 +278,45 @@ def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> d
 
 
 def predicted(size: int, spp: int, repeats: int) -> str:
-    """What a picture takes, and how far it is off, where light on surfaces leaves the tracing out; as a row."""
+    """What a picture takes, and how far it is off, where light on surfaces leaves the
+    tracing out; as a row.
+    """
     renderer = problem_of(PAIRS[0], size, "camera").renderer
     light = SurfaceRenderer(renderer, renderer.start, seed=0).renderer
     seconds: tuple[list[float], list[float]] = ([], [])
     squares: tuple[list[float], list[float]] = ([], [])
     with torch.no_grad():
         for number in range(repeats + 1):
-            u = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(number))
+            u = torch.rand(
+                len(renderer.start), generator=torch.Generator().manual_seed(number)
+            )
             pictures = []
             for kept, way in zip(seconds, (light, renderer), strict=True):
                 begun = time.process_time()
                 pictures.append(way(u, number, spp))
                 kept.append(time.process_time() - begun)
-            for kept, levels in zip(squares, levels_off(renderer, pictures, u, number, 4 * CHECK_SPP), strict=True):
+            for kept, levels in zip(
+                squares,
+                levels_off(renderer, pictures, u, number, 4 * CHECK_SPP),
+                strict=True,
+            ):
                 kept.append(levels**2)
     times = [statistics.median(one[1:]) for one in seconds]
     errors = [statistics.fmean(one) for one in squares]
     gain = times[1] * errors[1] / (times[0] * errors[0])
     off = " and ".join(f"{math.sqrt(one):.1f}" for one in errors)
-    return f"| mug, studio, camera: light on surfaces | {1e3 * times[0]:.0f} | {gain:.1f} | {off} levels | | |"
+    return (
+        f"| mug, studio, camera: light on surfaces | {1e3 * times[0]:.0f} | "
+        f"{gain:.1f} | {off} levels | | |"
+    )
 
 
-def agreement(pair: tuple[str, str, str], size: int, spp: int, count: int) -> dict[str, int]:
-    """Verdicts with everything and with nothing left out, over textures, poses and cameras."""
+def agreement(
+    pair: tuple[str, str, str], size: int, spp: int, count: int
+) -> dict[str, int]:
+    """Verdicts with everything and with nothing left out, over textures, poses and
+    cameras.
+    """
     problem = problem_of(pair, size, "texture,pose,camera")
     lean = problem.renderer
     full = lean.like(lean.scene.like(leave_out=NOTHING))
@@ -241,16 +326,22 @@ def agreement(pair: tuple[str, str, str], size: int, spp: int, count: int) -> di
         for number in range(count):
             u = problem.domain.sample(torch.Generator().manual_seed(number))[0]
             with lean.scene.shorter(depth):
-                verdicts = [int(problem.model(lean(u, noise, spp))[0].argmax()) for noise in (number, count + number)]
+                verdicts = [
+                    int(problem.model(lean(u, noise, spp))[0].argmax())
+                    for noise in (number, count + number)
+                ]
             whole = int(problem.model(full(u, number, spp))[0].argmax())
-            same, other = same + (verdicts[0] == whole), other + (verdicts[0] == verdicts[1])
+            same = same + (verdicts[0] == whole)
+            other = other + (verdicts[0] == verdicts[1])
     return {"configurations": count, "agree": same, "other_seed": other, "depth": depth}
 
 
 def problem_of(pair: tuple[str, str, str], size: int, controls: str) -> Problem:
     """The problem of a pair at a size."""
     named: dict[str, Any] = {name: {} for name in controls.split(",")}
-    config = AttackConfig(object=pair[0], environment=pair[1], controls=named, resolution=(size, size))
+    config = AttackConfig(
+        object=pair[0], environment=pair[1], controls=named, resolution=(size, size)
+    )
     return problem_from_config(config)[0]
 
 

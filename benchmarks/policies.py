@@ -1,11 +1,14 @@
-"""Compares a policy with random search at equal renders on closed-form objectives: how often it is not worse.
+"""Compares a policy with random search at equal renders on closed-form objectives: how
+often it is not worse.
 
-    python benchmarks/policies.py [--policy auto] [--renders 40] [--noise 0 0.3] [--dimensions 1 3 6 12] [--seeds 6]
+    python benchmarks/policies.py [--policy auto] [--renders 40] [--noise 0 0.3]
+    [--dimensions 1 3 6 12] [--seeds 6]
 
-Objectives stand for what is met over poses, lights and choices: a bowl, a ramp, bumps, waves of several lengths down to
-that of a pixel, a saturated margin, angles, and choices. Each is divided by its standard deviation over the domain, and
-noise of a given size in that unit is added to what a policy sees. The results are compared without noise: "not worse"
-means better than random's or within 0.05.
+Objectives stand for what is met over poses, lights and choices: a bowl, a ramp, bumps,
+waves of several lengths down to that of a pixel, a saturated margin, angles, and
+choices. Each is divided by its standard deviation over the domain, and noise of a given
+size in that unit is added to what a policy sees. The results are compared without
+noise: "not worse" means better than random's or within 0.05.
 """
 
 from __future__ import annotations
@@ -21,7 +24,15 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy, search
+from advsearch.attacks import (
+    Block,
+    Domain,
+    Evaluation,
+    Policy,
+    Query,
+    make_policy,
+    search,
+)
 
 Doubles = npt.NDArray[np.float64]
 Function = Callable[[Doubles], Doubles]
@@ -39,7 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=6)
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
-    print("| renders | noise / standard deviation of the objective | not worse | better | searches |")
+    print(
+        "| renders | noise / standard deviation of the objective | not worse | "
+        "better | searches |"
+    )
     print("| --- | --- | --- | --- | --- |")
     for renders in args.renders:
         for noise in args.noise:
@@ -51,15 +65,22 @@ def main(argv: Sequence[str] | None = None) -> int:
                     for seed in range(args.seeds)
                 ]
             )
-            not_worse, better = float((gaps > -TIE).mean()), float((gaps > TIE).mean())
+            not_worse = float((gaps > -TIE).mean())
+            better = float((gaps > TIE).mean())
             print(
-                f"| {renders} | {noise:g} | {100 * not_worse:.0f} % | {100 * better:.0f} % | {len(gaps)} |", flush=True
+                f"| {renders} | {noise:g} | {100 * not_worse:.0f} % | "
+                f"{100 * better:.0f} % | {len(gaps)} |",
+                flush=True,
             )
     return 0
 
 
-def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, seed: int) -> float:
-    """How much better what a policy finds is than what random search finds, without noise, in standard deviations."""
+def gap(
+    policy: Policy[object], kind: str, d: int, renders: int, noise: float, seed: int
+) -> float:
+    """How much better what a policy finds is than what random search finds, without
+    noise, in standard deviations.
+    """
     rng = np.random.default_rng([seed, d, zlib.crc32(kind.encode())])
     domain, function = KINDS[kind](rng, d)
     sample = domain.sample(torch.Generator().manual_seed(99), 500).double().numpy()
@@ -67,29 +88,46 @@ def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, s
 
     def answer(by: Policy[object]) -> float:
         def evaluate(query: Query) -> Evaluation:
-            key = [seed, query.number, zlib.crc32(query.u.numpy().tobytes()), zlib.crc32(by.name.encode())]
+            key = [
+                seed,
+                query.number,
+                zlib.crc32(query.u.numpy().tobytes()),
+                zlib.crc32(by.name.encode()),
+            ]
             value = float(function(query.u.double().numpy()[None])[0]) / spread
             value += noise * float(np.random.default_rng(key).normal())
             return Evaluation(value, None, False)
 
-        found = search(partial(map, evaluate), domain, by, steps=renders, seed=seed).best_u
+        found = search(
+            partial(map, evaluate), domain, by, steps=renders, seed=seed
+        ).best_u
         return float(function(found.double().numpy()[None])[0]) / spread
 
     return answer(policy) - answer(make_policy("random"))
 
 
-# ---- the objectives -------------------------------------------------------------------------------------------------
+# ---- the objectives
+# -------------------------------------------------------------------------------------------------
 
 
-def waves(rng: np.random.Generator, d: int, length: float, count: int = 200) -> Function:
-    """A random smooth function whose features have about a given length (random Fourier features)."""
+def waves(
+    rng: np.random.Generator, d: int, length: float, count: int = 200
+) -> Function:
+    """A random smooth function whose features have about a given length (random Fourier
+    features).
+    """
     directions = rng.normal(size=(count, d)) / length
-    phases, sizes = rng.uniform(0.0, 2.0 * np.pi, count), rng.normal(size=count)
-    return lambda x: np.asarray(math.sqrt(2.0 / count) * np.cos(x @ directions.T + phases) @ sizes)
+    phases = rng.uniform(0.0, 2.0 * np.pi, count)
+    sizes = rng.normal(size=count)
+    return lambda x: np.asarray(
+        math.sqrt(2.0 / count) * np.cos(x @ directions.T + phases) @ sizes
+    )
 
 
 def box(rng: np.random.Generator, d: int, *blocks: Block) -> Domain:
-    """The unit box, or blocks that fill it, with a start near the middle; choices start at their first option."""
+    """The unit box, or blocks that fill it, with a start near the middle; choices start
+    at their first option.
+    """
     start = rng.uniform(0.3, 0.7, d)
     parts = blocks or (Block(d),)
     begin = 0
@@ -97,12 +135,17 @@ def box(rng: np.random.Generator, d: int, *blocks: Block) -> Domain:
         if block.options:
             start[begin] = 0.5 / block.options
         begin += block.size
-    return Domain(torch.tensor(start, dtype=torch.float32), tuple(parts), gradient_cost=10**6)
+    return Domain(
+        torch.tensor(start, dtype=torch.float32), tuple(parts), gradient_cost=10**6
+    )
 
 
 def bowl(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
-    centre, steepness = rng.uniform(0.1, 0.9, d), rng.uniform(0.5, 2.0, d)
-    return box(rng, d), lambda x: np.asarray(-((x - centre) ** 2 * steepness).sum(axis=1))
+    centre = rng.uniform(0.1, 0.9, d)
+    steepness = rng.uniform(0.5, 2.0, d)
+    return box(rng, d), lambda x: np.asarray(
+        -((x - centre) ** 2 * steepness).sum(axis=1)
+    )
 
 
 def ramp(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
@@ -111,7 +154,8 @@ def ramp(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
 
 
 def bumps(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
-    centres, heights = rng.uniform(0.1, 0.9, (6, d)), rng.uniform(0.4, 1.0, 6)
+    centres = rng.uniform(0.1, 0.9, (6, d))
+    heights = rng.uniform(0.4, 1.0, 6)
     widths = rng.uniform(0.15, 0.3, 6) * math.sqrt(d)
 
     def function(x: Doubles) -> Doubles:
@@ -121,13 +165,16 @@ def bumps(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
     return box(rng, d), function
 
 
-def of_length(length: float) -> Callable[[np.random.Generator, int], tuple[Domain, Function]]:
+def of_length(
+    length: float,
+) -> Callable[[np.random.Generator, int], tuple[Domain, Function]]:
     """Waves whose length is this share of the box's diagonal."""
     return lambda rng, d: (box(rng, d), waves(rng, d, length * math.sqrt(d)))
 
 
 def two_scales(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
-    slow, fast = waves(rng, d, 0.35 * math.sqrt(d)), waves(rng, d, 0.03 * math.sqrt(d))
+    slow = waves(rng, d, 0.35 * math.sqrt(d))
+    fast = waves(rng, d, 0.03 * math.sqrt(d))
     return box(rng, d), lambda x: np.asarray(slow(x) + 0.5 * fast(x))
 
 
@@ -138,8 +185,10 @@ def saturated(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
 
 def angles(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
     turns = max(1, d // 2)
-    orders, slopes = rng.integers(-2, 3, (60, turns)), rng.normal(size=(60, d - turns)) / 0.5
-    phases, sizes = rng.uniform(0.0, 2.0 * np.pi, 60), rng.normal(size=60)
+    orders = rng.integers(-2, 3, (60, turns))
+    slopes = rng.normal(size=(60, d - turns)) / 0.5
+    phases = rng.uniform(0.0, 2.0 * np.pi, 60)
+    sizes = rng.normal(size=60)
     rough = waves(rng, d, 0.03 * math.sqrt(d))
 
     def function(x: Doubles) -> Doubles:
@@ -154,13 +203,24 @@ def choices(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
     counts = (3, 8)[: min(2, d)]
     ways = len(counts)
     levels = [rng.normal(size=count) for count in counts]
-    beside = [waves(rng, max(1, d - ways), 0.4 * math.sqrt(max(1, d - ways))) for _ in range(counts[0])]
+    beside = [
+        waves(rng, max(1, d - ways), 0.4 * math.sqrt(max(1, d - ways)))
+        for _ in range(counts[0])
+    ]
 
     def function(x: Doubles) -> Doubles:
-        chosen = [np.minimum((x[:, j] * counts[j]).astype(int), counts[j] - 1) for j in range(ways)]
+        chosen = [
+            np.minimum((x[:, j] * counts[j]).astype(int), counts[j] - 1)
+            for j in range(ways)
+        ]
         value = np.sum([levels[j][chosen[j]] for j in range(ways)], axis=0)
         if d > ways:
-            value = value + np.stack([one(x[:, ways:]) for one in beside])[chosen[0], np.arange(len(x))]
+            value = (
+                value
+                + np.stack([one(x[:, ways:]) for one in beside])[
+                    chosen[0], np.arange(len(x))
+                ]
+            )
         return np.asarray(value)
 
     rest = (Block(d - ways),) if d > ways else ()

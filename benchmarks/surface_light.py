@@ -1,32 +1,40 @@
-"""Light on surfaces: what a picture from a new viewpoint takes, and how far it is off, beside a rendered one.
+"""Light on surfaces: what a picture from a new viewpoint takes, and how far it is off,
+beside a rendered one.
 
-    python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5] [--sizes 128,224]
-    python benchmarks/surface_light.py [SCENE ...] --sweep [--rows 1000]
-    python benchmarks/surface_light.py [SCENE ...] --rule [--views 20]
-    python benchmarks/surface_light.py [SCENE ...] --viewpoints [--sizes 128]
-    python benchmarks/surface_light.py [SCENE ...] --region
+    python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats
+    5] [--sizes 128,224] python benchmarks/surface_light.py [SCENE ...] --sweep [--rows
+    1000] python benchmarks/surface_light.py [SCENE ...] --rule [--views 20] python
+    benchmarks/surface_light.py [SCENE ...] --viewpoints [--sizes 128] python
+    benchmarks/surface_light.py [SCENE ...] --region
 
-A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled mug, bottle and bowl. The model
-is the reference model, for scenes whose object has a class of it. For each scene and size, over random cameras within
+A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled
+mug, bottle and bowl. The model is the reference model, for scenes whose object has a
+class of it. For each scene and size, over random cameras within
 their whole ranges:
 
-- ms: processor time of one picture, predicted and rendered (8 samples, denoised), medians of turns one after the other;
-- levels: root mean square difference of 255 from a picture of `--truth` samples, without the noise that it has itself
-  (two of them are traced), predicted and rendered;
-- margin: mean absolute difference of the model's margin from that of the traced pictures, predicted and rendered;
-- light: seconds of processor time until the first picture can be predicted, and ms for another environment.
+- ms: processor time of one picture, predicted and rendered (8 samples, denoised),
+medians of turns one after the other;
+- levels: root mean square difference of 255 from a picture of `--truth` samples,
+  without the noise that it has itself (two of them are traced), predicted and rendered;
+- margin: mean absolute difference of the model's margin from that of the traced
+pictures, predicted and rendered;
+- light: seconds of processor time until the first picture can be predicted, and ms for
+another environment.
 
-With `--sweep`, of a sweep over azimuth, elevation and distance that is predicted, and two that are rendered with other
-seeds: rows a second, light and comparisons included, and how often that is of the rendered ones (asked for: 5); the
-accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
+With `--sweep`, of a sweep over azimuth, elevation and distance that is predicted, and
+two that are rendered with other seeds: rows a second, light and comparisons included,
+and how often that is of the rendered ones (asked for: 5); the accuracy; and in how many
+rows the verdict is not that of the rendered ones, and how many differ between these.
 
-With `--rule`, how often the comparison before a search accepts predictions (`engine.problem`): by simulation; and as
-they are, and with mistakes planted in them, for `--views` searches, near and from afar, where the object is small.
+With `--rule`, how often the comparison before a search accepts predictions
+(`engine.problem`): by simulation; and as they are, and with mistakes planted in them,
+for `--views` searches, near and from afar, where the object is small.
 
-With `--viewpoints`, the search of the recipe of that name up to its verified result, predicted, and rendered where the
-object moves in place of the shift of the picture; with `--region`, a region over azimuth and elevation with its map,
-and one over more of both and the distance, predicted and rendered: processor seconds and seconds (asked for, of the
-first: a quarter).
+With `--viewpoints`, the search of the recipe of that name up to its verified result,
+predicted, and rendered where the object moves in place of the shift of the picture;
+with `--region`, a region over azimuth and elevation with its map, and one over more of
+both and the distance, predicted and rendered: processor seconds and seconds (asked for,
+of the first: a quarter).
 """
 
 from __future__ import annotations
@@ -52,7 +60,13 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
+from advsearch.engine.acceptance import (
+    VIEWS,
+    ComparedView,
+    Deviation,
+    compared,
+    view_of,
+)  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
@@ -81,10 +95,22 @@ def main() -> None:
     parser.add_argument("--sizes", default="128,224")
     parser.add_argument("--label", help="what the object is, for a file")
     parser.add_argument("--sweep", action="store_true", help="rows of a sweep")
-    parser.add_argument("--rows", type=int, default=1000, help="of it, about (default 1000)")
-    parser.add_argument("--rule", action="store_true", help="how often predictions are accepted, right and wrong ones")
-    parser.add_argument("--viewpoints", action="store_true", help="the search of the recipe of that name")
-    parser.add_argument("--region", action="store_true", help="a region over viewpoints, with its map")
+    parser.add_argument(
+        "--rows", type=int, default=1000, help="of it, about (default 1000)"
+    )
+    parser.add_argument(
+        "--rule",
+        action="store_true",
+        help="how often predictions are accepted, right and wrong ones",
+    )
+    parser.add_argument(
+        "--viewpoints",
+        action="store_true",
+        help="the search of the recipe of that name",
+    )
+    parser.add_argument(
+        "--region", action="store_true", help="a region over viewpoints, with its map"
+    )
     args = parser.parse_args()
     if args.viewpoints or args.region:
         for scene in args.scenes:
@@ -105,17 +131,32 @@ def main() -> None:
             swept(scene, args.rows, args.label)
         return
     model = load_model("reference")
-    print("predicted | rendered          ms a picture       levels off         margin off     light: s   ms")
+    print(
+        "predicted | rendered          ms a picture       levels off         margin "
+        "off     light: s   ms"
+    )
     for scene in args.scenes:
         thing, _, environment = scene.partition("@")
         loaded = load_scene(thing, environment or None)
         label = args.label or loaded.description.object.label
         for size in map(int, args.sizes.split(",")):
             with torch.no_grad():
-                row(Path(thing).stem, loaded.renderer(["camera", "environment"], resolution=size), model, label, args)
+                row(
+                    Path(thing).stem,
+                    loaded.renderer(["camera", "environment"], resolution=size),
+                    model,
+                    label,
+                    args,
+                )
 
 
-def row(name: str, renderer: Renderer, model: Model, label: str | None, args: argparse.Namespace) -> None:
+def row(
+    name: str,
+    renderer: Renderer,
+    model: Model,
+    label: str | None,
+    args: argparse.Namespace,
+) -> None:
     """Print what one scene at one size comes to."""
     height = renderer.formation.resolution[0]
     reason = why_not(renderer, ["camera", "environment"])
@@ -141,17 +182,29 @@ def row(name: str, renderer: Renderer, model: Model, label: str | None, args: ar
     off: list[list[float]] = [[], []]
     margins: list[list[float]] = [[], []]
     for number, whole in enumerate(wholes):
-        traced = [renderer(whole, seed=100 + 2 * number + half, spp=args.truth) for half in range(2)]
-        for kind, picture in enumerate((light(whole), renderer(whole, seed=number, spp=SPP))):
+        traced = [
+            renderer(whole, seed=100 + 2 * number + half, spp=args.truth)
+            for half in range(2)
+        ]
+        for kind, picture in enumerate(
+            (light(whole), renderer(whole, seed=number, spp=SPP))
+        ):
             square = ((picture - traced[0]) * (picture - traced[1])).mean()
             off[kind].append(255.0 * float(square.clamp_min(0.0).sqrt()))
             if label in model.labels:
                 right = sum(margin(model, one, label) for one in traced) / 2.0
                 margins[kind].append(abs(margin(model, picture, label) - right))
-    shown = "       -         " if not margins[0] else " | ".join(f"{statistics.fmean(one):6.2f}" for one in margins)
+    shown = (
+        "       -         "
+        if not margins[0]
+        else " | ".join(f"{statistics.fmean(one):6.2f}" for one in margins)
+    )
     ms = " | ".join(f"{statistics.median(one[1:]):6.1f}" for one in taken)
     levels = " | ".join(f"{statistics.fmean(one):6.2f}" for one in off)
-    print(f"{name:20s} {height:4d}  {ms}   {levels}   {shown}   {first:6.1f} {statistics.median(others):6.0f}")
+    print(
+        f"{name:20s} {height:4d}  {ms}   {levels}   {shown}   {first:6.1f} "
+        f"{statistics.median(others):6.0f}"
+    )
 
 
 def swept(scene: str, rows: int, label: str | None) -> None:
@@ -162,24 +215,53 @@ def swept(scene: str, rows: int, label: str | None) -> None:
         "camera.elevation": "5:60:10",
         "camera.sizes": "2:5:5",
     }
-    config = SweepConfig(object=thing, environment=environment or "studio", label=label, grid=grid, trials=0)
-    sweeps = [config, *(config.model_copy(update={"specialise": False, "seed": seed}) for seed in (0, 1))]
-    found, speeds = list[SweepResult](), list[float]()
+    config = SweepConfig(
+        object=thing,
+        environment=environment or "studio",
+        label=label,
+        grid=grid,
+        trials=0,
+    )
+    sweeps = [
+        config,
+        *(
+            config.model_copy(update={"specialise": False, "seed": seed})
+            for seed in (0, 1)
+        ),
+    ]
+    found = list[SweepResult]()
+    speeds = list[float]()
     for one in sweeps:
         sweep = Sweep(job_of(one), None, NullProgress())
         found.append(sweep.carry_out())
         speeds.append(sweep.total / sweep.stages.seconds["sweep"])
     right = [[row.correct for row in one.rows()] for one in found]
-    differ = [sum(a != b for a, b in zip(*pair, strict=True)) for pair in itertools.combinations(right, 2)]
+    differ = [
+        sum(a != b for a, b in zip(*pair, strict=True))
+        for pair in itertools.combinations(right, 2)
+    ]
     accuracy = " | ".join(f"{statistics.fmean(map(bool, one)):.3f}" for one in right)
     speed = " | ".join(f"{one:.1f}" for one in speeds)
     told = found[0].summary.transport
-    print(f"{scene}, {len(right[0])} rows, predicted | rendered | rendered with another seed")
-    print(f"  rows a second   {speed}   ({speeds[0] / statistics.fmean(speeds[1:]):.1f} times)")
+    print(
+        f"{scene}, {len(right[0])} rows, predicted | rendered | rendered with "
+        "another seed"
+    )
+    print(
+        f"  rows a second   {speed}   "
+        f"({speeds[0] / statistics.fmean(speeds[1:]):.1f} times)"
+    )
     print(f"  accuracy        {accuracy}")
-    print(f"  verdicts that differ: {differ[0]} and {differ[1]} of the rendered ones, {differ[2]} between these")
+    print(
+        f"  verdicts that differ: {differ[0]} and {differ[1]} of the rendered ones, "
+        f"{differ[2]} between these"
+    )
     assert told is not None
-    error = "" if told.error is None else f"{told.error.levels:.2f} levels off, {told.error.logits:+.2f} logits; "
+    error = (
+        ""
+        if told.error is None
+        else (f"{told.error.levels:.2f} levels off, {told.error.logits:+.2f} logits; ")
+    )
     print(f"  {error}{told.reason or 'all predicted'}", flush=True)
 
 
@@ -196,14 +278,25 @@ def ruled(scene: str, searches: int) -> None:
     """Print how often the comparison accepts predictions, and wrong ones."""
     thing, _, environment = scene.partition("@")
     loaded = load_scene(thing, environment or None)
-    model, label = load_model("reference"), loaded.description.object.label
+    model = load_model("reference")
+    label = loaded.description.object.label
     for name, camera in (("", {}), (", small", {"distance": [4.0, 5.0]})):
-        renderer = loaded.renderer({"camera": camera, "environment": {}}, resolution=128)
+        renderer = loaded.renderer(
+            {"camera": camera, "environment": {}}, resolution=128
+        )
         light = SurfaceRenderer(renderer, renderer.start, seed=0)
-        accepted, shares, margins, views_seen = [0] * len(PLANTED), [list[float]() for _ in PLANTED], list[float](), 0
+        accepted = [0] * len(PLANTED)
+        shares = [list[float]() for _ in PLANTED]
+        margins = list[float]()
+        views_seen = 0
         wholes = views(renderer, VIEWS * searches)
         for search in range(searches):
-            seen = [compare(renderer, light, wholes[VIEWS * search + n], search, model, label) for n in range(VIEWS)]
+            seen = [
+                compare(
+                    renderer, light, wholes[VIEWS * search + n], search, model, label
+                )
+                for n in range(VIEWS)
+            ]
             for kind in range(len(PLANTED)):
                 column = [one[kind] for one in seen]
                 found = compared(column.__getitem__)
@@ -211,27 +304,51 @@ def ruled(scene: str, searches: int) -> None:
                 shares[kind].append(Deviation.of(column).share)
                 views_seen += found.pictures // 3 if kind == 0 else 0
             margins += [one[0].margin for one in seen]
-        print(f"{scene}{name}: accepted of {searches} searches, and levels off as a share of the limit")
+        print(
+            f"{scene}{name}: accepted of {searches} searches, and levels off as a "
+            "share of the limit"
+        )
         for planted, count, share in zip(PLANTED, accepted, shares, strict=True):
-            print(f"  {planted:24s} {count:3d}   {statistics.fmean(share):.2f}", flush=True)
-        told = f"{statistics.fmean(margins):+.2f}, with a deviation of {statistics.stdev(margins):.2f} over views"
-        print(f"  views compared: {views_seen / searches:.1f}; margin off by {told}", flush=True)
+            print(
+                f"  {planted:24s} {count:3d}   {statistics.fmean(share):.2f}",
+                flush=True,
+            )
+        told = (
+            f"{statistics.fmean(margins):+.2f}, with a deviation of "
+            f"{statistics.stdev(margins):.2f} over views"
+        )
+        print(
+            f"  views compared: {views_seen / searches:.1f}; margin off by {told}",
+            flush=True,
+        )
 
 
 def compare(
-    renderer: Renderer, light: SurfaceRenderer, whole: Tensor, search: int, model: Model, label: str | None
+    renderer: Renderer,
+    light: SurfaceRenderer,
+    whole: Tensor,
+    search: int,
+    model: Model,
+    label: str | None,
 ) -> list[ComparedView]:
-    """One view, predicted and with each mistake planted; all beside the same traced pictures."""
+    """One view, predicted and with each mistake planted; all beside the same traced
+    pictures.
+    """
     inputs = renderer.scene.assembly(renderer.space.inputs(whole))
     lit = light.light(inputs)
-    brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
+    brighter = [
+        replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)
+    ]
     pictures = []
     for light.fixed in brighter:
         pictures.append(light(whole))
     light.fixed = None
     pictures += [pictures[0].roll(1, dims=1), pictures[0]]
     once: Any = Once(renderer)
-    found = [view_of(once, one, whole, search, SPP, lambda at, _: margin(model, at, label)) for one in pictures]
+    found = [
+        view_of(once, one, whole, search, SPP, lambda at, _: margin(model, at, label))
+        for one in pictures
+    ]
     return [*found[:-1], replace(found[-1], margin=found[-1].margin + 0.5)]
 
 
@@ -248,48 +365,96 @@ class Once:
 
 
 def simulated(searches: int = 4000) -> None:
-    """Print how often the rule accepts, over views whose squared errors are log-normal, by simulation."""
+    """Print how often the rule accepts, over views whose squared errors are log-normal,
+    by simulation.
+    """
     generator = np.random.default_rng(0)
 
     def accepts(share: float, bias: float, spread: float, deviation: float) -> str:
         sigma = math.sqrt(math.log(1.0 + spread**2))
         normal = generator.normal(size=(2, searches, VIEWS))
-        squares, moved = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
+        squares = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0)
+        moved = bias + deviation * normal[1]
         good = sum(
-            compared(lambda n, one=one: ComparedView(16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3)).good  # type: ignore[misc]
+            compared(
+                lambda n, one=one: ComparedView(
+                    16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3
+                )
+            ).good  # type: ignore[misc]
             for one in range(searches)
         )
         return f"{100.0 * good / searches:5.1f}"
 
     levels = (0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5)
-    print("accepted, %, where predictions are off by a share of the limit in levels of", *levels)
+    print(
+        "accepted, %, where predictions are off by a share of the limit in levels of",
+        *levels,
+    )
     for spread in (0.5, 0.8, 1.2):
-        print(f"  squares spread by {spread}:", *(accepts(share, 0.0, spread, 0.2) for share in levels), flush=True)
+        print(
+            f"  squares spread by {spread}:",
+            *(accepts(share, 0.0, spread, 0.2) for share in levels),
+            flush=True,
+        )
     biases = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0)
-    print("accepted, %, of half the limit in levels, where the margin is off by", *biases)
+    print(
+        "accepted, %, of half the limit in levels, where the margin is off by", *biases
+    )
     for deviation in (0.2, 0.3, 0.45):
-        print(f"  deviation {deviation}:", *(accepts(0.5, bias, 0.8, deviation) for bias in biases), flush=True)
+        print(
+            f"  deviation {deviation}:",
+            *(accepts(0.5, bias, 0.8, deviation) for bias in biases),
+            flush=True,
+        )
 
 
 def searched(thing: str, environment: str, size: int) -> None:
-    """Print what the search of the recipe for viewpoints takes, and one that moves the object instead."""
-    asked = RecipeConfig(recipe="viewpoints", object=thing, environment=environment, resolution=(size, size))
-    (config,) = [one.config for one in planned(read_recipe("viewpoints"), asked) if one.part == "search"]
+    """Print what the search of the recipe for viewpoints takes, and one that moves the
+    object instead.
+    """
+    asked = RecipeConfig(
+        recipe="viewpoints",
+        object=thing,
+        environment=environment,
+        resolution=(size, size),
+    )
+    (config,) = [
+        one.config
+        for one in planned(read_recipe("viewpoints"), asked)
+        if one.part == "search"
+    ]
     assert isinstance(config, AttackConfig)
-    camera = {name: ends for name, ends in config.controls["camera"].items() if not name.startswith("shift")}
+    camera = {
+        name: ends
+        for name, ends in config.controls["camera"].items()
+        if not name.startswith("shift")
+    }
     moved = {"camera": camera, "pose": {"x": [-0.2, 0.2], "y": [-0.2, 0.2]}}
-    for name, one in (("predicted", config), ("rendered", config.model_copy(update={"controls": moved}))):
+    for name, one in (
+        ("predicted", config),
+        ("rendered", config.model_copy(update={"controls": moved})),
+    ):
         begun = time.process_time()
         found = attack_once(one).summary
-        taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
-        print(f"{thing}@{environment} {size:4d} {name:10s} {taken}, {found.ending}", flush=True)
+        taken = (
+            f"{time.process_time() - begun:5.1f} processor seconds, "
+            f"{found.seconds['total']:5.1f} seconds"
+        )
+        print(
+            f"{thing}@{environment} {size:4d} {name:10s} {taken}, {found.ending}",
+            flush=True,
+        )
 
 
 def grown(thing: str, environment: str) -> None:
     """Print what a region over azimuth and elevation takes, predicted and rendered."""
     whole = {"azimuth": [0, 360], "elevation": [0, 80], "distance": [1.5, 5]}
-    two, three = ["camera.azimuth", "camera.elevation"], [f"camera.{name}" for name in whole]
-    for kind, side, controls, vary in (("with its map", 16, {}, two), ("farther", 0, whole, three)):
+    two = ["camera.azimuth", "camera.elevation"]
+    three = [f"camera.{name}" for name in whole]
+    for kind, side, controls, vary in (
+        ("with its map", 16, {}, two),
+        ("farther", 0, whole, three),
+    ):
         for name, specialise in (("predicted", True), ("rendered", False)):
             with tempfile.TemporaryDirectory() as folder:
                 begun = time.process_time()
@@ -297,9 +462,19 @@ def grown(thing: str, environment: str) -> None:
                     thing, environment=environment, controls={"camera": controls}, vary=vary, map=side,
                     samples=60 if side else 100, specialise=specialise, run=Path(folder) / "run", progress=False,
                 )  # fmt: skip
-            taken = f"{time.process_time() - begun:5.1f} processor seconds, {found.seconds['total']:5.1f} seconds"
-            told = f"{found.same} of {found.samples} in {found.volume:.2f} of the range" if found.volume else ""
-            print(f"{thing}@{environment} region {kind} {name:10s} {taken}, {told}", flush=True)
+            taken = (
+                f"{time.process_time() - begun:5.1f} processor seconds, "
+                f"{found.seconds['total']:5.1f} seconds"
+            )
+            told = (
+                f"{found.same} of {found.samples} in {found.volume:.2f} of the range"
+                if found.volume
+                else ""
+            )
+            print(
+                f"{thing}@{environment} region {kind} {name:10s} {taken}, {told}",
+                flush=True,
+            )
 
 
 def views(renderer: Renderer, count: int) -> list[Tensor]:

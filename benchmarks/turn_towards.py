@@ -1,11 +1,13 @@
-"""A tiny policy that turns towards the bundled mug, by behaviour cloning in rendered pictures; for task `command`.
+"""A tiny policy that turns towards the bundled mug, by behaviour cloning in rendered
+pictures; for task `command`.
 
     python benchmarks/turn_towards.py turn.pt2 [--pictures 400] [--rounds 60] [--seed 0]
 
-It gets a picture (N, 3, 32, 32) and a state, `speed` (N, 1) in m/s, and returns a yaw rate (N, 1) in rad/s, over 0 to
-the left. The teacher is pure pursuit (Coulter 1992, section 2) of a point 1 m ahead: 2 x speed x sin(bearing), by the
-bearing of the mug's middle column. Prints how far off the policy is in pictures that it was not trained on, which have
-other places, turns, lights and cameras.
+It gets a picture (N, 3, 32, 32) and a state, `speed` (N, 1) in m/s, and returns a yaw
+rate (N, 1) in rad/s, over 0 to the left. The teacher is pure pursuit (Coulter 1992,
+section 2) of a point 1 m ahead: 2 x speed x sin(bearing), by the bearing of the mug's
+middle column. Prints how far off the policy is in pictures that it was not trained on,
+which have other places, turns, lights and cameras.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ from advsearch.controls import compose  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer  # noqa: E402
 from advsearch.scene.color import to_8_bit  # noqa: E402
 
-SIDE, FOV, SPP = 32, 35.0, 8
+SIDE = 32
+FOV = 35.0
+SPP = 8
 SPEEDS = 0.5, 1.5
 ANYWHERE = {
     "pose": {"yaw": [0, 360], "x": [-0.5, 0.5], "y": [-0.5, 0.5]},
@@ -43,21 +47,33 @@ class Turn(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         sizes = (3, 8, 12, 16)
-        convolutions = [layer for a, b in itertools.pairwise(sizes) for layer in (nn.Conv2d(a, b, 3, 2, 1), nn.ReLU())]
-        self.see = nn.Sequential(*convolutions, nn.Flatten(), nn.Linear(256, 16), nn.ReLU())
+        convolutions = [
+            layer
+            for a, b in itertools.pairwise(sizes)
+            for layer in (nn.Conv2d(a, b, 3, 2, 1), nn.ReLU())
+        ]
+        self.see = nn.Sequential(
+            *convolutions, nn.Flatten(), nn.Linear(256, 16), nn.ReLU()
+        )
         self.decide = nn.Sequential(nn.Linear(17, 16), nn.ReLU(), nn.Linear(16, 1))
 
     def forward(self, images: Tensor, state: dict[str, Tensor]) -> Tensor:
-        rate: Tensor = self.decide(torch.cat([self.see(images - 0.5), state["speed"]], dim=1))
+        rate: Tensor = self.decide(
+            torch.cat([self.see(images - 0.5), state["speed"]], dim=1)
+        )
         return rate
 
 
 @torch.no_grad()
 def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Return pictures (N, 3, SIDE, SIDE) of the mug, and its bearing in each, (N, 1) in radians to the left."""
+    """Return pictures (N, 3, SIDE, SIDE) of the mug, and its bearing in each, (N, 1) in
+    radians to the left.
+    """
     description = framed(load_scene("mug").description, SIDE)
     space = compose(as_controls(ANYWHERE), description)
-    renderer = make_renderer(description, space, SIDE, "none", seed, differentiated=False)
+    renderer = make_renderer(
+        description, space, SIDE, "none", seed, differentiated=False
+    )
     draw = torch.Generator().manual_seed(seed)
     seen: list[Tensor] = []
     bearings: list[float] = []
@@ -66,9 +82,16 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
         columns = renderer.mask(u).sum(dim=0).double()
         if columns.sum() < 8:
             continue
-        middle = float((columns * (torch.arange(SIDE) + 0.5)).sum() / columns.sum()) / SIDE - 0.5
+        middle = (
+            float((columns * (torch.arange(SIDE) + 0.5)).sum() / columns.sum()) / SIDE
+            - 0.5
+        )
         radiance = renderer.radiance(u, seeds.stream(seed, f"picture {len(seen)}"), SPP)
-        seen.append(to_8_bit(space.picture(u, renderer.formation.display(radiance))).permute(2, 0, 1).clone())
+        seen.append(
+            to_8_bit(space.picture(u, renderer.formation.display(radiance)))
+            .permute(2, 0, 1)
+            .clone()
+        )
         bearings.append(-math.atan(2.0 * middle * math.tan(math.radians(FOV) / 2.0)))
     return torch.stack(seen), torch.tensor(bearings)[:, None]
 
@@ -81,17 +104,24 @@ def taught(bearings: Tensor, draw: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def train(images: Tensor, bearings: Tensor, rounds: int, seed: int) -> Turn:
-    """Return a policy that imitates the teacher, each picture mirrored in half of the rounds."""
+    """Return a policy that imitates the teacher, each picture mirrored in half of the
+    rounds.
+    """
     torch.manual_seed(seed)
-    policy, draw = Turn(), torch.Generator().manual_seed(seed)
+    policy = Turn()
+    draw = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.AdamW(policy.parameters(), lr=3e-3)
     steps = rounds * math.ceil(len(images) / 32)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(rounds):
         for part in torch.randperm(len(images), generator=draw).split(32):
             flip = torch.rand(len(part), generator=draw) < 0.5
-            shown = torch.where(flip[:, None, None, None], images[part].flip(3), images[part])
-            speeds, rates = taught(torch.where(flip[:, None], -bearings[part], bearings[part]), draw)
+            shown = torch.where(
+                flip[:, None, None, None], images[part].flip(3), images[part]
+            )
+            speeds, rates = taught(
+                torch.where(flip[:, None], -bearings[part], bearings[part]), draw
+            )
             loss = nn.functional.mse_loss(policy(shown, {"speed": speeds}), rates)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call, unused-ignore]
@@ -111,18 +141,28 @@ def main() -> None:
     begun = time.process_time()
     images, bearings = pictures(given.pictures + given.pictures // 4, given.seed)
     rendered = time.process_time()
-    policy = train(images[: given.pictures], bearings[: given.pictures], given.rounds, given.seed)
-    held, truth = images[given.pictures :], bearings[given.pictures :]
+    policy = train(
+        images[: given.pictures], bearings[: given.pictures], given.rounds, given.seed
+    )
+    held = images[given.pictures :]
+    truth = bearings[given.pictures :]
     speeds, rates = taught(truth, torch.Generator().manual_seed(1))
     with torch.no_grad():
         off = policy(held, {"speed": speeds}) - rates
     seconds = rendered - begun, time.process_time() - rendered
-    print(f"{given.pictures} pictures: {seconds[0]:.0f} s of CPU; training: {seconds[1]:.0f} s")
-    print(f"yaw rate in {len(held)} other pictures: off by {float(off.abs().mean()):.3f} rad/s on average, "
-          f"{float(off.abs().max()):.3f} at most; the teacher's are up to {float(rates.abs().max()):.2f}")  # fmt: skip
+    print(
+        f"{given.pictures} pictures: {seconds[0]:.0f} s of CPU; training: "
+        f"{seconds[1]:.0f} s"
+    )
+    print(f"yaw rate in {len(held)} other pictures: off by "
+          f"{float(off.abs().mean()):.3f} rad/s on average, "
+          f"{float(off.abs().max()):.3f} at most; the teacher's are up to "
+          f"{float(rates.abs().max()):.2f}")  # fmt: skip
     batch = torch.export.Dim("batch", min=1, max=64)
     example = (images[:2].clone(), {"speed": speeds[:2].clone()})
-    program = torch.export.export(policy, example, dynamic_shapes=({0: batch}, {"speed": {0: batch}}))
+    program = torch.export.export(
+        policy, example, dynamic_shapes=({0: batch}, {"speed": {0: batch}})
+    )
     torch.export.save(program, given.file)
     print(f"written: {given.file}, {given.file.stat().st_size:,} bytes")
 

@@ -1,4 +1,5 @@
-"""Draws docs/images/cameras.webp: the bundled mug through each kind of camera, 300 x 300 pixels each.
+"""Draws docs/images/cameras.webp: the bundled mug through each kind of camera, 300 x
+300 pixels each.
 
 python docs/make_camera_images.py
 """
@@ -14,7 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 import advsearch
 
 OUT = Path(__file__).resolve().parent / "images" / "cameras.webp"
-SIDE, CAPTION = 300, 26
+SIDE = 300
+CAPTION = 26
 BARREL = """%YAML:1.0
 ---
 image_width: 640
@@ -51,20 +53,35 @@ def main() -> None:
         ("COLMAP: k1 = -0.3, folds", "cameras.txt", FOLDING),
     ]
     sheet = Image.new("RGB", (3 * SIDE + 20, 2 * (SIDE + CAPTION) + 10), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(15)
     with tempfile.TemporaryDirectory() as folder:
         for number, (caption, camera, text) in enumerate(panels):
             if text:
                 camera = str(Path(folder) / str(camera))
                 Path(camera).write_text(text, encoding="utf-8")
-            settings = {"camera.distance": 1.3, **({} if camera else {"camera.fov": 74.6})}
-            scene = advsearch.load_scene("mug", "kitchen", settings=settings, camera=camera)
+            settings = {
+                "camera.distance": 1.3,
+                **({} if camera else {"camera.fov": 74.6}),
+            }
+            scene = advsearch.load_scene(
+                "mug", "kitchen", settings=settings, camera=camera
+            )
             rendered = advsearch.render(scene, resolution=SIDE, spp=32, progress=False)
             print(caption, *rendered.warnings, sep="\n  ")
-            picture = Image.fromarray((rendered.views[0].picture.numpy() * 255.0).round().astype(np.uint8))
-            left, top = (number % 3) * (SIDE + 10), (number // 3) * (SIDE + CAPTION + 10)
+            picture = Image.fromarray(
+                (rendered.views[0].picture.numpy() * 255.0).round().astype(np.uint8)
+            )
+            left = (number % 3) * (SIDE + 10)
+            top = (number // 3) * (SIDE + CAPTION + 10)
             sheet.paste(picture, (left, top))
-            draw.text((left + SIDE / 2, top + SIDE + CAPTION / 2), caption, fill="black", font=font, anchor="mm")
+            draw.text(
+                (left + SIDE / 2, top + SIDE + CAPTION / 2),
+                caption,
+                fill="black",
+                font=font,
+                anchor="mm",
+            )
     sheet.save(OUT, optimize=True)
 
 

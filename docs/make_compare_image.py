@@ -2,8 +2,8 @@
 
     python docs/make_compare_image.py RUN
 
-RUN is the folder of a run of `compare`. Chromium draws its page; the upper part is written to
-`docs/images/compare.png`, in few colours.
+RUN is the folder of a run of `compare`. Chromium draws its page; the upper part is
+written to `docs/images/compare.png`, in few colours.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from pathlib import Path
 from PIL import Image
 
 PICTURE = Path(__file__).resolve().parent / "images" / "compare.png"
-WIDTH, HEIGHT, COLOURS = 720, 1220, 256
+WIDTH = 720
+HEIGHT = 1220
+COLOURS = 256
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,10 +35,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "page.png"
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
-        drawn = [f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={file}", page.as_uri()]
+        drawn = [
+            f"--window-size={WIDTH},{HEIGHT}",
+            f"--screenshot={file}",
+            page.as_uri(),
+        ]
         subprocess.run([browser, *flags, *drawn], check=True, stderr=subprocess.DEVNULL)
         with Image.open(file) as picture:
-            picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(PICTURE, optimize=True)
+            picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
+                PICTURE, optimize=True
+            )
     print(f"written: {PICTURE}", file=sys.stderr)
     return 0
 

@@ -1,9 +1,11 @@
-"""Render every object of a folder in every environment of a folder, on one sheet: a row each, a column each.
+"""Render every object of a folder in every environment of a folder, on one sheet: a row
+each, a column each.
 
     python docs/make_contact_sheet.py OBJECTS ENVIRONMENTS SHEET.webp
 
-Objects are mesh files, environments .hdr or .exr files; the scenes are those of `advsearch render`, with nothing set.
-What it is for: to see that objects of other people stand upright, in the frame and well lit.
+Objects are mesh files, environments .hdr or .exr files; the scenes are those of
+`advsearch render`, with nothing set. What it is for: to see that objects of other
+people stand upright, in the frame and well lit.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ def files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """
     found = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
     if not found:
-        raise SystemExit(f"{folder}: expected files ending in {', '.join(suffixes)}, found none")
+        raise SystemExit(
+            f"{folder}: expected files ending in {', '.join(suffixes)}, found none"
+        )
     return found
 
 
@@ -44,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--resolution", type=int, default=192)
     parser.add_argument("--spp", type=int, default=32)
     given = parser.parse_args(argv)
-    environments, rows = files(given.environments, ENVIRONMENTS), []
+    environments = files(given.environments, ENVIRONMENTS)
+    rows = []
     for mesh in files(given.objects, OBJECTS):
         row = []
         for environment in environments:

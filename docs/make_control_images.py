@@ -2,8 +2,8 @@
 
     python docs/make_control_images.py [NAME ...] [--size 144]
 
-Four configurations of the bundled mug (or of an object that suits the control) stand side by side: the scene as it is,
-and three of what the control can do.
+Four configurations of the bundled mug (or of an object that suits the control) stand
+side by side: the scene as it is, and three of what the control can do.
 """
 
 from __future__ import annotations
@@ -31,14 +31,20 @@ SPP = 128
 def main(argv: Sequence[str] | None = None) -> int:
     """Render and write; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help="controls (default: all)")
-    parser.add_argument("--size", type=int, default=144, help="side of one picture (default 144)")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="controls (default: all)"
+    )
+    parser.add_argument(
+        "--size", type=int, default=144, help="side of one picture (default 144)"
+    )
     args = parser.parse_args(argv)
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name in args.names or list_built_ins("control"):
         path = FOLDER / f"{name}.png"
         row(name, args.size).save(path, optimize=True)
-        print(f"written: {path.relative_to(FOLDER.parent.parent.parent)}", file=sys.stderr)
+        print(
+            f"written: {path.relative_to(FOLDER.parent.parent.parent)}", file=sys.stderr
+        )
     return 0
 
 
@@ -53,22 +59,45 @@ SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "things": ("mug", "room", {"camera.distance": 0.75, "camera.elevation": 20.0}),
     "body": ("person", "street", {"camera.elevation": 6.0, "camera.azimuth": 30.0}),
 }
-"""Object, environment and settings where the mug in the studio does not show it well."""
+"""Object, environment and settings where the mug in the studio does not show it
+well.
+"""
 
-BESIDE = {"things": "bottle@0.05,-0.2; book@0.15,0.2,heading=30; banana@0.2,0,heading=70"}
+BESIDE = {
+    "things": "bottle@0.05,-0.2; book@0.15,0.2,heading=30; banana@0.2,0,heading=70"
+}
 """What stands beside it."""
 
 CONTROLS: Mapping[str, Mapping[str, Any]] = {
-    "camera": {"camera": {"azimuth": [0, 360], "elevation": [5, 70], "roll": [-20, 20], "fov": [20, 70]}},
+    "camera": {
+        "camera": {
+            "azimuth": [0, 360],
+            "elevation": [5, 70],
+            "roll": [-20, 20],
+            "fov": [20, 70],
+        }
+    },
     "path": {"path": {"path": "approach", "reach": 4.0}},
-    "environment": {"environment": {"which": ["own", "kitchen", "noon", "loft"], "rotation": [0, 360]}},
+    "environment": {
+        "environment": {
+            "which": ["own", "kitchen", "noon", "loft"],
+            "rotation": [0, 360],
+        }
+    },
     "light": {
         "key": {"kind": "light", "power": [0.5, 4], "x": [-2, 2], "y": [-2, 2]},
         "fill": {"kind": "light", "red": [0, 1], "blue": [0, 1], "power": [0.5, 4]},
     },
     "material": {"material.which": {}},
-    "occlusion": {"occlusion": {"which": ["vase", "banana", "book", "card"], "coverage": [0.0, 0.5]}},
-    "things": {"things": {"x": [-0.15, 0.15], "y": [-0.15, 0.15], "heading": [-180, 180]}},
+    "occlusion": {
+        "occlusion": {
+            "which": ["vase", "banana", "book", "card"],
+            "coverage": [0.0, 0.5],
+        }
+    },
+    "things": {
+        "things": {"x": [-0.15, 0.15], "y": [-0.15, 0.15], "heading": [-180, 180]}
+    },
     "geometry": {"geometry": {"epsilon": 0.12}},
     "haze": {"haze": {"density": [0.0, 0.6]}},
     "mitsuba": {
@@ -78,7 +107,13 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
     "projector": {"projector": {"resolution": 16, "lumens": 4}},
     "shadow": {"shadow": {"size": [0.3, 0.6], "distance": 1.0}},
     "sensor": {
-        "sensor": {"shot": [0.0, 0.15], "mosaic": [0, 1], "red": [-1, 1], "blue": [-1, 1], "compression": [0, 95]}
+        "sensor": {
+            "shot": [0.0, 0.15],
+            "mosaic": [0, 1],
+            "red": [-1, 1],
+            "blue": [-1, 1],
+            "compression": [0, 95],
+        }
     },
 }
 """What is varied where it is not simply the control with its defaults."""
@@ -91,22 +126,31 @@ def row(name: str, size: int) -> Image.Image:
     controls = dict(CONTROLS.get(name, {name: {}}))
     space = make_space(as_controls(controls), scene.description)
     render = make_renderer(scene.description, space, size, "oidn", 0)
-    pictures = [render.start, *(_example(space.start, space.groups, number) for number in range(1, 4))]
+    pictures = [
+        render.start,
+        *(_example(space.start, space.groups, number) for number in range(1, 4)),
+    ]
     with torch.no_grad():
         shown = [to_8_bit(render(u, seed=0, spp=SPP)) for u in pictures]
     gap = torch.ones(size, 6, 3)
-    strip = torch.cat([part for picture in shown for part in (picture, gap)][:-1], dim=1)
+    strip = torch.cat(
+        [part for picture in shown for part in (picture, gap)][:-1], dim=1
+    )
     return Image.fromarray((strip * 255.0).round().to(torch.uint8).numpy())
 
 
 def _example(start: Tensor, groups: Any, number: int) -> Tensor:
-    """A configuration that shows something: random numbers, the options in turn, balls left for the most part."""
+    """A configuration that shows something: random numbers, the options in turn, balls
+    left for the most part.
+    """
     generator = torch.Generator().manual_seed(number)
     u = start.clone()
     for group in groups:
         part = group.coordinates
         if group.options:
-            u[part] = ((number * max(1, group.options // 4)) % group.options + 0.5) / group.options
+            u[part] = (
+                (number * max(1, group.options // 4)) % group.options + 0.5
+            ) / group.options
         elif group.budget.norm == "box":
             u[part] = torch.rand(group.size, generator=generator)
         elif group.budget.norm == "linf":
@@ -114,7 +158,9 @@ def _example(start: Tensor, groups: Any, number: int) -> Tensor:
             u[part] = (start[part] + group.budget.epsilon * move).clamp(0.0, 1.0)
         else:
             move = torch.randn(group.size, generator=generator)
-            u[part] = (start[part] + group.budget.epsilon * move / move.norm()).clamp(0.0, 1.0)
+            u[part] = (start[part] + group.budget.epsilon * move / move.norm()).clamp(
+                0.0, 1.0
+            )
     return u
 
 

@@ -22,10 +22,18 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         advsearch.sweep(
-            "mug", grid={"pose.yaw": "0:360:4"}, environment="studio,noon", path="approach", fps=1, trials=0, run=run
+            "mug",
+            grid={"pose.yaw": "0:360:4"},
+            environment="studio,noon",
+            path="approach",
+            fps=1,
+            trials=0,
+            run=run,
         )
         shutil.copyfile(run / "images" / "drive.png", PICTURE)
-    print(f"written: {PICTURE.relative_to(PICTURE.parent.parent.parent)}", file=sys.stderr)
+    print(
+        f"written: {PICTURE.relative_to(PICTURE.parent.parent.parent)}", file=sys.stderr
+    )
     return 0
 
 

@@ -2,8 +2,9 @@
 
     python docs/make_images.py RUN
 
-RUN is the folder of a run with the control `texture`. Written are `docs/images/attack-mug.png` (the clean picture, the
-adversarial one and the texture, side by side) and, in README.md, the result that the run printed.
+RUN is the folder of a run with the control `texture`. Written are
+`docs/images/attack-mug.png` (the clean picture, the adversarial one and the texture,
+side by side) and, in README.md, the result that the run printed.
 """
 
 from __future__ import annotations
@@ -16,48 +17,75 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from advsearch.cli.output import shown_text as text_of
-from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction, attack_of
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    PicturedPrediction,
+    attack_of,
+)
 from advsearch.report.wording import CLASSIFICATION, prediction_text
 from advsearch.runs.directory import default_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "attack-mug.png"
-BEGIN, END = "<!-- made by docs/make_images.py -->\n", "<!-- end -->"
-SIDE, GAP, CAPTION = 288, 12, 30
+BEGIN = "<!-- made by docs/make_images.py -->\n"
+END = "<!-- end -->"
+SIDE = 288
+GAP = 12
+CAPTION = 30
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Write both files; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a finished run with the control texture")
+    parser.add_argument(
+        "run", type=Path, help="folder of a finished run with the control texture"
+    )
     run = parser.parse_args(argv).run
     summary = attack_of(run)
     side_by_side(run, summary).save(PICTURE, optimize=True)
     readme = ROOT / "README.md"
-    readme.write_text(with_adversarial(readme.read_text(encoding="utf-8"), summary), encoding="utf-8")
-    print(f"written: {PICTURE.relative_to(ROOT)}, {readme.relative_to(ROOT)}", file=sys.stderr)
+    readme.write_text(
+        with_adversarial(readme.read_text(encoding="utf-8"), summary), encoding="utf-8"
+    )
+    print(
+        f"written: {PICTURE.relative_to(ROOT)}, {readme.relative_to(ROOT)}",
+        file=sys.stderr,
+    )
     return 0
 
 
 def side_by_side(run: Path, summary: AttackSummary) -> Image.Image:
-    """Return the clean and the adversarial picture with the model's predictions, and the texture, on white."""
+    """Return the clean and the adversarial picture with the model's predictions, and
+    the texture, on white.
+    """
     panels = [
         ("images/clean.png", f"clean: {_said(summary.clean)}"),
         ("images/adversarial.png", f"adversarial: {_said(summary.adversarial)}"),
         ("artifacts/texture.png", "the texture"),
     ]
-    sheet = Image.new("RGB", (len(panels) * SIDE + (len(panels) - 1) * GAP, SIDE + CAPTION), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    sheet = Image.new(
+        "RGB", (len(panels) * SIDE + (len(panels) - 1) * GAP, SIDE + CAPTION), "white"
+    )
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(15)
     for number, (name, caption) in enumerate(panels):
         left = number * (SIDE + GAP)
         with Image.open(run / name) as picture:
             sheet.paste(_fitted(picture.convert("RGB")), (left, 0))
-        draw.text((left + SIDE / 2, SIDE + CAPTION / 2), caption, fill="black", font=font, anchor="mm")
+        draw.text(
+            (left + SIDE / 2, SIDE + CAPTION / 2),
+            caption,
+            fill="black",
+            font=font,
+            anchor="mm",
+        )
     return sheet
 
 
 def _fitted(picture: Image.Image) -> Image.Image:
-    """Return the picture on a white square of SIDE pixels, as large as it goes in there."""
+    """Return the picture on a white square of SIDE pixels, as large as it goes in
+    there.
+    """
     scale = SIDE / max(picture.size)
     size = round(picture.width * scale), round(picture.height * scale)
     square = Image.new("RGB", (SIDE, SIDE), "white")
@@ -67,11 +95,14 @@ def _fitted(picture: Image.Image) -> Image.Image:
 
 
 def _said(prediction: PicturedPrediction | None) -> str:
-    return prediction_text(CLASSIFICATION, prediction) if prediction else "no prediction"
+    return (
+        prediction_text(CLASSIFICATION, prediction) if prediction else "no prediction"
+    )
 
 
 def with_adversarial(readme: str, summary: AttackSummary) -> str:
-    """Return the text of README.md with the run's result in the marked place; the run gets its usual name in `runs/`.
+    """Return the text of README.md with the run's result in the marked place; the run
+    gets its usual name in `runs/`.
 
     Raises:
         ValueError: there is no such place, or more than one.

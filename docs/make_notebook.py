@@ -1,4 +1,5 @@
-"""Make docs/own-loss.ipynb of docs/own-loss.md: its text as cells of Markdown, its blocks of Python as cells of code.
+"""Make docs/own-loss.ipynb of docs/own-loss.md: its text as cells of Markdown, its
+blocks of Python as cells of code.
 
     python docs/make_notebook.py
 
@@ -14,14 +15,18 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-PAGE, NOTEBOOK = DOCS / "own-loss.md", DOCS / "own-loss.ipynb"
+PAGE = DOCS / "own-loss.md"
+NOTEBOOK = DOCS / "own-loss.ipynb"
 
 
 def notebook() -> dict[str, Any]:
     """Return the notebook, without outputs."""
     cells: list[dict[str, Any]] = []
-    for number, part in enumerate(re.split(r"^```python\n(.*?)^```$", PAGE.read_text("utf-8"), flags=re.M | re.S)):
-        text, code = part.strip(), number % 2 == 1
+    for number, part in enumerate(
+        re.split(r"^```python\n(.*?)^```$", PAGE.read_text("utf-8"), flags=re.M | re.S)
+    ):
+        text = part.strip()
+        code = number % 2 == 1
         last = ast.parse(text).body[-1] if code else None
         if isinstance(last, ast.Assign) and ast.unparse(last.targets[0]) == "result":
             text += "\nresult"
@@ -30,7 +35,9 @@ def notebook() -> dict[str, Any]:
             if code:
                 kind = {"cell_type": "code", "execution_count": None, "outputs": []}
             source = text.splitlines(keepends=True)
-            cells.append({**kind, "id": f"cell-{len(cells)}", "metadata": {}, "source": source})
+            cells.append(
+                {**kind, "id": f"cell-{len(cells)}", "metadata": {}, "source": source}
+            )
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     return {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}

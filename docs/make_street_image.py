@@ -1,4 +1,5 @@
-"""Renders `docs/images/street.webp`: the car and the stop sign in the streets; and `validity.webp`: how far they hold.
+"""Renders `docs/images/street.webp`: the car and the stop sign in the streets; and
+`validity.webp`: how far they hold.
 
 python docs/make_street_image.py [--size 200] [--spp 64] [--only validity]
 """
@@ -32,10 +33,14 @@ FROM = ((90.0, 12.0), (90.0, 25.0), (90.0, 60.0), (0.0, 60.0))
 HEIGHT = 1.6
 
 
-def picture(name: str, light: str, settings: dict[str, float], size: tuple[int, int], spp: int) -> Image.Image:
+def picture(
+    name: str, light: str, settings: dict[str, float], size: tuple[int, int], spp: int
+) -> Image.Image:
     """One picture of a height and width."""
     scene = load_scene(name, light, settings=settings)
-    renderer = make_renderer(framed(scene.description, size), Space(()), size, "oidn", 0)
+    renderer = make_renderer(
+        framed(scene.description, size), Space(()), size, "oidn", 0
+    )
     with torch.no_grad():
         levels = to_8_bit(renderer(renderer.start, 0, spp)) * 255.0
     return Image.fromarray(levels.round().byte().numpy())
@@ -44,11 +49,21 @@ def picture(name: str, light: str, settings: dict[str, float], size: tuple[int, 
 def main(argv: Sequence[str] | None = None) -> int:
     """Render and write; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--size", type=int, default=200, help="half the width of one picture (default 200)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default 64)")
-    parser.add_argument("--only", choices=("street", "validity"), help="one of the two (default: both)")
+    parser.add_argument(
+        "--size",
+        type=int,
+        default=200,
+        help="half the width of one picture (default 200)",
+    )
+    parser.add_argument(
+        "--spp", type=int, default=64, help="samples per pixel (default 64)"
+    )
+    parser.add_argument(
+        "--only", choices=("street", "validity"), help="one of the two (default: both)"
+    )
     args = parser.parse_args(argv)
-    width, height = 2 * args.size, 3 * args.size // 2
+    width = 2 * args.size
+    height = 3 * args.size // 2
     if args.only != "validity":
         sheet = Image.new("RGB", (3 * width, 2 * height))
         for number, (name, light, azimuth, elevation) in enumerate(VIEWS):
@@ -57,19 +72,30 @@ def main(argv: Sequence[str] | None = None) -> int:
             sheet.paste(one, (number % 3 * width, number // 3 * height))
         write(sheet, "street.webp")
     if args.only != "street":
-        side, sheet = width * 3 // 4, Image.new("RGB", (3 * width, width * 3 // 4))
+        side = width * 3 // 4
+        sheet = Image.new("RGB", (3 * width, width * 3 // 4))
         for number, (azimuth, away) in enumerate(FROM):
             middle = 0.73  # height of the car's, metres
             elevation = math.degrees(math.asin((HEIGHT - middle) / away))
-            given = {"camera.azimuth": azimuth, "camera.elevation": elevation, "camera.distance": away}
-            sheet.paste(picture("car", "street", given, (side, side), args.spp), (number * side, 0))
+            given = {
+                "camera.azimuth": azimuth,
+                "camera.elevation": elevation,
+                "camera.distance": away,
+            }
+            sheet.paste(
+                picture("car", "street", given, (side, side), args.spp),
+                (number * side, 0),
+            )
         write(sheet, "validity.webp")
     return 0
 
 
 def write(sheet: Image.Image, name: str) -> None:
     sheet.save(IMAGES / name, quality=86, method=6)
-    print(f"written: {name}, {(IMAGES / name).stat().st_size // 1024} KiB", file=sys.stderr)
+    print(
+        f"written: {name}, {(IMAGES / name).stat().st_size // 1024} KiB",
+        file=sys.stderr,
+    )
 
 
 if __name__ == "__main__":

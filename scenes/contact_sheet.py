@@ -1,9 +1,10 @@
-"""Draws docs/images/objects.webp and docs/images/environments.webp: all objects and environments, to be looked at.
+"""Draws docs/images/objects.webp and docs/images/environments.webp: all objects and
+environments, to be looked at.
 
 Those of the street are drawn by docs/make_street_image.py.
 
-Run as ``python scenes/contact_sheet.py [--out docs/images] [--size 256] [--spp 64]``. It needs
-`mitsuba-oidn` and takes some minutes.
+Run as ``python scenes/contact_sheet.py [--out docs/images] [--size 256] [--spp 64]``.
+It needs `mitsuba-oidn` and takes some minutes.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ def picture(
     elevation: float = 25.0,
     zoom: float = 1.0,
 ) -> Floats:
-    """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
+    """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB.
+    Angles in degrees.
+    """
     import torch
 
     from advsearch.scene.mitsuba_backend.denoise import denoise
@@ -43,10 +46,12 @@ def picture(
 
     mi = mitsuba()
     transform = mi.ScalarTransform4f
-    low, high = asset.mesh.vertices.min(axis=0), asset.mesh.vertices.max(axis=0)
+    low = asset.mesh.vertices.min(axis=0)
+    high = asset.mesh.vertices.max(axis=0)
     middle = (low + high) / 2
     radius = 0.5 * float(np.linalg.norm(high - low)) / zoom
-    a, e = np.radians(azimuth), np.radians(elevation)
+    a = np.radians(azimuth)
+    e = np.radians(elevation)
     away = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     whole = mesh_part(asset.name, asset, np.eye(4), asset.material)
     fov = 35.0
@@ -62,8 +67,15 @@ def picture(
             "sensor": {
                 "type": "perspective",
                 "fov": fov,
-                "to_world": transform().look_at(origin=eye.tolist(), target=middle.tolist(), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+                "to_world": transform().look_at(
+                    origin=eye.tolist(), target=middle.tolist(), up=[0, 0, 1]
+                ),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "rfilter": {"type": "box"},
+                },
             },
             "light": {
                 "type": "envmap",
@@ -73,42 +85,66 @@ def picture(
             "ground": {
                 "type": "rectangle",
                 "to_world": transform().scale([1.5, 1.5, 1]),
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]}},
+                "bsdf": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]},
+                },
             },
-            "object": mitsuba_mesh(asset.name, asset.mesh, np.eye(4), principled(whole)),
+            "object": mitsuba_mesh(
+                asset.name, asset.mesh, np.eye(4), principled(whole)
+            ),
         }
     )
-    layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))
-    radiance = denoise(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
+    layers = torch.from_numpy(
+        np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32)
+    )
+    radiance = denoise(
+        layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:]
+    )
     return linear_to_srgb(radiance.numpy())
 
 
 def _save(path: Path, image: Floats) -> None:
     from PIL import Image
 
-    Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(path, quality=85, method=6)
+    Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(
+        path, quality=85, method=6
+    )
     print(f"{path}: {path.stat().st_size // 1024} KiB")
 
 
 def objects(size: int, spp: int, names: list[str]) -> Floats:
-    """One cell per class: the canonical instance above, three drawn ones below, seven classes in a row."""
+    """One cell per class: the canonical instance above, three drawn ones below, seven
+    classes in a row.
+    """
     light = ENVIRONMENTS["studio"].make()
     cells = []
     for name in names:
         family = OBJECTS[name]
         big = picture(family.generate(None), light, size, spp)
         small = [
-            picture(family.generate(np.random.default_rng(seed)), light, size // 2, spp) for seed in range(2 * VARIANTS)
+            picture(family.generate(np.random.default_rng(seed)), light, size // 2, spp)
+            for seed in range(2 * VARIANTS)
         ]
-        rows = [np.concatenate(small[i : i + 2], axis=1) for i in range(0, 2 * VARIANTS, 2)]
+        rows = [
+            np.concatenate(small[i : i + 2], axis=1) for i in range(0, 2 * VARIANTS, 2)
+        ]
         cells.append(np.concatenate([big, *rows], axis=0))
     width = min(7, len(cells))
     cells += [np.ones_like(cells[0])] * (-len(cells) % width)
-    return np.concatenate([np.concatenate(cells[i : i + width], axis=1) for i in range(0, len(cells), width)], axis=0)
+    return np.concatenate(
+        [
+            np.concatenate(cells[i : i + width], axis=1)
+            for i in range(0, len(cells), width)
+        ],
+        axis=0,
+    )
 
 
 def environments(size: int, spp: int) -> Floats:
-    """For every environment that goes with household objects its map and the mug under it, two in a row."""
+    """For every environment that goes with household objects its map and the mug under
+    it, two in a row.
+    """
     from PIL import Image
 
     mug = OBJECTS["mug"].generate(None)
@@ -116,18 +152,37 @@ def environments(size: int, spp: int) -> Floats:
     for family in (one for one in ENVIRONMENTS.values() if one.ground is None):
         light = family.make()
         chart = linear_to_srgb(light.radiance)
-        wide = Image.fromarray((chart * 255 + 0.5).astype(np.uint8)).resize((2 * size, size), Image.Resampling.BICUBIC)
-        cells.append(np.concatenate([np.asarray(wide, dtype=np.float32) / 255, picture(mug, light, size, spp)], axis=1))
+        wide = Image.fromarray((chart * 255 + 0.5).astype(np.uint8)).resize(
+            (2 * size, size), Image.Resampling.BICUBIC
+        )
+        cells.append(
+            np.concatenate(
+                [
+                    np.asarray(wide, dtype=np.float32) / 255,
+                    picture(mug, light, size, spp),
+                ],
+                axis=1,
+            )
+        )
     cells += [np.ones_like(cells[0])] * (-len(cells) % 2)
-    return np.concatenate([np.concatenate(cells[i : i + 2], axis=1) for i in range(0, len(cells), 2)], axis=0)
+    return np.concatenate(
+        [np.concatenate(cells[i : i + 2], axis=1) for i in range(0, len(cells), 2)],
+        axis=0,
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0] if __doc__ else ""
+    )
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
-    parser.add_argument("--size", type=int, default=256, help="pixels across one picture")
+    parser.add_argument(
+        "--size", type=int, default=256, help="pixels across one picture"
+    )
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel")
-    parser.add_argument("--only", nargs="*", default=list(HOUSEHOLD), help="names of objects")
+    parser.add_argument(
+        "--only", nargs="*", default=list(HOUSEHOLD), help="names of objects"
+    )
     parser.add_argument("--no-environments", action="store_true")
     parser.add_argument("--no-objects", action="store_true")
     args = parser.parse_args()

@@ -1,9 +1,11 @@
-"""Lists the files of an attack whose functions name its epsilon, up to the search, or its settings, up to the end.
+"""Lists the files of an attack whose functions name its epsilon, up to the search, or
+its settings, up to the end.
 
     python tools/main_line.py
 
-Only functions that run count, where they read, take or pass something called `epsilon`, or `config`. The attack is that
-of the command line, on the bundled mug. The fewer the files, the easier it is to follow the main line.
+Only functions that run count, where they read, take or pass something called `epsilon`,
+or `config`. The attack is that of the command line, on the bundled mug. The fewer the
+files, the easier it is to follow the main line.
 """
 
 from __future__ import annotations
@@ -19,7 +21,10 @@ import advsearch
 from advsearch.cli.main import main as run_command
 
 PACKAGE = Path(advsearch.__file__).parent
-COMMAND = "attack --object mug --control texture --epsilon 0.1 --steps 4 --trials 6 --resolution 32 --spp 2 --quiet"
+COMMAND = (
+    "attack --object mug --control texture --epsilon 0.1 --steps 4 --trials 6 "
+    "--resolution 32 --spp 2 --quiet"
+)
 
 
 def names_in(code: CodeType) -> set[str]:
@@ -36,15 +41,24 @@ def names_in(code: CodeType) -> set[str]:
 
 
 def trace_attack(folder: Path) -> dict[str, dict[str, set[str]]]:
-    """Run an attack; return for `epsilon` and for `config` the files and the functions in them."""
-    found: dict[str, dict[str, set[str]]] = {"epsilon": defaultdict(set), "config": defaultdict(set)}
+    """Run an attack; return for `epsilon` and for `config` the files and the functions
+    in them.
+    """
+    found: dict[str, dict[str, set[str]]] = {
+        "epsilon": defaultdict(set),
+        "config": defaultdict(set),
+    }
     names_of_code: dict[CodeType, set[str]] = {}
     is_searching = False
 
     def profile(frame: FrameType, event: str, _: object) -> None:
         nonlocal is_searching
         code = frame.f_code
-        if event != "call" or code in names_of_code or not code.co_filename.startswith(str(PACKAGE)):
+        if (
+            event != "call"
+            or code in names_of_code
+            or not code.co_filename.startswith(str(PACKAGE))
+        ):
             return
         names_of_code[code] = names_in(code)
         file = Path(code.co_filename).relative_to(PACKAGE).as_posix()

@@ -1,10 +1,12 @@
-"""Plants forty faults, each alone, in a copy of the checkout, and shows which test finds it.
+"""Plants forty faults, each alone, in a copy of the checkout, and shows which test
+finds it.
 
     python tools/plant.py [NAME ...] [--all-tests] [--list]
 
-A fault is a text that stands exactly once in a file, and what it becomes. The tests that should find it run until the
-first failure; that test then has to pass without the fault, or else it does not count. Where no test finds a fault, one
-is missing. `tests/test_plant.py` holds the list to the source.
+A fault is a text that stands exactly once in a file, and what it becomes. The tests
+that should find it run until the first failure; that test then has to pass without the
+fault, or else it does not count. Where no test finds a fault, one is missing.
+`tests/test_plant.py` holds the list to the source.
 """
 
 from __future__ import annotations
@@ -53,7 +55,10 @@ class Fault:
         text = (root / self.file).read_text("utf-8")
         if text.count(self.before) != 1:
             count = text.count(self.before)
-            raise ValueError(f"{self.name}: expected its text once in {self.file}, got {count} times; renew the fault")
+            raise ValueError(
+                f"{self.name}: expected its text once in {self.file}, got "
+                f"{count} times; renew the fault"
+            )
         return text.replace(self.before, self.after)
 
 
@@ -146,7 +151,8 @@ FAULTS = (
         "models: the gradient of all models but the first is lost",
         "advsearch/tasks/together.py",
         "return [model(images) for model in self.models]",
-        "return [model(images.detach() if number else images) for number, model in enumerate(self.models)]",
+        "return [model(images.detach() if number else images) for number, model in "
+        "enumerate(self.models)]",
         ("tests/tasks/test_together.py",),
     ),
     Fault(
@@ -166,7 +172,8 @@ FAULTS = (
     Fault(
         "attacks: a projection is left out",
         "advsearch/attacks/domain.py",
-        "project_l2_box(u[part], self.start[part], block.epsilon, block.low, block.high)",
+        "project_l2_box(u[part], self.start[part], block.epsilon, block.low, "
+        "block.high)",
         "u[part].clamp(block.low, block.high)",
         ("tests/attacks/test_attacks_domain.py",),
     ),
@@ -250,7 +257,8 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * self.pixel[1]",
+        "(width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * "
+        "self.pixel[1]",
         "width * self.pixel[0], height * self.pixel[1]",
         ("tests/report/test_sheets.py",),
     ),
@@ -307,13 +315,15 @@ FAULTS = (
         "explain: a rule is counted on the rows that chose it",
         "advsearch/rules.py",
         "rule = CountedRule(conditions, counting[inside], counting[~inside])",
-        "rule = CountedRule(conditions, choosing[find_covered(conditions, choosing)], choosing)",
+        "rule = CountedRule(conditions, choosing[find_covered(conditions, choosing)], "
+        "choosing)",
         ("tests/questions/test_rules.py",),
     ),
     Fault(
         "explain: what chance adds is not taken off",
         "advsearch/questions/explain/importance.py",
-        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(n_rows - n_groups, 1)",
+        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(n_rows - n_groups, "
+        "1)",
         "corrected_share = share",
         ("tests/questions/test_rules.py",),
     ),
@@ -357,10 +367,16 @@ class Outcome:
 
 
 def copied(folder: Path) -> Path:
-    """Copy the files of the checkout, as they are now, into a folder and return it; links stay what they are."""
+    """Copy the files of the checkout, as they are now, into a folder and return it;
+    links stay what they are.
+    """
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    for name in filter(os.path.lexists, (ROOT / one for one in names.split("\0") if one)):
+    names = subprocess.run(
+        listed, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for name in filter(
+        os.path.lexists, (ROOT / one for one in names.split("\0") if one)
+    ):
         target = folder / name.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(name, target, follow_symlinks=False)
@@ -368,7 +384,9 @@ def copied(folder: Path) -> Path:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a module, and remove what Python has compiled of it: it goes by the second of a change and the length."""
+    """Write a module, and remove what Python has compiled of it: it goes by the second
+    of a change and the length.
+    """
     path.write_text(text, "utf-8")
     for old in path.parent.glob(f"__pycache__/{path.stem}.*"):
         old.unlink()
@@ -381,7 +399,17 @@ def outcome(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> 
         RuntimeError: none of them ran.
     """
     left_out = [word for one in without for word in ("--deselect", one)]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "--tb=no", *tests, *left_out]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-n0",
+        "--tb=no",
+        *tests,
+        *left_out,
+    ]
     begun = time.perf_counter()
     try:
         ran = subprocess.run(
@@ -399,17 +427,24 @@ def outcome(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> 
     if ran.returncode == 0:
         return Outcome(None, seconds)
     if found is None:
-        raise RuntimeError(f"pytest ended with {ran.returncode} and no failed test:\n{ran.stdout}{ran.stderr}")
+        raise RuntimeError(
+            f"pytest ended with {ran.returncode} and no failed "
+            f"test:\n{ran.stdout}{ran.stderr}"
+        )
     return Outcome(found[1], seconds)
 
 
-def found_by(root: Path, fault: Fault, failing: set[str], *, all_tests: bool = False) -> str | None:
-    """Plant a fault in a copy, and return what finds it, in words; None where nothing does. The copy is as before then.
+def found_by(
+    root: Path, fault: Fault, failing: set[str], *, all_tests: bool = False
+) -> str | None:
+    """Plant a fault in a copy, and return what finds it, in words; None where nothing
+    does. The copy is as before then.
 
     Args:
         root: the copy.
         fault: what is planted.
-        failing: tests that fail without a fault too, and find nothing; those that are met are added.
+        failing: tests that fail without a fault too, and find nothing; those that are
+            met are added.
         all_tests: run all tests where those of the fault do not find it.
     """
     for tests in (fault.tests, ("tests",)) if all_tests else (fault.tests,):
@@ -426,7 +461,9 @@ def found_by(root: Path, fault: Fault, failing: set[str], *, all_tests: bool = F
     return None
 
 
-def planted_prediction(root: Path, fault: Fault, tests: Sequence[str], failing: Collection[str]) -> Outcome:
+def planted_prediction(
+    root: Path, fault: Fault, tests: Sequence[str], failing: Collection[str]
+) -> Outcome:
     """Return what tests say of a copy with a fault in it."""
     path = root / fault.file
     whole = path.read_text("utf-8")
@@ -439,24 +476,42 @@ def planted_prediction(root: Path, fault: Fault, tests: Sequence[str], failing: 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Plant faults, and return 1 if one of them was not found."""
-    parser = argparse.ArgumentParser(prog="python tools/plant.py", description=__doc__.partition("\n")[0])
-    parser.add_argument("name", nargs="*", help="faults, by the beginning of their names, such as scene (default: all)")
-    parser.add_argument("--all-tests", action="store_true", help="run all tests where those that should find it do not")
-    parser.add_argument("--list", action="store_true", help="list the faults and plant none")
+    parser = argparse.ArgumentParser(
+        prog="python tools/plant.py", description=__doc__.partition("\n")[0]
+    )
+    parser.add_argument(
+        "name",
+        nargs="*",
+        help="faults, by the beginning of their names, such as scene (default: all)",
+    )
+    parser.add_argument(
+        "--all-tests",
+        action="store_true",
+        help="run all tests where those that should find it do not",
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="list the faults and plant none"
+    )
     args = parser.parse_args(argv)
-    chosen = [one for one in FAULTS if not args.name or one.name.startswith(tuple(args.name))]
+    chosen = [
+        one for one in FAULTS if not args.name or one.name.startswith(tuple(args.name))
+    ]
     if not chosen:
         parser.error(f"no fault is called so; the rooms are {', '.join(rooms())}")
     if args.list:
         print("\n".join(f"{one.name}   ({one.file})" for one in chosen))
         return 0
-    missed, failing = 0, set[str]()
+    missed = 0
+    failing = set[str]()
     with tempfile.TemporaryDirectory(prefix="plant-") as folder:
         root = copied(Path(folder))
         for fault in chosen:
             by = found_by(root, fault, failing, all_tests=args.all_tests)
             missed += by is None
-            print(f"{fault.name}: {'NOT FOUND' if by is None else f'found by {by}'}", flush=True)
+            print(
+                f"{fault.name}: {'NOT FOUND' if by is None else f'found by {by}'}",
+                flush=True,
+            )
     print(f"{len(chosen) - missed} of {len(chosen)} faults found")
     if failing:
         print(f"These tests fail without a fault too: {', '.join(sorted(failing))}")

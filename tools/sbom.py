@@ -1,9 +1,11 @@
-"""Writes the software bill of materials of the wheel: every package of constraints.txt, as CycloneDX 1.6 in JSON.
+"""Writes the software bill of materials of the wheel: every package of constraints.txt,
+as CycloneDX 1.6 in JSON.
 
     python tools/sbom.py dist   # dist/advsearch-VERSION.cdx.json
 
-What advsearch itself needs is "required", what only its extras and its development need "optional". A package that only
-some versions of Python need has the condition as a property. The same lock gives the same file.
+What advsearch itself needs is "required", what only its extras and its development need
+"optional". A package that only some versions of Python need has the condition as a
+property. The same lock gives the same file.
 """
 
 from __future__ import annotations
@@ -34,10 +36,15 @@ def main(folder: Path) -> Path:
 
 
 def bill(constraints: str, version: str) -> dict[str, Any]:
-    """Return the document (https://cyclonedx.org/docs/1.6/json) of a lock in the form of pip's constraints."""
-    components, needed = list(locked(constraints)), set(needs(NAME))
+    """Return the document (https://cyclonedx.org/docs/1.6/json) of a lock in the form
+    of pip's constraints.
+    """
+    components = list(locked(constraints))
+    needed = set(needs(NAME))
     for one in components:
-        one["scope"] = "required" if canonicalize_name(one["name"]) in needed else "optional"
+        one["scope"] = (
+            "required" if canonicalize_name(one["name"]) in needed else "optional"
+        )
     content = json.dumps([version, components], sort_keys=True)
     return {
         "bomFormat": "CycloneDX",
@@ -50,7 +57,9 @@ def bill(constraints: str, version: str) -> dict[str, Any]:
 
 
 def locked(constraints: str) -> Iterator[dict[str, Any]]:
-    """Yield a component for each line ``NAME==VERSION ; CONDITION``. Raises ValueError where a line pins no version."""
+    """Yield a component for each line ``NAME==VERSION ; CONDITION``. Raises ValueError
+    where a line pins no version.
+    """
     for line in constraints.splitlines():
         text = line.partition("#")[0].strip()
         if not text:
@@ -61,13 +70,20 @@ def locked(constraints: str) -> Iterator[dict[str, Any]]:
             raise ValueError(f"{text}: expected one exact version")
         more: Mapping[str, Any] = {}
         if pinned.marker is not None:
-            more = {"properties": [{"name": f"{NAME}:condition", "value": str(pinned.marker)}]}
+            more = {
+                "properties": [
+                    {"name": f"{NAME}:condition", "value": str(pinned.marker)}
+                ]
+            }
         yield {"type": "library", **_named(pinned.name, only.version), **more}
 
 
 def needs(package: str) -> Iterator[str]:
-    """Yield the names of all packages that an installed one needs here, without extras; those of others included."""
-    left, seen = [(package, "")], {(package, "")}
+    """Yield the names of all packages that an installed one needs here, without extras;
+    those of others included.
+    """
+    left = [(package, "")]
+    seen = {(package, "")}
     while left:
         name, extra = left.pop()
         try:

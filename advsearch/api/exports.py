@@ -1,4 +1,6 @@
-"""What exporters of runs write: the adversarial scene of a run, its rows with images, stored images, printed sheets."""
+"""What exporters of runs write: the adversarial scene of a run, its rows with images,
+stored images, printed sheets.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """The settings of each experiment as keywords: what Python callers may write for them.
 
-A setting is declared once: its default, its range, what it is. In Python more may be written for it than the text of a
-file (`hint_of`). Signatures and docstrings are made from both (`asks`). Type checkers read the keywords of `attack` and
-`sweep` in code: `SceneKeywords` and its subclasses.
+A setting is declared once: its default, its range, what it is. In Python more may be
+written for it than the text of a file (`hint_of`). Signatures and docstrings are made
+from both (`asks`). Type checkers read the keywords of `attack` and `sweep` in code:
+`SceneKeywords` and its subclasses.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ Names = str | Sequence[str]  # names in a list, or in a text with commas between
 
 
 class SceneKeywords(TypedDict, total=False):
-    """Settings that `attack` and `sweep` both take as keywords; their docstrings say what each is."""
+    """Settings that `attack` and `sweep` both take as keywords; their docstrings say
+    what each is.
+    """
 
     environment: Path | Names | None
     up: Literal["y", "z"] | None
@@ -81,8 +84,9 @@ class SceneKeywords(TypedDict, total=False):
 
 
 class _Signature(inspect.Signature):
-    """A signature with all settings, for editors; `help` writes the `short` one, with `**settings` in their place: it
-    lists them below."""
+    """A signature with all settings, for editors; `help` writes the `short` one, with
+    `**settings` in their place: it lists them below.
+    """
 
     __slots__ = ("short",)
     short: Any
@@ -96,63 +100,100 @@ class _Signature(inspect.Signature):
 
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
-RUN = {"run": inspect.Parameter("run", ONLY_BY_NAME, default=None, annotation="str | Path | None")}
+RUN = {
+    "run": inspect.Parameter(
+        "run", ONLY_BY_NAME, default=None, annotation="str | Path | None"
+    )
+}
 KEPT = "The run is kept, in `run` or under runs/."
 SAME = {
     "object": "from `load_scene`, or the name of an object, or a file of one.",
     "model": "from `load_model`, or what that takes.",
-    "progress": "True shows a bar, False none, None one on a terminal; or told how far it is.",
+    "progress": "True shows a bar, False none, None one on a terminal; or told how far "
+    "it is.",
 }
 RAISED = "InputError: anything that the caller can put right; nothing is written then."
-"""What the docstrings of many questions say alike: of the run, of arguments, and of errors."""
+"""What the docstrings of many questions say alike: of the run, of arguments, and of
+errors.
+"""
 Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
 
 def asks(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` the signature and the docstring that they come to. Every
-    setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that the
-    function has of its own stays as it is there."""
+    """Give a function that takes settings as `**settings` the signature and the
+    docstring that they come to. Every setting becomes a keyword with the default that
+    it is declared with, and a line among the arguments. One that the function has of
+    its own stays as it is there.
+    """
 
     def decorate(function: Function) -> Function:
         own = inspect.signature(function)
-        plain = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
-        added, lines = [], []
+        plain = [
+            one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD
+        ]
+        added = []
+        lines = []
         for one in settings(config):
             name = one.field.removesuffix("_")
             if name in own.parameters or one.required:
                 continue
             hint = hint_of(one.field, config.model_fields[one.field].annotation)
-            added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hint))
-            lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
-        signature = _Signature([*plain, *added], return_annotation=own.return_annotation)
+            added.append(
+                inspect.Parameter(
+                    name, ONLY_BY_NAME, default=one.default, annotation=hint
+                )
+            )
+            lines.append(
+                textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    ")
+            )
+        signature = _Signature(
+            [*plain, *added], return_annotation=own.return_annotation
+        )
         signature.short = own
 
         @wraps(function)
         def asked(*args: Any, **given: Any) -> Any:
-            if error := unexpected(function.__name__, given, list(signature.parameters)):
+            if error := unexpected(
+                function.__name__, given, list(signature.parameters)
+            ):
                 raise error
-            check_types({**own.parameters, **RUN}, {**dict(zip(own.parameters, args, strict=False)), **given})
+            check_types(
+                {**own.parameters, **RUN},
+                {**dict(zip(own.parameters, args, strict=False)), **given},
+            )
             try:
                 bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
             allow_named({**bound.arguments, **given})
             kept = ("scene", "model", "beside", "progress", "metrics", "tracker")
-            plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
+            plain = {
+                key: one if key in kept or not is_shallow(one) else as_python(one)
+                for key, one in given.items()
+            }
             with ExitStack() as stack:
                 stack.enter_context(in_turn())
                 if "progress" in own.parameters:
-                    plain["progress"] = stack.enter_context(watched(plain.get("progress")))
-                for key in {"task", "objective", "policy"} & plain.keys() - own.parameters.keys():
+                    plain["progress"] = stack.enter_context(
+                        watched(plain.get("progress"))
+                    )
+                for key in {
+                    "task",
+                    "objective",
+                    "policy",
+                } & plain.keys() - own.parameters.keys():
                     if not isinstance(plain[key], (str, Mapping, type(None))):
                         raise InputError(
-                            f"{key}: expected a name for {function.__name__}, got {told(plain[key])}; `attack` "
+                            f"{key}: expected a name for {function.__name__}, got "
+                            f"{told(plain[key])}; `attack` "
                             "takes your own, and `sweep` a task of your own"
                         )
                 return function(*args, **plain)
 
-        asked.__doc__ = _docstring(function.__doc__ or "", [one.name for one in plain], config.command, lines)
+        asked.__doc__ = _docstring(
+            function.__doc__ or "", [one.name for one in plain], config.command, lines
+        )
         asked.__signature__ = signature  # type: ignore[attr-defined]
         return asked  # type: ignore[return-value]
 
@@ -160,9 +201,11 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
 
 
 WRITTEN = {
-    "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | Names | None",
+    "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | "
+                                                         "Names | None",
     "resolution": "int | str | tuple[int, int] | None", "set_": "Mapping[str, float | str | Sequence[float]] | None",
-    "estimators": "str | Mapping[str, str]", "value_range": "str | Sequence[float] | None",
+    "estimators": "str | Mapping[str, str]", "value_range": "str | Sequence[float] | "
+                                                            "None",
 }  # fmt: skip
 """What may be written for some settings beside what they become."""
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
@@ -170,50 +213,79 @@ LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", 
 
 
 def hint_of(field: str, kind: Any) -> str:
-    """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
-    what may be several names a list."""
-    text = inspect.formatannotation(kind).replace("typing.", "").replace("NoneType", "None")
-    text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)  # bounds are no part of a hint
-    if field in WRITTEN and not (field == "label" and "dict" in text):  # a recipe's may be one of each object
+    """Return what Python callers may write for a setting that is declared as `kind`:
+    for a text also a path, and for what may be several names a list.
+    """
+    text = (
+        inspect.formatannotation(kind)
+        .replace("typing.", "")
+        .replace("NoneType", "None")
+    )
+    # bounds are no part of a hint
+    text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
+    # a recipe's may be one of each object
+    if field in WRITTEN and not (field == "label" and "dict" in text):
         return WRITTEN[field]
     match = re.fullmatch(r"Optional\[(.*)\]", text)
     parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
     wider = {"str": "Path | Names" if field in LISTED else "str | Path"}
-    return " | ".join(re.sub(r"^dict\[.*", "Mapping[str, Any]", wider.get(one, one)) for one in parts)
+    return " | ".join(
+        re.sub(r"^dict\[.*", "Mapping[str, Any]", wider.get(one, one)) for one in parts
+    )
 
 
-def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence[str]) -> str:
-    """A question's own docstring (what it does, and arguments that `SAME` does not describe) with what all of them say:
-    where the run is kept, their arguments by `names`, a line for each setting, and what is raised."""
+def _docstring(
+    text: str, names: Sequence[str], command: str, settings: Sequence[str]
+) -> str:
+    """A question's own docstring (what it does, and arguments that `SAME` does not
+    describe) with what all of them say: where the run is kept, their arguments by
+    `names`, a line for each setting, and what is raised.
+    """
     said, _, own = inspect.cleandoc(text).partition("\n\nArgs:\n")
     if "other arguments are the settings of" not in " ".join(said.split()):
-        said += f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"
-    told = {one.partition(":")[0]: one.rstrip() for one in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own)) if one}
-    listed = [told.get(name, f"{name}: {SAME.get(name)}") for name in names] + [*settings]
+        said += (
+            f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"
+        )
+    told = {
+        one.partition(":")[0]: one.rstrip()
+        for one in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own))
+        if one
+    }
+    listed = [told.get(name, f"{name}: {SAME.get(name)}") for name in names] + [
+        *settings
+    ]
     return f"{said}\n\nArgs:\n{textwrap.indent(chr(10).join(listed), '    ')}\n\nRaises:\n    {RAISED}"
 
 
 def configured(config: type[Made], **given: Any) -> Made:
-    """Return a configuration of settings as Python has them; None is one that was not given.
+    """Return a configuration of settings as Python has them; None is one that was not
+    given.
 
-    A scene, a model and controls may be objects: the settings name them, hold them (`Config.python_object`), and know
-    which of them exist only in this session.
+    A scene, a model and controls may be objects: the settings name them, hold them
+    (`Config.python_object`), and know which of them exist only in this session.
     """
     settings = {name: value for name, value in given.items() if value is not None}
     objects: dict[tuple[str, str], Any] = {}
     only_here: list[PythonOnly] = []
 
-    scene, model = settings.get("object"), settings.get("model")
+    scene = settings.get("object")
+    model = settings.get("model")
     if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
         check_not_spread(settings)
     if isinstance(model, (Model, nn.Module)):
         settings["model"] = model_name(model)
         objects[MODEL, settings["model"]] = model
-        only_here += [PythonOnly("model", settings["model"])] if exists_here(model) else []
+        only_here += (
+            [PythonOnly("model", settings["model"])] if exists_here(model) else []
+        )
     if isinstance(scene, loading.Scene):
-        check_not_of_scene({name: value for name, value in settings.items() if name != "object"})
+        check_not_of_scene(
+            {name: value for name, value in settings.items() if name != "object"}
+        )
         described = loading.scene_as_settings(scene)
-        settings |= {name: value for name, value in described.items() if value is not None}
+        settings |= {
+            name: value for name, value in described.items() if value is not None
+        }
         objects[SCENE, settings["object"]] = scene
         only_here += [PythonOnly("scene")] if scene.only_here else []
     for name in ("controls", "over"):
@@ -223,6 +295,8 @@ def configured(config: type[Made], **given: Any) -> Made:
             if loading.only_here(controls):
                 check_not_spread(settings)
             objects |= {(CONTROL, control.name): control for control in instances}
-            only_here += [PythonOnly("control", kind) for kind in loading.only_here(instances)]
+            only_here += [
+                PythonOnly("control", kind) for kind in loading.only_here(instances)
+            ]
             settings[name] = loading.settings_of(controls)
     return config(**settings).with_python_objects(objects).with_only_here(only_here)

@@ -1,4 +1,5 @@
-"""`render`: pictures of a scene, with what the model says of them; `load_run`, the result of a run from its folder.
+"""`render`: pictures of a scene, with what the model says of them; `load_run`, the
+result of a run from its folder.
 
 And `load_model`, to which a task may be named.
 """
@@ -20,7 +21,13 @@ from advsearch import models
 from advsearch.calls import helped
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
-from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
+from advsearch.engine.naming import (
+    check_run_settings,
+    given_to,
+    in_turn,
+    load_models,
+    scene_of,
+)
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import writable
 from advsearch.errors import InputError
@@ -49,11 +56,13 @@ if TYPE_CHECKING:
 
 @helped
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
-    """Return the result of a run from its folder, of the type that the function of its question returns.
+    """Return the result of a run from its folder, of the type that the function of its
+    question returns.
 
-    An attack's is an `AttackResult`, a sweep's a `SweepResult`, and so on; of several objects, epsilons or models,
-    which only a command attacks, it is the table of them. `search` of a loaded attack is None: `rows("search")` has its
-    steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, and so on; of several
+    objects, epsilons or models, which only a command attacks, it is the table of them.
+    `search` of a loaded attack is None: `rows("search")` has its steps. Nothing is
+    rendered, and no scene or model is loaded before `render` asks for them.
 
     Args:
         run: its name, which stands for runs/NAME, or its folder.
@@ -64,16 +73,22 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
         FileFormatError: it has not ended, or its files are damaged.
     """
     if not isinstance(run, (str, Path)):
-        raise InputError(f"run: expected the name of a run or its folder, got {run!r:.80}")
+        raise InputError(
+            f"run: expected the name of a run or its folder, got {run!r:.80}"
+        )
     path = find_run(run)
     result = read_result(path)
     if not isinstance(result, AttackSummary):
         return SweepResult(result, path) if isinstance(result, SweepSummary) else result
-    clean, adversarial = (read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial"))
+    clean, adversarial = (
+        read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial")
+    )
     artifacts = dict[str, Tensor]()
     for file in sorted((path / ARTIFACTS).glob("*.exr")):
         planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
-        artifacts[file.stem] = torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
+        artifacts[file.stem] = torch.from_numpy(
+            np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1)
+        )
     return AttackResult(
         summary=result,
         run=path,
@@ -104,10 +119,15 @@ class ModelKeywords(TypedDict, total=False):
 
 
 def load_model(
-    spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
+    spec: str | Path | nn.Module | Model,
+    *,
+    task: AnyTask | None = None,
+    **options: Unpack[ModelKeywords],
 ) -> Model:
     allow_named({"model": spec})
-    return models.load_model(spec, task=None if task is None else make_task(task), **options)
+    return models.load_model(
+        spec, task=None if task is None else make_task(task), **options
+    )
 
 
 load_model.__doc__ = models.load_model.__doc__
@@ -116,19 +136,33 @@ load_model = helped(load_model)
 render = names_code(helped(in_turn()(shows_progress(rendering.render))))
 
 
-def render_picture_file(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
-    """Render what a configuration describes, write the file, and return what is known about it. Raises InputError as
-    `render`, or where the file would replace one that is read, StorageError where it could not be written."""
+def render_picture_file(
+    config: RenderConfig, *, progress: Progress | None = None
+) -> RenderResult:
+    """Render what a configuration describes, write the file, and return what is known
+    about it. Raises InputError as `render`, or where the file would replace one that is
+    read, StorageError where it could not be written.
+    """
     progress = progress or NullProgress()
-    out, aovs = writable(config.out, config.around or 1), aovs_of(config.aov)
+    out = writable(config.out, config.around or 1)
+    aovs = aovs_of(config.aov)
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
     for spec in (config.object, config.environment, config.model, config.labels):
-        if spec is not None and out.exists() and os.path.exists(spec) and out.samefile(spec):
-            raise InputError(f"out: would replace {spec}, which is read; choose another name")
+        if (
+            spec is not None
+            and out.exists()
+            and os.path.exists(spec)
+            and out.samefile(spec)
+        ):
+            raise InputError(
+                f"out: would replace {spec}, which is read; choose another name"
+            )
     progress.stage("loading the scene and the model")
     check_run_settings(config)
-    controls, scene, task = given_to(config, config.controls), scene_of(config), make_task(config.task)
+    controls = given_to(config, config.controls)
+    scene = scene_of(config)
+    task = make_task(config.task)
     (model,), notes = load_models([config.model], task, config)
     rendering = render(
         scene,
@@ -148,4 +182,6 @@ def render_picture_file(config: RenderConfig, *, progress: Progress | None = Non
         progress.message(text)
     if aovs:
         rendering.save_aov(out, aovs)
-    return rendering.result(out, rendering.save(out), warnings, rendering.save_predictions(out))
+    return rendering.result(
+        out, rendering.save(out), warnings, rendering.save_predictions(out)
+    )

@@ -1,4 +1,5 @@
-"""What experiments load and use: scenes, models, tasks and problems that settings name, attacks, and workers.
+"""What experiments load and use: scenes, models, tasks and problems that settings name,
+attacks, and workers.
 
     from advsearch.extend import workbench
 
@@ -8,8 +9,9 @@
     query = workbench.Query(u, seed, "trial", 0, spp=16)
     (evaluation,) = journal.evaluate_all([query])
 
-`advsearch.extend` offers this module to added experiments. Everything here renders or imports torch, so that the
-module of an experiment, which the command line reads for its help, imports it inside functions.
+`advsearch.extend` offers this module to added experiments. Everything here renders or
+imports torch, so that the module of an experiment, which the command line reads for its
+help, imports it inside functions.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ from advsearch.questions.attack.carry_out import executor_for as executor_for
 from advsearch.questions.attack.carry_out import judged_alone as judged_alone
 from advsearch.questions.attack.carry_out import parts_in as parts_in
 from advsearch.questions.attack.carry_out import parts_of as parts_of
-from advsearch.questions.attack.carry_out import problem_from_config as problem_from_config
+from advsearch.questions.attack.carry_out import (
+    problem_from_config as problem_from_config,
+)
 from advsearch.questions.attack.carry_out import problem_of as problem_of
 from advsearch.questions.attack.carry_out import problem_of_parts as problem_of_parts
 from advsearch.questions.attack.carry_out import problem_on as problem_on
@@ -83,7 +87,9 @@ from advsearch.questions.attack.summary import attack_of as attack_of
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
 from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
-from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
+from advsearch.questions.sweep.predicting import (
+    prepare_surface_light as prepare_surface_light,
+)
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
 from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment
@@ -113,8 +119,10 @@ from advsearch.trust.programs import surroundings as surroundings
 
 
 def load_photographs() -> Any:
-    """Return what takes photographs of the real thing in for runs, and counts how they agree with the renderings.
+    """Return what takes photographs of the real thing in for runs, and counts how they
+    agree with the renderings.
 
-    It has `list_files(folder, task)`, `add_files(run, files)` and `agreement(run)` (`advsearch.photo_agreement`).
+    It has `list_files(folder, task)`, `add_files(run, files)` and `agreement(run)`
+    (`advsearch.photo_agreement`).
     """
     return imported("advsearch.questions.photographs.carry_out:Photographs")()

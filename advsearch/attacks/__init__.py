@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from advsearch.attacks.domain import Block, Domain
-from advsearch.attacks.evaluation import Evaluate, Evaluated, Evaluation, Policy, Proposal, Query, draw_seed, seeded
+from advsearch.attacks.evaluation import (
+    Evaluate,
+    Evaluated,
+    Evaluation,
+    Policy,
+    Proposal,
+    Query,
+    draw_seed,
+    seeded,
+)
 from advsearch.attacks.objective_functions import margin
 from advsearch.attacks.objectives import OBJECTIVES, Objective, get_objective
 from advsearch.attacks.policies import POLICIES, make_policy
@@ -14,7 +23,13 @@ from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import SampleCount, Trials, choose_spp
-from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
+from advsearch.attacks.verification import (
+    Ending,
+    Verification,
+    count_right,
+    run_trials,
+    verify,
+)
 from advsearch.statistics.intervals import clopper_pearson
 
 __all__ = [

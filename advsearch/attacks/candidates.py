@@ -1,6 +1,9 @@
-"""What a search may end with: the few best configurations, rendered again with seeds it has not used, as the largest
-of many noisy values is mostly a lucky one (the winner's curse); many different failures; and the smallest change, a
-bracket of scales of all budgets, whose upper end passed the trials, and at whose lower end a search found nothing."""
+"""What a search may end with: the few best configurations, rendered again with seeds it
+has not used, as the largest of many noisy values is mostly a lucky one (the winner's
+curse); many different failures; and the smallest change, a bracket of scales of all
+budgets, whose upper end passed the trials, and at whose lower end a search found
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,17 @@ from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE
 from advsearch.statistics.sequential import edge_of
 
-SAME = 1e-4  # configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)
+# configurations that differ by less than this in every element are one candidate (an
+# 8-bit level is 4e-3)
+SAME = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A configuration (d,) worth a second look: the objective (biased upwards) and success of the render that admitted
-    it, the objectives of its renders since then, -inf where not finite, and how many were a success."""
+    """A configuration (d,) worth a second look: the objective (biased upwards) and
+    success of the render that admitted it, the objectives of its renders since then,
+    -inf where not finite, and how many were a success.
+    """
 
     u: Tensor
     objective: float
@@ -40,19 +47,27 @@ class Candidate:
         return self.successes / len(self.again) if self.again else float(self.success)
 
     def seen_again(self, objective: float, success: bool) -> Candidate:
-        return replace(self, again=(*self.again, objective), successes=self.successes + success)
+        return replace(
+            self, again=(*self.again, objective), successes=self.successes + success
+        )
 
 
-def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candidate, ...]:
-    """Return the pool with `new` in it if it belongs to the best `size` distinct ones, best first.
+def admit(
+    pool: tuple[Candidate, ...], new: Candidate, size: int
+) -> tuple[Candidate, ...]:
+    """Return the pool with `new` in it if it belongs to the best `size` distinct ones,
+    best first.
 
-    A success beats what is none, then the objective counts; of two that are nearly the same configuration the better
-    stays. One that is in the pool exactly as it is gets another look by it, as unbiased as those of the ranking.
+    A success beats what is none, then the objective counts; of two that are nearly the
+    same configuration the better stays. One that is in the pool exactly as it is gets
+    another look by it, as unbiased as those of the ranking.
     """
     for old in pool:
         if torch.equal(old.u, new.u):
             looked = old.seen_again(new.objective, new.success)
-            return tuple(looked if candidate is old else candidate for candidate in pool)
+            return tuple(
+                looked if candidate is old else candidate for candidate in pool
+            )
     if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
         return pool
     for old in pool:
@@ -64,35 +79,50 @@ def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candi
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 
-def with_last(pool: tuple[Candidate, ...], last: Candidate | None, size: int) -> tuple[Candidate, ...]:
-    """Return the pool, of at most `size`, with the last configuration of a search in it, if need be for its worst."""
+def with_last(
+    pool: tuple[Candidate, ...], last: Candidate | None, size: int
+) -> tuple[Candidate, ...]:
+    """Return the pool, of at most `size`, with the last configuration of a search in
+    it, if need be for its worst.
+    """
     if last is None or any(torch.equal(candidate.u, last.u) for candidate in pool):
         return pool
     return (*pool[: size - 1], last)
 
 
 def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
-    """Return the winner so far and those that are not clearly worse, in their order: the mean of their differences from
-    the winner, seed by seed, in the last `shared` renders, is larger than the standard error of that mean, and their
-    success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one deviation in place of
-    Hoeffding's: a search needs the better of two, not a proof.)"""
+    """Return the winner so far and those that are not clearly worse, in their order:
+    the mean of their differences from the winner, seed by seed, in the last `shared`
+    renders, is larger than the standard error of that mean, and their success rate is
+    no higher. (The race of Maron and Moore 1994, with normal intervals of one deviation
+    in place of Hoeffding's: a search needs the better of two, not a proof.)
+    """
     if shared < 2 or len(pool) < 2:
         return pool
     leader = best(pool)
 
     def worse(candidate: Candidate) -> bool:
-        behind = [a - b for a, b in zip(leader.again[-shared:], candidate.again[-shared:], strict=True)]
+        behind = [
+            a - b
+            for a, b in zip(
+                leader.again[-shared:], candidate.again[-shared:], strict=True
+            )
+        ]
         if not all(map(math.isfinite, behind)):
             return not math.isfinite(candidate.believed)
         mean = math.fsum(behind) / shared
         variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
         return candidate.rate <= leader.rate and mean > math.sqrt(variance / shared)
 
-    return tuple(candidate for candidate in pool if candidate is leader or not worse(candidate))
+    return tuple(
+        candidate for candidate in pool if candidate is leader or not worse(candidate)
+    )
 
 
 def best(pool: tuple[Candidate, ...]) -> Candidate:
-    """Return the winner: by success rate, then by objective, of new renders where all have had some."""
+    """Return the winner: by success rate, then by objective, of new renders where all
+    have had some.
+    """
     if all(candidate.again for candidate in pool):
         return max(pool, key=lambda candidate: (candidate.rate, candidate.believed))
     return pool[0]
@@ -102,16 +132,21 @@ def _raw(candidate: Candidate) -> tuple[bool, float]:
     return candidate.success, candidate.objective
 
 
-LEAST_EFFECTIVE = 10.0  # with fewer failures than so many, each of equal weight, no estimate is stated
-BETS = 8  # sizes of a bet, each half of the one before; the capital is shared equally among them
+# with fewer failures than so many, each of equal weight, no estimate is stated
+LEAST_EFFECTIVE = 10.0
+# sizes of a bet, each half of the one before; the capital is shared equally among them
+BETS = 8
 
 
 @dataclass(frozen=True)
 class FailureShare:
-    """The share of configurations, drawn evenly from the budget, in which one render of the search is a success: the
-    mean of the weighted draws (None where `effective` is under `LEAST_EFFECTIVE`, or a draw could not be evaluated); an
-    interval that covers the share in 95 % at least, however the draws were adapted, at any number of them; and how many
-    failures of equal weight would be worth as much: (sum w)^2 / sum w^2 (Kish 1965)."""
+    """The share of configurations, drawn evenly from the budget, in which one render of
+    the search is a success: the mean of the weighted draws (None where `effective` is
+    under `LEAST_EFFECTIVE`, or a draw could not be evaluated); an interval that covers
+    the share in 95 % at least, however the draws were adapted, at any number of them;
+    and how many failures of equal weight would be worth as much: (sum w)^2 / sum w^2
+    (Kish 1965).
+    """
 
     estimate: float | None
     interval: tuple[float, float]
@@ -119,38 +154,57 @@ class FailureShare:
     draws: int
 
 
-def failure_share(weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tensor) -> FailureShare:
-    """Return what draws from changing densities say of the share of failures under the even one.
+def failure_share(
+    weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tensor
+) -> FailureShare:
+    """Return what draws from changing densities say of the share of failures under the
+    even one.
 
-    Draw t comes from a density q_t that may depend on all draws before it; x_t = w_t [failed], w_t = 1 / q_t relative
-    to the even density, has the share p as its mean given these. Bets on the difference are fair games if the share is
-    p: the capital of
+    Draw t comes from a density q_t that may depend on all draws before it; x_t = w_t
+    [failed], w_t = 1 / q_t relative to the even density, has the share p as its mean
+    given these. Bets on the difference are fair games if the share is p: the capital of
 
         prod_t (1 - c + c x_t / p)   and   prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives,
 
-    a mean over bets c, exceeds 2 / 0.05 with a probability of 0.025 at most (Ville 1939), so the p at which neither
-    does are a 95 % interval (Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables by betting").
-    Both are monotone in p.
+    a mean over bets c, exceeds 2 / 0.05 with a probability of 0.025 at most (Ville
+    1939), so the p at which neither does are a 95 % interval (Waudby-Smith and Ramdas
+    2024, "Estimating means of bounded random variables by betting"). Both are monotone
+    in p.
 
-    All are (n,), n at least 1: w_t over 0; b_t, at least 1 and w_t, known before draw t; whether it failed; and whether
-    it is unknown, as it could not be evaluated: the interval holds whatever these are.
+    All are (n,), n at least 1: w_t over 0; b_t, at least 1 and w_t, known before draw
+    t; whether it failed; and whether it is unknown, as it could not be evaluated: the
+    interval holds whatever these are.
     """
-    weights, bounds = weights.double(), bounds.double()
-    low, high = weights * (failed & ~unknown), weights * (failed | unknown)
+    weights = weights.double()
+    bounds = bounds.double()
+    low = weights * (failed & ~unknown)
+    high = weights * (failed | unknown)
     sizes = 0.5 ** torch.arange(BETS, dtype=torch.float64)[:, None]
     limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(BETS)
 
     def against_low(p: float) -> bool:
-        return float(torch.log(1.0 - sizes + sizes * low / p).sum(dim=1).logsumexp(dim=0)) >= limit
+        return (
+            float(torch.log(1.0 - sizes + sizes * low / p).sum(dim=1).logsumexp(dim=0))
+            >= limit
+        )
 
     def against_high(p: float) -> bool:
-        return float(torch.log1p(sizes * (p - high) / (bounds - p)).sum(dim=1).logsumexp(dim=0)) >= limit
+        return (
+            float(
+                torch.log1p(sizes * (p - high) / (bounds - p))
+                .sum(dim=1)
+                .logsumexp(dim=0)
+            )
+            >= limit
+        )
 
     total = float(low.sum())
     effective = total**2 / float(low.square().sum()) if total else 0.0
     stated = effective >= LEAST_EFFECTIVE and not bool(unknown.any())
     ends = edge_of(lambda p: not against_low(p)), edge_of(against_high)
-    return FailureShare(min(1.0, total / len(low)) if stated else None, ends, effective, len(low))
+    return FailureShare(
+        min(1.0, total / len(low)) if stated else None, ends, effective, len(low)
+    )
 
 
 MOST = 24  # failures that a result lists, at most
@@ -158,8 +212,10 @@ MOST = 24  # failures that a result lists, at most
 
 @dataclass(frozen=True, eq=False)
 class FoundFailure:
-    """A configuration (d,) that a search claims to be a success, the objective of its one render, biased upwards, and
-    where the others lie that it stands for: both ends in u, by position."""
+    """A configuration (d,) that a search claims to be a success, the objective of its
+    one render, biased upwards, and where the others lie that it stands for: both ends
+    in u, by position.
+    """
 
     u: Tensor
     objective: float
@@ -168,9 +224,11 @@ class FoundFailure:
 
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """What a search knows of different failures: at most `MOST` of them; the positions in u of what tells cells apart;
-    how many cells fail, were seen and are there (without cells, draws, and None); and how large a part of all
-    configurations fails, where that can be told."""
+    """What a search knows of different failures: at most `MOST` of them; the positions
+    in u of what tells cells apart; how many cells fail, were seen and are there
+    (without cells, draws, and None); and how large a part of all configurations fails,
+    where that can be told.
+    """
 
     listed: tuple[FoundFailure, ...]
     over: tuple[int, ...]
@@ -180,15 +238,20 @@ class Failures:
     share: FailureShare | None = None
 
 
-def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST) -> list[int]:
-    """Return which to list, at places (n, k) in shares of each range: the worst first, then each time the one that is
-    farthest from all before it. That is the greedy choice of k centres, whose largest distance is at most twice the
-    least possible (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The ends of ranges
-    `around` (k,) are the same place; different choices, `apart` (k,), lie 1 apart. Of equals the worse one goes first.
+def most_different(
+    at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST
+) -> list[int]:
+    """Return which to list, at places (n, k) in shares of each range: the worst first,
+    then each time the one that is farthest from all before it. That is the greedy
+    choice of k centres, whose largest distance is at most twice the least possible
+    (Gonzalez 1985, "Clustering to minimize the maximum intercluster distance"). The
+    ends of ranges `around` (k,) are the same place; different choices, `apart` (k,),
+    lie 1 apart. Of equals the worse one goes first.
     """
     order = sorted(range(len(at)), key=lambda number: -worst[number])
     at = at[order].double()
-    nearest, picked = torch.full((len(at),), torch.inf, dtype=torch.float64), list[int]()
+    nearest = torch.full((len(at),), torch.inf, dtype=torch.float64)
+    picked = list[int]()
     for _ in range(min(most, len(at))):
         chosen = int(nearest.argmax())
         picked.append(chosen)
@@ -208,25 +271,37 @@ ROUNDS = 12
 ATTEMPTS = 6  # steps outwards that the confirmation of the upper end takes at most
 
 SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
-"""A configuration's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
+"""A configuration's length is bisected until the ends are within this: a fifth of the
+bracket's ratio.
+"""
 
-MOST_CHECKS = 1 + math.ceil(math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED)))
-"""Configurations that go through the trials after a search, at most: what it found, and those of the bisection."""
+MOST_CHECKS = 1 + math.ceil(
+    math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED))
+)
+"""Configurations that go through the trials after a search, at most: what it found, and
+those of the bisection.
+"""
 
 Search = Callable[[Domain, int], Tensor]
-"""(domain, round) -> the best configuration a search finds there; round numbers its seeds."""
+"""(domain, round) -> the best configuration a search finds there; round numbers its
+seeds.
+"""
 
 Passes = Callable[[Tensor, int], bool]
 """(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
 
 Likely = Callable[[Tensor], bool]
-"""u -> whether a configuration would probably pass: a guess that costs next to nothing."""
+"""u -> whether a configuration would probably pass: a guess that costs next to
+nothing.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Bracket:
-    """Where the smallest scale lies: a search found nothing at `low` (0 where none has failed), and `u` (d,) passes at
-    `high`, infinity where nothing did; of the search `found_by`; if `confirmed` it has passed again with new seeds."""
+    """Where the smallest scale lies: a search found nothing at `low` (0 where none has
+    failed), and `u` (d,) passes at `high`, infinity where nothing did; of the search
+    `found_by`; if `confirmed` it has passed again with new seeds.
+    """
 
     low: float
     high: float
@@ -244,43 +319,64 @@ class Bracket:
 
 def scaled(domain: Domain, scale: float) -> Domain:
     """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
-    names = (block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None)
+    names = (
+        block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
+    )
     if bare := [name or "a block" for name in dict.fromkeys(names)]:
         raise InputError(
-            f"smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
+            "smallest: expected controls with a budget (texture, geometry, patch, "
+            f"...), got {', '.join(bare)}, "
             "whose parameters have ranges and no epsilon; leave it out"
         )
-    blocks = tuple(replace(block, epsilon=float(block.epsilon or 0.0) * scale) for block in domain.blocks)
+    blocks = tuple(
+        replace(block, epsilon=float(block.epsilon or 0.0) * scale)
+        for block in domain.blocks
+    )
     return replace(domain, blocks=blocks)
 
 
 def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
-    """Return the configuration moved towards the start, its change multiplied by `scale`."""
+    """Return the configuration moved towards the start, its change multiplied by
+    `scale`.
+    """
     return domain.project(domain.start + scale * (u - domain.start))
 
 
-def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | None = None) -> Bracket:
-    """Bracket the smallest scale of the domain's budgets at which a configuration passes.
+def smallest(
+    search: Search, passes: Passes, domain: Domain, likely: Likely | None = None
+) -> Bracket:
+    """Bracket the smallest scale of the domain's budgets at which a configuration
+    passes.
 
-    1. A search in the whole budget. If what it finds fails the trials, there is nothing to shrink.
-    2. The configuration is moved towards the start, by bisection in the logarithm of its length, to the shortest that
-       passes: a handful of trials, no search.
-    3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each configuration that
-       passes is shortened as in 2, each that fails raises the lower end; until it is closed, or after `ROUNDS`.
+    1. A search in the whole budget. If what it finds fails the trials, there is nothing
+    to shrink.
+    2. The configuration is moved towards the start, by bisection in the logarithm of
+       its length, to the shortest that passes: a handful of trials, no search.
+    3. A search at half the scale reached, then at the geometric mean of the bracket's
+       ends; each configuration that passes is shortened as in 2, each that fails raises
+       the lower end; until it is closed, or after `ROUNDS`.
 
-    For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
-    optimum, so that the result is within `RATIO` of the closed form.
+    For a linear model and a gradient policy the first search points the right way and 2
+    ends within its own step of the optimum, so that the result is within `RATIO` of the
+    closed form.
 
-    `likely` says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length. The
-    bracket is not `closed` if the searches did not suffice.
+    `likely` says where 2 begins, and from where it goes on in growing steps; None to
+    bisect from the whole length. The bracket is not `closed` if the searches did not
+    suffice.
     """
     u = search(domain, 0)
     state = Bracket(0.0, math.inf, None, 1, 1)
     if not passes(u, 0):
         return replace(state, low=1.0)
     state = _shorten(state, u, 1.0, passes, domain, likely)
-    while state.searches < ROUNDS and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
-        scale = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
+    while (
+        state.searches < ROUNDS
+        and state.high > RATIO * state.low
+        and state.high > SMALLEST_SCALE
+    ):
+        scale = (
+            state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
+        )
         if state.high <= RATIO**2 * state.low:
             scale = max(scale, state.high / RATIO)
         u = search(scaled(domain, scale), state.searches)
@@ -288,43 +384,67 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
         if passed:
             state = replace(state, found_by=state.searches)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
-        state = _shorten(state, u, scale, passes, domain, likely) if passed else replace(state, low=scale)
+        state = (
+            _shorten(state, u, scale, passes, domain, likely)
+            if passed
+            else replace(state, low=scale)
+        )
     return state
 
 
-def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2) -> Bracket:
-    """Return the bracket with its upper end moved out until the configuration there passes so many times in a row: what
-    lies exactly on the edge passes its trials by chance. So it is tried again with new seeds; where it fails, the
-    change grows by a fortieth, in `ATTEMPTS`, the last of which is returned untried."""
+def confirmed(
+    bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2
+) -> Bracket:
+    """Return the bracket with its upper end moved out until the configuration there
+    passes so many times in a row: what lies exactly on the edge passes its trials by
+    chance. So it is tried again with new seeds; where it fails, the change grows by a
+    fortieth, in `ATTEMPTS`, the last of which is returned untried.
+    """
     if bracket.u is None:
         return bracket
-    edge, reached, at = bracket.u, bracket.high, 1.0
+    edge = bracket.u
+    reached = bracket.high
+    at = 1.0
     for _ in range(ATTEMPTS):
         if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         at *= math.sqrt(RATIO)
         high = min(1.0, reached * at)
-        farther = scaled(domain, high).project(domain.start + at * (edge - domain.start))
+        farther = scaled(domain, high).project(
+            domain.start + at * (edge - domain.start)
+        )
         bracket = replace(bracket, high=high, u=farther, checks=bracket.checks + times)
     return bracket
 
 
 def _shorten(
-    state: Bracket, u: Tensor, length: float, passes: Passes, domain: Domain, likely: Likely | None
+    state: Bracket,
+    u: Tensor,
+    length: float,
+    passes: Passes,
+    domain: Domain,
+    likely: Likely | None,
 ) -> Bracket:
-    """Bisect the length of a configuration that passes until the ends are within `SHORTENED`.
+    """Bisect the length of a configuration that passes until the ends are within
+    `SHORTENED`.
 
-    With a guess it is tried first at the shortest length of which that says that it passes, and then farther and
-    farther from there, but never beyond the middle.
+    With a guess it is tried first at the shortest length of which that says that it
+    passes, and then farther and farther from there, but never beyond the middle.
     """
-    low, high, shortest, checks = max(state.low, SMALLEST_SCALE * length), length, u, state.checks
+    low = max(state.low, SMALLEST_SCALE * length)
+    high = length
+    shortest = u
+    checks = state.checks
 
     def at(scale: float) -> Tensor:
         return shrunk(scaled(domain, scale), u, scale / length)
 
-    middle, stride = math.sqrt(high * low), math.inf
+    middle = math.sqrt(high * low)
+    stride = math.inf
     if likely is not None:
-        least, most, stride = low, high, SHORTENED
+        least = low
+        most = high
+        stride = SHORTENED
         while most > SHORTENED * least:
             middle = math.sqrt(most * least)
             least, most = (least, middle) if likely(at(middle)) else (middle, most)
@@ -332,10 +452,12 @@ def _shorten(
     while high > SHORTENED * low:
         shorter = at(middle)
         if passes(shorter, checks):
-            shortest, high = shorter, middle
+            shortest = shorter
+            high = middle
             middle = max(math.sqrt(high * low), high / stride)
         else:
             low = middle
             middle = min(math.sqrt(high * low), low * stride)
-        stride, checks = stride * stride, checks + 1
+        stride = stride * stride
+        checks = checks + 1
     return replace(state, high=high, u=shortest, checks=checks)

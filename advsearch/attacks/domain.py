@@ -1,4 +1,6 @@
-"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit box."""
+"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit
+box.
+"""
 
 from __future__ import annotations
 
@@ -20,71 +22,111 @@ Norm = Literal["linf", "l2", "box"]
 NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
-"""How far outside its budget float32 rounding may put a configuration, absolute in u and relative to the radius; beside
-`Block.rounding`, which adds up in an l2 norm."""
+"""How far outside its budget float32 rounding may put a configuration, absolute in u
+and relative to the radius; beside `Block.rounding`, which adds up in an l2 norm.
+"""
 
 
 @dataclass(frozen=True)
 class Block:
-    """One contiguous slice of u and how far it may go. InputError: a value is outside what is said here."""
+    """One contiguous slice of u and how far it may go. InputError: a value is outside
+    what is said here.
+    """
 
     size: int  # number of elements, at least 1
-    norm: Norm = "box"  # "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds alone
+    # "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds
+    # alone
+    norm: Norm = "box"
     epsilon: float | None = None
-    """Radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it is the norm of the whole block,
-    not a norm per element, so a sensible value grows with the square root of the size."""
+    """Radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it
+    is the norm of the whole block, not a norm per element, so a sensible value grows
+    with the square root of the size.
+    """
     low: float = 0.0
     high: float = 1.0  # 0 <= low < high <= 1
     periodic: bool = False
-    """Whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box"."""
+    """Whether `high` and `low` are the same place (an angle): projecting wraps around.
+    Only for "box".
+    """
     name: str = ""  # of its parameter, e.g. "pose.yaw"
     options: int = 0
-    """Over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has size 1, norm
-    "box" and the whole unit interval; it has no direction that is uphill."""
-    reach: float | None = None  # length of one whole step in a "box", over 0; None for half the diagonal of the bounds
+    """Over 0 for a discrete choice among so many: u means option floor(u * options).
+    Such a block has size 1, norm "box" and the whole unit interval; it has no direction
+    that is uphill.
+    """
+    # length of one whole step in a "box", over 0; None for half the diagonal of the
+    # bounds
+    reach: float | None = None
 
     def __post_init__(self) -> None:
         where = f" of {self.name!r}" if self.name else ""
         if self.size < 1:
-            raise InputError(f"block{where}: expected a size of at least 1, got {self.size}")
-        if self.norm not in NORMS:
-            raise InputError(f"`norm`{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}")
-        if not 0.0 <= self.low < self.high <= 1.0:
-            raise InputError(f"bounds{where}: expected 0 <= low < high <= 1, got [{self.low}, {self.high}]")
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out")
-        if self.norm != "box" and not (self.epsilon is not None and 0.0 < self.epsilon < math.inf):
             raise InputError(
-                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} radius, in units where the "
+                f"block{where}: expected a size of at least 1, got {self.size}"
+            )
+        if self.norm not in NORMS:
+            raise InputError(
+                f"`norm`{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}"
+            )
+        if not 0.0 <= self.low < self.high <= 1.0:
+            raise InputError(
+                f"bounds{where}: expected 0 <= low < high <= 1, got "
+                f"[{self.low}, {self.high}]"
+            )
+        if self.norm == "box" and self.epsilon is not None:
+            raise InputError(
+                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
+            )
+        if self.norm != "box" and not (
+            self.epsilon is not None and 0.0 < self.epsilon < math.inf
+        ):
+            raise InputError(
+                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
+                "radius, in units where the "
                 f"parameter's whole range is 1), got {self.epsilon}; try `epsilon=0.1`"
             )
         if self.periodic and self.norm != "box":
-            raise InputError(f"block{where}: a periodic block cannot have a norm budget; use norm 'box'")
+            raise InputError(
+                f"block{where}: a periodic block cannot have a norm "
+                "budget; use norm 'box'"
+            )
         if self.reach is not None and (self.norm != "box" or not self.reach > 0.0):
             raise InputError(
-                f"block{where}: expected a reach over 0 and norm 'box', got {self.reach} and {self.norm!r}"
+                f"block{where}: expected a reach over 0 and norm 'box', got "
+                f"{self.reach} and {self.norm!r}"
             )
-        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
+        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (
+            1,
+            "box",
+            0.0,
+            1.0,
+            False,
+        )
         if self.options and (self.options < 0 or not whole):
             raise InputError(
-                f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and "
+                f"block{where}: expected a discrete choice to have at least one "
+                "option, size 1, norm 'box' and "
                 f"bounds [0, 1], got {self}"
             )
 
     @property
     def radius(self) -> float:
-        """The length of one whole step, in the block's own norm: epsilon, or the reach in a box; never more than the
-        bounds let the start move."""
+        """The length of one whole step, in the block's own norm: epsilon, or the reach
+        in a box; never more than the bounds let the start move.
+        """
         width = self.high - self.low
         if self.norm == "box":
-            return 0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
+            return (
+                0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
+            )
         reach = width if self.norm == "linf" else width * math.sqrt(self.size)
         return min(float(self.epsilon or 0.0), reach)
 
     @property
     def rounding(self) -> float:
-        """What rounding all elements of u to float32 may add to the l2 norm: half of the last bit of 1 for each, all
-        the same way where a texture has one colour."""
+        """What rounding all elements of u to float32 may add to the l2 norm: half of
+        the last bit of 1 for each, all the same way where a texture has one colour.
+        """
         return 0.5 * torch.finfo(torch.float32).eps * math.sqrt(self.size)
 
 
@@ -93,22 +135,30 @@ class Domain:
     """The set of configurations a search may propose: the product of its blocks.
 
     Raises:
-        InputError: sizes do not add up, a cost is under 0, the start is not finite or outside the bounds, or `first`
-            lies outside.
+        InputError: sizes do not add up, a cost is under 0, the start is not finite or
+            outside the bounds, or `first` lies outside.
     """
 
-    start: Tensor  # (d,) float32, the clean configuration, inside every block's bounds; a copy is kept
+    # (d,) float32, the clean configuration, inside every block's bounds; a copy is kept
+    start: Tensor
     blocks: tuple[Block, ...]  # consecutive slices of u that add up to d
     gradient_cost: int = 0
-    """Pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two for each number
-    with central differences."""
-    partial_gradients: bool = False  # whether `evaluate` understands "free", the part of a gradient that costs nothing
+    """Pictures that one whole gradient costs on top of the one it belongs to: 0 for an
+    adjoint, two for each number with central differences.
+    """
+    # whether `evaluate` understands "free", the part of a gradient that costs nothing
+    partial_gradients: bool = False
     exact: bool = False
-    """Whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where a
-    matrix predicts the pictures (docs/transport.md)."""
-    drawn: bool = False  # whether they are but for the conditions that each draws anew from a bank (docs/transport.md)
+    """Whether evaluations are free of noise: equal configurations have equal objectives
+    and gradients, as where a matrix predicts the pictures (docs/transport.md).
+    """
+    # whether they are but for the conditions that each draws anew from a bank
+    # (docs/transport.md)
+    drawn: bool = False
     first: Tensor | None = None
-    """(d,) where a policy should begin, if not at the start; it moves no ball. For those that begin several times."""
+    """(d,) where a policy should begin, if not at the start; it moves no ball. For
+    those that begin several times.
+    """
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
     """(d,) float32 bounds; those of an l-infinity ball are cut into them already."""
@@ -117,29 +167,43 @@ class Domain:
         start = self.start.detach().to(torch.float32, copy=True)
         total = sum(block.size for block in self.blocks)
         if start.ndim != 1 or start.numel() != total:
-            raise InputError(f"start: expected shape ({total},), the sum of the blocks, got {tuple(start.shape)}")
+            raise InputError(
+                f"start: expected shape ({total},), the sum of the "
+                f"blocks, got {tuple(start.shape)}"
+            )
         if not bool(torch.isfinite(start).all()):
-            raise InputError("start: found NaN or infinite values; a start must be a configuration")
+            raise InputError(
+                "start: found NaN or infinite values; a start must be a configuration"
+            )
         if self.gradient_cost < 0:
-            raise InputError(f"gradient_cost: expected at least 0, got {self.gradient_cost}")
-        lower, upper = torch.empty_like(start), torch.empty_like(start)
+            raise InputError(
+                f"gradient_cost: expected at least 0, got {self.gradient_cost}"
+            )
+        lower = torch.empty_like(start)
+        upper = torch.empty_like(start)
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "blocks", tuple(self.blocks))
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         for block, part in self.parts():
             lower[part], upper[part] = block.low, block.high
-            if not bool(((start[part] >= lower[part]) & (start[part] <= upper[part])).all()):
-                low, high = float(start[part].min()), float(start[part].max())
+            if not bool(
+                ((start[part] >= lower[part]) & (start[part] <= upper[part])).all()
+            ):
+                low = float(start[part].min())
+                high = float(start[part].max())
                 raise InputError(
-                    f"start{f' of {block.name!r}' if block.name else ''}: expected values in "
+                    f"start{f' of {block.name!r}' if block.name else ''}: expected "
+                    "values in "
                     f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
                 )
             if block.norm == "linf" and block.epsilon is not None:
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
         if self.first is not None and not self.contains(self.first):
-            raise InputError("first: expected a configuration of the domain; project it")
+            raise InputError(
+                "first: expected a configuration of the domain; project it"
+            )
 
     @property
     def begin(self) -> Tensor:
@@ -153,15 +217,26 @@ class Domain:
 
     @property
     def names(self) -> list[str]:
-        """The name of each element of u: "pose.yaw"; "camera.target.0" of several numbers."""
-        numbered = [(block, number) for block in self.blocks for number in range(block.size)]
-        return [block.name + (f".{number}" if block.size > 1 else "") for block, number in numbered]
+        """The name of each element of u: "pose.yaw"; "camera.target.0" of several
+        numbers.
+        """
+        numbered = [
+            (block, number) for block in self.blocks for number in range(block.size)
+        ]
+        return [
+            block.name + (f".{number}" if block.size > 1 else "")
+            for block, number in numbered
+        ]
 
     @property
     def options(self) -> Tensor:
-        """(d,) how many options each element of u has that is a discrete choice; 0 of a number."""
+        """(d,) how many options each element of u has that is a discrete choice; 0 of a
+        number.
+        """
         sizes = torch.tensor([block.size for block in self.blocks], dtype=torch.long)
-        return torch.tensor([block.options for block in self.blocks], dtype=torch.long).repeat_interleave(sizes)
+        return torch.tensor(
+            [block.options for block in self.blocks], dtype=torch.long
+        ).repeat_interleave(sizes)
 
     def block_of(self, place: int) -> Block:
         """Return the block that an element of u belongs to."""
@@ -170,51 +245,76 @@ class Domain:
     def parts(self) -> list[tuple[Block, slice]]:
         """Return every block with its slice of u."""
         ends = [0, *accumulate(block.size for block in self.blocks)]
-        return [(block, slice(*place)) for block, place in zip(self.blocks, pairwise(ends), strict=True)]
+        return [
+            (block, slice(*place))
+            for block, place in zip(self.blocks, pairwise(ends), strict=True)
+        ]
 
     def project(self, u: Tensor) -> Tensor:
-        """Return the configuration (d,) of the domain that is nearest to u (d,), both float32, finite, block by block
-        (Euclidean; periodic blocks wrap instead). Configurations inside come back bit for bit.
+        """Return the configuration (d,) of the domain that is nearest to u (d,), both
+        float32, finite, block by block (Euclidean; periodic blocks wrap instead).
+        Configurations inside come back bit for bit.
 
-        An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an l2 ball see `project_l2_box`.
+        An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an
+        l2 ball see `project_l2_box`.
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
         for block, part in self.parts():
             if block.norm == "l2" and block.epsilon is not None:
-                projected[part] = project_l2_box(u[part], self.start[part], block.epsilon, block.low, block.high)
+                projected[part] = project_l2_box(
+                    u[part], self.start[part], block.epsilon, block.low, block.high
+                )
             elif block.periodic:
-                wrapped = block.low + torch.remainder(u[part] - block.low, block.high - block.low)
+                wrapped = block.low + torch.remainder(
+                    u[part] - block.low, block.high - block.low
+                )
                 wrapped.clamp_(block.low, block.high)
-                projected[part] = torch.where(u[part] == projected[part], projected[part], wrapped)
+                projected[part] = torch.where(
+                    u[part] == projected[part], projected[part], wrapped
+                )
         return projected
 
     def violation(self, u: Tensor) -> float:
-        """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite elements.
+        """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite
+        elements.
 
-        The largest of the distances past a bound, and of the excess of an l2 norm over its radius and what rounding
-        may add (divided by the radius where that is over 1).
+        The largest of the distances past a bound, and of the excess of an l2 norm over
+        its radius and what rounding may add (divided by the radius where that is over
+        1).
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
         for block, part in self.parts():
             if block.norm == "l2" and block.epsilon is not None:
-                norm = math.sqrt(float((u[part] - self.start[part]).square_().sum(dtype=torch.float64)))
-                excess = max(excess, (norm - block.epsilon - block.rounding) / max(1.0, block.epsilon))
+                norm = math.sqrt(
+                    float(
+                        (u[part] - self.start[part]).square_().sum(dtype=torch.float64)
+                    )
+                )
+                excess = max(
+                    excess,
+                    (norm - block.epsilon - block.rounding) / max(1.0, block.epsilon),
+                )
         return math.inf if math.isnan(excess) else max(0.0, excess)
 
     def contains(self, u: Tensor, tolerance: float = TOLERANCE) -> bool:
         """Return whether u is a configuration of the domain, but for rounding."""
         return u.shape == self.start.shape and self.violation(u) <= tolerance
 
-    def sample(self, generator: torch.Generator, n: int = 1, *, extreme: bool = False) -> Tensor:
-        """Draw configurations (n, d) float32 at random within the budget; the generator advances.
+    def sample(
+        self, generator: torch.Generator, n: int = 1, *, extreme: bool = False
+    ) -> Tensor:
+        """Draw configurations (n, d) float32 at random within the budget; the generator
+        advances.
 
-        - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of a discrete choice, the centre of
-          a random option.
-        - "l2": uniform in the ball, then projected onto the bounds; not uniform where the bounds cut the ball.
-        - with `extreme`, a norm ball is sampled where random search is strongest: an l-infinity ball at random
-          corners, an l2 ball at its surface in a direction of random signs. A "box" has no such place (the corners of
-          a range of poses are no worse than its middle) and is sampled as before.
+        - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of
+          a discrete choice, the centre of a random option.
+        - "l2": uniform in the ball, then projected onto the bounds; not uniform where
+        the bounds cut the ball.
+        - with `extreme`, a norm ball is sampled where random search is strongest: an
+          l-infinity ball at random corners, an l2 ball at its surface in a direction of
+          random signs. A "box" has no such place (the corners of a range of poses are
+          no worse than its middle) and is sampled as before.
         """
         drawn = []
         for _ in range(n):
@@ -233,19 +333,23 @@ class Domain:
                 else:  # uniform in the ball (Muller 1959)
                     direction = torch.randn(block.size, generator=generator)
                     length = block.epsilon * math.pow(float(noise[0]), 1.0 / block.size)
-                    direction *= length / max(float(torch.linalg.vector_norm(direction)), 1e-30)
+                    direction *= length / max(
+                        float(torch.linalg.vector_norm(direction)), 1e-30
+                    )
                     u[part] = self.start[part] + direction
             drawn.append(self.project(u))
         return torch.stack(drawn)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
-        """Return one whole step (d,) from u uphill: the displacement that a linear objective likes most, in each
-        block's norm, from the gradient (d,), finite. Add a multiple of it to u and project. All are float32.
+        """Return one whole step (d,) from u uphill: the displacement that a linear
+        objective likes most, in each block's norm, from the gradient (d,), finite. Add
+        a multiple of it to u and project. All are float32.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
-        - "box": the same, without the elements that point out of a bound at which u already lies (the free part of
-          the gradient, as in projected-gradient methods for bounds), so that they do not use up the step;
+        - "box": the same, without the elements that point out of a bound at which u
+          already lies (the free part of the gradient, as in projected-gradient methods
+          for bounds), so that they do not use up the step;
         - a discrete choice, and a block whose gradient is zero: nothing.
         """
         step = torch.empty_like(gradient)
@@ -259,10 +363,14 @@ class Domain:
                 step[part] *= block.radius
                 continue
             if block.norm == "box" and not block.periodic:
-                out = ((u[part] >= block.high) & (slope > 0)) | ((u[part] <= block.low) & (slope < 0))
+                out = ((u[part] >= block.high) & (slope > 0)) | (
+                    (u[part] <= block.low) & (slope < 0)
+                )
                 slope = slope.masked_fill(out, 0.0)
             slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
-            step[part] = slope * (block.radius / max(float(torch.linalg.vector_norm(slope)), 1.0))
+            step[part] = slope * (
+                block.radius / max(float(torch.linalg.vector_norm(slope)), 1.0)
+            )
         return step
 
 
@@ -271,34 +379,47 @@ def centre_of_option(u: Tensor, options: Tensor | int) -> Tensor:
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
-CHUNK = 32768  # elements worked on at once: small enough for a core's cache, and torch uses one thread below it
-SLACK = 1e-6  # a norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing
+# elements worked on at once: small enough for a core's cache, and torch uses one thread
+# below it
+CHUNK = 32768
+# a norm at most this fraction over the radius counts as inside, so that projecting
+# twice changes nothing
+SLACK = 1e-6
 
 _MAX_ITERATIONS = 100
 
 
-def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, high: float = 1.0) -> Tensor:
+def project_l2_box(
+    u: Tensor, centre: Tensor, radius: float, low: float = 0.0, high: float = 1.0
+) -> Tensor:
     """Project onto the intersection of an l2 ball and a box.
 
-    The result is the one nearest point, argmin_p ||p - u|| subject to ||p - centre|| <= radius and low <= p <= high.
-    Clipping and then rescaling is not that point, and for a box that cuts deep it is far from it.
+    The result is the one nearest point, argmin_p ||p - u|| subject to ||p - centre|| <=
+    radius and low <= p <= high. Clipping and then rescaling is not that point, and for
+    a box that cuts deep it is far from it.
 
-    The optimality conditions give p(t) = clip(centre + t (u - centre), low, high) with one multiplier t in (0, 1],
-    t = 1 if p(1) lies in the ball. Otherwise t solves ||p(t) - centre|| = radius. In s = t^2 the squared norm is
+    The optimality conditions give p(t) = clip(centre + t (u - centre), low, high) with
+    one multiplier t in (0, 1], t = 1 if p(1) lies in the ball. Otherwise t solves
+    ||p(t) - centre|| = radius. In s = t^2 the squared norm is
 
         g(s) = sum_i min(s v_i^2, room_i^2),     v = u - centre, room_i = distance to the bound that v_i points at,
 
-    concave, increasing and piecewise linear, so Newton's method from the left never overshoots and stops at the exact
-    root after finitely many steps (two to six in practice). It is the scheme known from continuous quadratic knapsack
-    problems (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic knapsack problem").
+    concave, increasing and piecewise linear, so Newton's method from the left never
+    overshoots and stops at the exact root after finitely many steps (two to six in
+    practice). It is the scheme known from continuous quadratic knapsack problems
+    (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic
+    knapsack problem").
 
-    u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is over 0. The point is rounded
-    towards the centre, so that rounding leaves no ball. Points inside come back bit for bit; projecting again changes
-    at most the last bits.
+    u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is
+    over 0. The point is rounded towards the centre, so that rounding leaves no ball.
+    Points inside come back bit for bit; projecting again changes at most the last bits.
     """
-    squares, rooms = [], []
+    squares = []
+    rooms = []
     full = inside = 0.0
-    for part, middle in zip(torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True):
+    for part, middle in zip(
+        torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
+    ):
         squares.append((part - middle).square_())
         rooms.append(part.clamp(low, high).sub_(middle).square_())
         full += float(squares[-1].sum(dtype=torch.float64))
@@ -319,54 +440,75 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
     t = math.sqrt(s)
     projected = torch.empty_like(u)
     for out, part, middle in zip(
-        torch.split(projected, CHUNK), torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
+        torch.split(projected, CHUNK),
+        torch.split(u, CHUNK),
+        torch.split(centre, CHUNK),
+        strict=True,
     ):
         torch.lerp(middle, part, t, out=out)
         outwards = (out - middle).abs() > ((part - middle) * t).abs()
-        torch.where(outwards, torch.nextafter(out, middle), out, out=out).clamp_(low, high)
+        torch.where(outwards, torch.nextafter(out, middle), out, out=out).clamp_(
+            low, high
+        )
     return projected
 
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A normal distribution with independent elements, projected onto the domain: the mean (d,) float32, inside it, and
-    the deviation (d,) float32, at least 0."""
+    """A normal distribution with independent elements, projected onto the domain: the
+    mean (d,) float32, inside it, and the deviation (d,) float32, at least 0.
+    """
 
     mean: Tensor
     deviation: Tensor
 
     def sample(self, generator: torch.Generator, n: int, domain: Domain) -> Tensor:
-        """Return (n, d) float32 configurations P(mean + deviation * z), z standard normal, P the projection."""
+        """Return (n, d) float32 configurations P(mean + deviation * z), z standard
+        normal, P the projection.
+        """
         noise = torch.randn(n, domain.dim, generator=generator)
-        return torch.stack([domain.project(self.mean + self.deviation * z) for z in noise])
+        return torch.stack(
+            [domain.project(self.mean + self.deviation * z) for z in noise]
+        )
 
 
 def half_widths(domain: Domain) -> Tensor:
-    """Return (d,) float32, over 0: how far each element may go while all others go as far.
+    """Return (d,) float32, over 0: how far each element may go while all others go as
+    far.
 
-    - "box": half of the bounds' distance, or the block's reach over the square root of its size if that is given;
+    - "box": half of the bounds' distance, or the block's reach over the square root of
+    its size if that is given;
     - "linf": half of what bounds and ball leave;
-    - "l2": epsilon over the square root of the block's size, at most half of the bounds' distance.
+    - "l2": epsilon over the square root of the block's size, at most half of the
+    bounds' distance.
     """
     half = (domain.upper - domain.lower) / 2.0
     for block, part in domain.parts():
         if block.norm == "l2" or block.reach is not None:
-            half[part] = min(block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0)
+            half[part] = min(
+                block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0
+            )
     return half.clamp_(min=torch.finfo(torch.float32).tiny)
 
 
 def wraps(domain: Domain) -> Tensor:
-    """Return (d,) bool: the elements that may leave their bounds, because there they come round again."""
+    """Return (d,) bool: the elements that may leave their bounds, because there they
+    come round again.
+    """
     sizes = torch.tensor([block.size for block in domain.blocks], dtype=torch.long)
-    return torch.tensor([block.periodic for block in domain.blocks], dtype=torch.bool).repeat_interleave(sizes)
+    return torch.tensor(
+        [block.periodic for block in domain.blocks], dtype=torch.bool
+    ).repeat_interleave(sizes)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Points that can be reached in any order by their number: draws from the unit cube, and products of axes.
+# Points that can be reached in any order by their number: draws from the unit cube, and
+# products of axes.
 #
 # Draw number n is the same point whoever asks for it when:
 #
-# - "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008) in nets of 65,536, each scrambled by a seed of its
+# - "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008) in nets of 65,536,
+# each scrambled by a seed of its
 #   own, so that no draw is far from the beginning of its net;
 # - "random": independent uniform points, in blocks with a seed of their own.
 #
@@ -378,56 +520,78 @@ Sampler = Literal["sobol", "random"]
 SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
 NET = 1 << 16  # points of one scrambled net
-MOST_DIMENSIONS = 21201  # numbers of a Sobol point, at most: for so many Joe and Kuo give directions
-BLOCK_NUMBERS = 1 << 18  # numbers that are drawn at once, at most (unless one point has more)
+# numbers of a Sobol point, at most: for so many Joe and Kuo give directions
+MOST_DIMENSIONS = 21201
+# numbers that are drawn at once, at most (unless one point has more)
+BLOCK_NUMBERS = 1 << 18
 SEEDS = 1024  # seeds that are made at once
 
 Doubles = NDArray[np.float64]
 
 
 class Draws:
-    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`."""
+    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams
+    are called `name`.
+    """
 
-    def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
+    def __init__(
+        self, dimensions: int, sampler: str, seed: int, name: str = "draws"
+    ) -> None:
         if sampler not in SAMPLERS:
-            raise InputError(f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}")
+            raise InputError(
+                f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}"
+            )
         if sampler == "sobol" and dimensions > MOST_DIMENSIONS:
             raise InputError(
-                f"`sampler` sobol: expected at most {MOST_DIMENSIONS} numbers to draw, got {dimensions}; use "
+                f"`sampler` sobol: expected at most {MOST_DIMENSIONS} numbers to draw, "
+                f"got {dimensions}; use "
                 "`sampler=random`"
             )
         self.dimensions = dimensions
-        self._sampler, self._seed, self._name = sampler, seed, name
+        self._sampler = sampler
+        self._seed = seed
+        self._name = name
         rows = max(1, min(NET, BLOCK_NUMBERS // max(1, dimensions)))
         self._rows = 1 << (rows.bit_length() - 1)
         self._number, self._block = -1, np.empty((0, dimensions))
         self._engine: Any = None
-        self._net, self._drawn = -1, 0
+        self._net = -1
+        self._drawn = 0
 
     def points(self, first: int, count: int) -> Doubles:
-        """Return the draws with the numbers from `first` on: (count, dimensions) float64 in [0, 1)."""
+        """Return the draws with the numbers from `first` on: (count, dimensions)
+        float64 in [0, 1).
+        """
         if not self.dimensions or count < 1:
             return np.empty((max(0, count), self.dimensions))
-        parts, end = [], first + count
+        parts = []
+        end = first + count
         while first < end:
             number, begin = divmod(first, self._rows)
             size = min(self._rows - begin, end - first)
             if number != self._number:
                 rng = np.random.default_rng(stream(self._seed, self._name, number))
                 shape = (self._rows, self.dimensions)
-                self._block = self._sobol(number) if self._sampler == "sobol" else rng.random(shape)
+                self._block = (
+                    self._sobol(number)
+                    if self._sampler == "sobol"
+                    else rng.random(shape)
+                )
                 self._number = number
             parts.append(self._block[begin : begin + size])
             first += size
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _sobol(self, number: int) -> Doubles:
-        from scipy.stats import qmc  # takes a quarter of a second, and few runs draw from nets
+        # takes a quarter of a second, and few runs draw from nets
+        from scipy.stats import qmc
 
         net, within = divmod(number * self._rows, NET)
         if net != self._net or self._engine is None or within < self._drawn:
             seed = stream(self._seed, self._name, net)
-            self._engine, self._net, self._drawn = qmc.Sobol(self.dimensions, scramble=True, seed=seed), net, 0
+            self._engine = qmc.Sobol(self.dimensions, scramble=True, seed=seed)
+            self._net = net
+            self._drawn = 0
         if within > self._drawn:
             self._engine.fast_forward(within - self._drawn)
         self._drawn = within + self._rows
@@ -435,10 +599,13 @@ class Draws:
 
 
 class Seeds:
-    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one."""
+    """Seeds of one stream by number, many at once: much faster than
+    `advsearch.seeds.stream` for every one.
+    """
 
     def __init__(self, root: int, name: str) -> None:
-        self._root, self._name = root, name
+        self._root = root
+        self._name = name
         self._number = -1
         self._block: NDArray[Any] = np.empty(0, dtype=np.uint32)
 
@@ -447,26 +614,35 @@ class Seeds:
         number, place = divmod(index, SEEDS)
         if number != self._number:
             sequence = np.random.SeedSequence(stream(self._root, self._name, number))
-            self._number, self._block = number, sequence.generate_state(SEEDS, dtype=np.uint32)
+            self._number, self._block = (
+                number,
+                sequence.generate_state(SEEDS, dtype=np.uint32),
+            )
         return int(self._block[place])
 
 
 @dataclass(frozen=True)
 class Product:
-    """The product of axes with so many values each, at least 1; the last runs fastest. No axis at all has one point."""
+    """The product of axes with so many values each, at least 1; the last runs fastest.
+    No axis at all has one point.
+    """
 
     sizes: tuple[int, ...]
     count: int = field(init=False)
 
     def __post_init__(self) -> None:
         if any(size < 1 for size in self.sizes):
-            raise InputError(f"axes: expected at least one value on each, got sizes {self.sizes}")
+            raise InputError(
+                f"axes: expected at least one value on each, got sizes {self.sizes}"
+            )
         object.__setattr__(self, "count", math.prod(self.sizes))
 
     def digits(self, index: int) -> tuple[int, ...]:
         """Return the place of a point on every axis."""
         if not 0 <= index < self.count:
-            raise IndexError(f"expected a point from 0 to {self.count - 1}, got {index}")
+            raise IndexError(
+                f"expected a point from 0 to {self.count - 1}, got {index}"
+            )
         digits = []
         for size in reversed(self.sizes):
             index, digit = divmod(index, size)
@@ -481,8 +657,10 @@ class Product:
 
 
 def batches(first: int, count: int, size: int) -> Iterator[range]:
-    """Yield the numbers from `first` to `count` in batches that begin at multiples of `size`, so that they are those of
-    somebody who started at 0; the first may be the rest of one."""
+    """Yield the numbers from `first` to `count` in batches that begin at multiples of
+    `size`, so that they are those of somebody who started at 0; the first may be the
+    rest of one.
+    """
     while first < count:
         last = min(count, (first // size + 1) * size)
         yield range(first, last)

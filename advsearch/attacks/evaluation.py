@@ -1,5 +1,7 @@
-"""What passes between a scene, a search and a trial: one question, its evaluation, and the contract of a policy: three
-functions over a state that is passed and never kept, so that it can be shared, wrapped, replayed and resumed."""
+"""What passes between a scene, a search and a trial: one question, its evaluation, and
+the contract of a policy: three functions over a state that is passed and never kept, so
+that it can be shared, wrapped, replayed and resumed.
+"""
 
 from __future__ import annotations
 
@@ -24,16 +26,23 @@ if TYPE_CHECKING:
     from advsearch.attacks.candidates import Failures
 
 WhichGradient = bool | Literal["free"]
-"""Which derivative is wanted: none, all of it, or only what costs no extra render, with zeros elsewhere."""
+"""Which derivative is wanted: none, all of it, or only what costs no extra render, with
+zeros elsewhere.
+"""
 
 Phase = Literal["search", "ranking"]
 
-MOST, MOST_NUMBERS = 1024, 2**21
-"""Queries that are asked at once, and the numbers that their configurations have together, at most."""
+MOST = 1024
+MOST_NUMBERS = 2**21
+"""Queries that are asked at once, and the numbers that their configurations have
+together, at most.
+"""
 
 
 def most_at_once(dim: int) -> int:
-    """Return how many configurations of so many numbers are asked about at once, at most."""
+    """Return how many configurations of so many numbers are asked about at once, at
+    most.
+    """
     return max(2, min(MOST, MOST_NUMBERS // dim))
 
 
@@ -41,28 +50,42 @@ def most_at_once(dim: int) -> int:
 class Query:
     """One question: what does the model say of this configuration under this noise?
 
-    A query of a search is about the picture as it is rendered, at the search's own samples and light paths, and over
-    the conditions that it draws. A trial is about the picture as a file would hold it, rounded to 8 bits.
+    A query of a search is about the picture as it is rendered, at the search's own
+    samples and light paths, and over the conditions that it draws. A trial is about the
+    picture as a file would hold it, rounded to 8 bits.
     """
 
     u: Tensor  # (d,) float32 in [0, 1], the configuration; must not be written to
-    seed: int  # of the noise, and of the conditions that are drawn; equal seeds mean equal noise
-    kind: str = "search"  # which rows the evaluation belongs to, such as "search" or "verification"
+    # of the noise, and of the conditions that are drawn; equal seeds mean equal noise
+    seed: int
+    # which rows the evaluation belongs to, such as "search" or "verification"
+    kind: str = "search"
     number: int = 0  # its place among these
     phase: Phase | None = None  # of a search; None for a trial
-    gradient: WhichGradient = False  # "free" only ever comes where the domain has `partial_gradients`
+    # "free" only ever comes where the domain has `partial_gradients`
+    gradient: WhichGradient = False
     samples: int = 1
-    """Of a search: how many times its own samples per pixel to render with, at least 1. The evaluation costs as many
-    times its renders: samples * (1 + gradient_cost) with a gradient, samples without."""
+    """Of a search: how many times its own samples per pixel to render with, at least 1.
+    The evaluation costs as many times its renders: samples * (1 + gradient_cost) with a
+    gradient, samples without.
+    """
     spp: int = 1  # of a trial: samples a pixel
-    drawn: bool = True  # of a trial: whether conditions are drawn; otherwise the scene has those it comes with
+    # of a trial: whether conditions are drawn; otherwise the scene has those it comes
+    # with
+    drawn: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
-    """Of a trial: what its row says of the configuration, which trials of one kind may have in common."""
-    sought: bool = True  # of a trial: whether a search seeks some prediction there, so that there is a success
+    """Of a trial: what its row says of the configuration, which trials of one kind may
+    have in common.
+    """
+    # of a trial: whether a search seeks some prediction there, so that there is a
+    # success
+    sought: bool = True
     wanted: Literal["judgement", "picture", "light"] = "judgement"
-    """What the evaluation is: a judgement; a picture alone; or "light", from which pictures can be predicted
-    (`advsearch.scene.transport`), at u of the whole space."""
-    keep: bool = False  # whether it has the picture, too; of a row of a sweep, the bytes of a small one
+    """What the evaluation is: a judgement; a picture alone; or "light", from which
+    pictures can be predicted (`advsearch.scene.transport`), at u of the whole space.
+    """
+    # whether it has the picture, too; of a row of a sweep, the bytes of a small one
+    keep: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,22 +93,38 @@ class Evaluation:
     """The answer to a query."""
 
     objective: float  # what is maximised; a noisy number, because a render is
-    gradient: Tensor | None  # (d,) float32, of the objective by u; None where it was not asked for
-    success: bool  # the model's prediction is what is sought, by the task; never derived from the objective
-    non_finite: int = 0  # gradient elements that were NaN or infinite and were set to zero where they arose
+    # (d,) float32, of the objective by u; None where it was not asked for
+    gradient: Tensor | None
+    # the model's prediction is what is sought, by the task; never derived from the
+    # objective
+    success: bool
+    # gradient elements that were NaN or infinite and were set to zero where they arose
+    non_finite: int = 0
     cost: int = 1
-    """Pictures that were rendered for it, at least 1: one, and those that differences took, each times `samples`. An
-    adjoint is not a picture and counts 0; `SearchResult.gradients` counts it. 0 of a row of a sweep whose picture was
-    predicted, or rendered for another model."""
+    """Pictures that were rendered for it, at least 1: one, and those that differences
+    took, each times `samples`. An adjoint is not a picture and counts 0;
+    `SearchResult.gradients` counts it. 0 of a row of a sweep whose picture was
+    predicted, or rendered for another model.
+    """
     judgement: Judgement | None = None
-    """What the task says of it, for the log; None where there is no task. No policy looks at it."""
-    picture: Tensor | None = None  # (H, W, 3) 8-bit values in [0, 1], where it was asked for
-    light: Any = None  # what was asked for as "light"; of a sweep's last row of a batch, what was predicted so far
-    predicted: int = 0  # 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix
-    small: bytes | None = None  # JPEG file of the picture of a row of a sweep, where it is kept
-    layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None  # ground truth by name, and notes, where kept
-    seconds: float | None = None  # that it took; None where whoever asks has to look at the clock
-    machine: str | None = None  # on which it was made, by its name among the workers'; None of one like this
+    """What the task says of it, for the log; None where there is no task. No policy
+    looks at it.
+    """
+    # (H, W, 3) 8-bit values in [0, 1], where it was asked for
+    picture: Tensor | None = None
+    # what was asked for as "light"; of a sweep's last row of a batch, what was
+    # predicted so far
+    light: Any = None
+    # 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix
+    predicted: int = 0
+    # JPEG file of the picture of a row of a sweep, where it is kept
+    small: bytes | None = None
+    # ground truth by name, and notes, where kept
+    layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
+    # that it took; None where whoever asks has to look at the clock
+    seconds: float | None = None
+    # on which it was made, by its name among the workers'; None of one like this
+    machine: str | None = None
     lost: bool = False  # whether every worker that tried it died
 
     @classmethod
@@ -96,7 +135,9 @@ class Evaluation:
 
     @property
     def said(self) -> Judgement:
-        """What the task says; a RuntimeError where there is no task, or something else was wanted."""
+        """What the task says; a RuntimeError where there is no task, or something else
+        was wanted.
+        """
         if self.judgement is None:
             raise RuntimeError("this evaluation has no judgement")
         return self.judgement
@@ -107,19 +148,28 @@ class Evaluation:
         return math.isfinite(self.objective)
 
     def usable(self) -> Evaluation:
-        """Return the evaluation as policies may see it: every number in it can be computed with.
+        """Return the evaluation as policies may see it: every number in it can be
+        computed with.
 
         The rule, the same for every policy:
 
-        - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
-        - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
-          false.
+        - gradient elements that are NaN or infinite become zero and are added to
+        `non_finite`;
+        - an objective that is NaN or infinite becomes -inf ("the worst there is"), its
+          gradient zero and its success false.
         """
-        evaluation, gradient = self, self.gradient
-        if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
+        evaluation = self
+        gradient = self.gradient
+        if gradient is not None and not math.isfinite(
+            float(gradient.sum(dtype=torch.float64))
+        ):
             if bad := int((~torch.isfinite(gradient)).sum()):
                 gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
-                evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
+                evaluation = replace(
+                    evaluation,
+                    gradient=gradient,
+                    non_finite=evaluation.non_finite + bad,
+                )
         if evaluation.finite:
             return evaluation
         zero = None if gradient is None else torch.zeros_like(gradient)
@@ -127,8 +177,10 @@ class Evaluation:
 
 
 Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
-"""Answers queries, in their order, each when it is asked for; whoever stops asking leaves the rest undone. Supplied by
-whoever owns the scene. `functools.partial(map, f)` makes one of a function of one query."""
+"""Answers queries, in their order, each when it is asked for; whoever stops asking
+leaves the rest undone. Supplied by whoever owns the scene. `functools.partial(map, f)`
+makes one of a function of one query.
+"""
 
 
 State = TypeVar("State")
@@ -140,11 +192,14 @@ class Proposal:
 
     Attributes:
         u: (d,) float32 inside the domain; the caller must not write to it.
-        gradient: whether the policy wants the derivative there: not, all of it (`Domain.gradient_cost` more pictures),
-            or what is "free" (only where the domain has `partial_gradients`). A wish: the end of a budget gets none.
-        step_size: the step that led here in units of each block's radius, for the log; NaN where there is none.
-        samples: render with so many times the search's samples per pixel, at least 1, for as many times the renders.
-            A wish too: the end of a budget gets what is left.
+        gradient: whether the policy wants the derivative there: not, all of it
+            (`Domain.gradient_cost` more pictures), or what is "free" (only where the
+            domain has `partial_gradients`). A wish: the end of a budget gets none.
+        step_size: the step that led here in units of each block's radius, for the log;
+            NaN where there is none.
+        samples: render with so many times the search's samples per pixel, at least 1,
+            for as many times the renders. A wish too: the end of a budget gets what is
+            left.
     """
 
     u: Tensor
@@ -154,11 +209,15 @@ class Proposal:
 
     def cost(self, domain: Domain) -> int:
         """Return the renders that this takes at most."""
-        return self.samples * (1 + (domain.gradient_cost if self.gradient is True else 0))
+        return self.samples * (
+            1 + (domain.gradient_cost if self.gradient is True else 0)
+        )
 
     def affordable(self, domain: Domain, left: int) -> Proposal:
-        """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
-        after which no render would be left to use it."""
+        """Return the proposal as far as `left` renders, at least 1, allow: no more
+        samples than these, and no gradient after which no render would be left to use
+        it.
+        """
         proposal = replace(self, samples=left) if self.samples > left else self
         if proposal.gradient and proposal.cost(domain) >= left:
             return replace(proposal, gradient=False)
@@ -167,31 +226,41 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Counts:
-    """What a policy had to do about evaluations, for the summary of a run: gradients of which single numbers were
-    outliers and cut (`pgd.clipped`), those shortened as a whole, and steps that were taken back (`rejected`)."""
+    """What a policy had to do about evaluations, for the summary of a run: gradients of
+    which single numbers were outliers and cut (`pgd.clipped`), those shortened as a
+    whole, and steps that were taken back (`rejected`).
+    """
 
     cut: int = 0
     shortened: int = 0
     rejected: int = 0
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(self.cut + other.cut, self.shortened + other.shortened, self.rejected + other.rejected)
+        return Counts(
+            self.cut + other.cut,
+            self.shortened + other.shortened,
+            self.rejected + other.rejected,
+        )
 
 
 NO_COUNTS = Counts()
 
 
 Evaluated = Sequence[tuple[Tensor, Evaluation]]
-"""Configurations with what a render of each said, in the order in which they were proposed."""
+"""Configurations with what a render of each said, in the order in which they were
+proposed.
+"""
 
 
 class Policy(ABC, Generic[State]):
-    """Proposes configurations, in batches. Write a new one by implementing the three methods below.
+    """Proposes configurations, in batches. Write a new one by implementing the three
+    methods below.
 
-    Its `name` is for messages and the log. One that `handles_choices` searches discrete choices (`Block.options`)
-    itself; any other is wrapped in `Choices` by `search`, so that it never sees any. Its options are the fields of a
-    dataclass; what is outside their range is an InputError when it is made, and a domain that it cannot search (of too
-    many numbers, say) when it starts.
+    Its `name` is for messages and the log. One that `handles_choices` searches discrete
+    choices (`Block.options`) itself; any other is wrapped in `Choices` by `search`, so
+    that it never sees any. Its options are the fields of a dataclass; what is outside
+    their range is an InputError when it is made, and a domain that it cannot search (of
+    too many numbers, say) when it starts.
     """
 
     name: ClassVar[str]
@@ -200,13 +269,18 @@ class Policy(ABC, Generic[State]):
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
         if "answer" in vars(cls):
-            raise InputError(f"policy {cls.__name__}: `answer` is called `distribution` now; rename it")
+            raise InputError(
+                f"policy {cls.__name__}: `answer` is called "
+                "`distribution` now; rename it"
+            )
         hand_copies(cls, start=slice(1), update=slice(1, None))
 
     @property
     @abstractmethod
     def uses_gradient(self) -> bool:
-        """Whether it ever asks for a gradient. A class where that is fixed just sets the attribute."""
+        """Whether it ever asks for a gradient. A class where that is fixed just sets
+        the attribute.
+        """
 
     @abstractmethod
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> State:
@@ -214,9 +288,10 @@ class Policy(ABC, Generic[State]):
 
         Args:
             domain: where to search; begin at `domain.begin`.
-            generator: the search's source of randomness, to draw a seed from; use `seeded` for numbers later on.
-            steps: how many renders there will be at most, those of gradients included: a plan for schedules, never to
-                be counted on.
+            generator: the search's source of randomness, to draw a seed from; use
+                `seeded` for numbers later on.
+            steps: how many renders there will be at most, those of gradients included:
+                a plan for schedules, never to be counted on.
         """
 
     @abstractmethod
@@ -228,37 +303,46 @@ class Policy(ABC, Generic[State]):
             n: how many can be evaluated before the next `update`, at least 1.
 
         Returns:
-            Up to n that do not wait for each other's evaluations: a sample of a population is one of many, a step
-            along a gradient is alone. None at all if there is nothing more to propose (a grid that is done, a flat
-            objective). Asked with another n, a policy proposes the same configurations in the same order, provided
-            that `update` is told of all of them.
+            Up to n that do not wait for each other's evaluations: a sample of a
+            population is one of many, a step along a gradient is alone. None at all if
+            there is nothing more to propose (a grid that is done, a flat objective).
+            Asked with another n, a policy proposes the same configurations in the same
+            order, provided that `update` is told of all of them.
         """
 
     @abstractmethod
     def update(self, state: State, evaluated: Evaluated) -> State:
-        """Return the state after what was proposed last was evaluated, all of it, or the first of it where the budget
-        ends.
+        """Return the state after what was proposed last was evaluated, all of it, or
+        the first of it where the budget ends.
 
-        Every evaluation is `usable`: its gradient (None where it was not asked for or could not be paid) is finite, and
-        its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
-        with another seed gives another value, and a maximum over many is biased upwards.
+        Every evaluation is `usable`: its gradient (None where it was not asked for or
+        could not be paid) is finite, and its objective is finite or -inf, which stands
+        for "could not be evaluated". The objective is noisy: the same u with another
+        seed gives another value, and a maximum over many is biased upwards.
         """
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
-        """Return whether, in `steps` renders, it may ask for gradients of a domain that cost renders."""
+        """Return whether, in `steps` renders, it may ask for gradients of a domain that
+        cost renders.
+        """
         return self.uses_gradient and domain.gradient_cost > 0
 
     def counts(self, state: State) -> Counts:
-        """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
+        """Return what the policy did about the evaluations so far; nothing where it
+        takes them as they come.
+        """
         return NO_COUNTS
 
     def distribution(self, state: State) -> Distribution | None:
-        """Return the distribution that the search has reached, where that is its result beside the best configuration
-        that it met; None where there is none (yet)."""
+        """Return the distribution that the search has reached, where that is its result
+        beside the best configuration that it met; None where there is none (yet).
+        """
         return None
 
     def failures(self, state: State) -> Failures | None:
-        """Return the different failures that the policy has met, if it looks for more than one."""
+        """Return the different failures that the policy has met, if it looks for more
+        than one.
+        """
         return None
 
 
@@ -268,14 +352,18 @@ def draw_seed(generator: torch.Generator) -> int:
 
 
 def seeded(seed: int, number: int) -> torch.Generator:
-    """Return the generator for draw `number` of a policy: it depends on nothing else."""
+    """Return the generator for draw `number` of a policy: it depends on nothing
+    else.
+    """
     return torch.Generator().manual_seed(stream(seed, "policy", number))
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while: faster for small matrices, on a busy machine many times so, and the last
-    bits are the same whatever the number of threads. Setting the number costs less than a microsecond."""
+    """Let torch use one thread for a while: faster for small matrices, on a busy
+    machine many times so, and the last bits are the same whatever the number of
+    threads. Setting the number costs less than a microsecond.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,14 +1,17 @@
-"""Objectives as pure functions: of logits margin, log-odds, cross-entropy and DLR; of features two distances.
+"""Objectives as pure functions: of logits margin, log-odds, cross-entropy and DLR; of
+features two distances.
 
 Each of logits comes in two forms over label sets, both to be *maximised*:
 
 - plain, `f(logits, images, labels)`: away from the label set Y of right labels;
-- targeted, `targeted_f(logits, images, target)`: towards a target T, which is a label set as well.
+- targeted, `targeted_f(logits, images, target)`: towards a target T, which is a label
+set as well.
 
-Arguments are logits (N, C), images (N, H, W, 3), which none of these look at, and class indices. Values are (N,), of
-the dtype of the logits, and differentiable. At logits of ten thousand, at ties and at probabilities that round to 0 or
-1 the gradient is finite, and it is not lost. InputError: logits that are not (N, C), indices that the model does not
-have, a label set of all classes.
+Arguments are logits (N, C), images (N, H, W, 3), which none of these look at, and class
+indices. Values are (N,), of the dtype of the logits, and differentiable. At logits of
+ten thousand, at ties and at probabilities that round to 0 or 1 the gradient is finite,
+and it is not lost. InputError: logits that are not (N, C), indices that the model does
+not have, a label set of all classes.
 """
 
 from __future__ import annotations
@@ -21,36 +24,52 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.errors import InputError
-from advsearch.tasks.classification import Labels, largest, members, target_lead, wrong_lead
+from advsearch.tasks.classification import (
+    Labels,
+    largest,
+    members,
+    target_lead,
+    wrong_lead,
+)
 
 SUREST = -15.0
-"""Log-odds below which cross-entropy is continued by its tangent. In float32 its own slope, exp(log-odds), would be
-lost at -103 and count for nothing beside other numbers long before."""
+"""Log-odds below which cross-entropy is continued by its tangent. In float32 its own
+slope, exp(log-odds), would be lost at -103 and count for nothing beside other numbers
+long before.
+"""
 
-RELIEF = 1e-4  # added to a denominator of `dlr`, as a fraction of the distance from the largest to the smallest logit
+# added to a denominator of `dlr`, as a fraction of the distance from the largest to the
+# smallest logit
+RELIEF = 1e-4
 SAME = 1e-12  # logits that lie closer together than this are all the same to `dlr`
 
 
 def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The largest wrong logit minus the largest right one: over 0 exactly where the model is wrong.
+    """The largest wrong logit minus the largest right one: over 0 exactly where the
+    model is wrong.
 
-    max over j not in Y of z_j, minus max over y in Y of z_y. In logits (log-odds), unbounded, and with a gradient of
-    one at every confidence (Carlini and Wagner 2017, f_6 without its hinge). Ties share the gradient.
+    max over j not in Y of z_j, minus max over y in Y of z_y. In logits (log-odds),
+    unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
+    f_6 without its hinge). Ties share the gradient.
     """
     return wrong_lead(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where the prediction is in T."""
+    """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where
+    the prediction is in T.
+    """
     return target_lead(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The log-odds of a wrong prediction: like cross-entropy all classes count, and the gradient never fades.
+    """The log-odds of a wrong prediction: like cross-entropy all classes count, and the
+    gradient never fades.
 
-    log((1 - p) / p) with p the total probability of Y, as logsumexp over j not in Y minus logsumexp over Y. A growing
-    function of `cross_entropy`, so the two rank configurations alike; between it and `margin` lies at most the
-    logarithm of the number of classes.
+    log((1 - p) / p) with p the total probability of Y, as logsumexp over j not in Y
+    minus logsumexp over Y. A growing function of `cross_entropy`, so the two rank
+    configurations alike; between it and `margin` lies at most the logarithm of the
+    number of classes.
     """
     return _log_odds(logits, ~members(logits, labels))
 
@@ -64,50 +83,61 @@ def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     """Minus the logarithm of the probability of the right labels, in nats.
 
     -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits of thousands nor cancels where p
-    is near 1. Its slope in l is 1 - p and would be lost where the model is sure. So below l = `SUREST`, where the value
-    is 3e-7, it is continued by its tangent: the slope stays 3e-7, and values get slightly under 0. That is enough for
-    policies that normalise their steps; `log_odds` has slope 1 everywhere.
+    is near 1. Its slope in l is 1 - p and would be lost where the model is sure. So
+    below l = `SUREST`, where the value is 3e-7, it is continued by its tangent: the
+    slope stays 3e-7, and values get slightly under 0. That is enough for policies that
+    normalise their steps; `log_odds` has slope 1 everywhere.
     """
     return _softplus(log_odds(logits, images, labels))
 
 
 def targeted_cross_entropy(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """log p with p the total probability of T, in nats: 0 at best, continued as `cross_entropy` is."""
+    """log p with p the total probability of T, in nats: 0 at best, continued as
+    `cross_entropy` is.
+    """
     return -_softplus(-targeted_log_odds(logits, images, target))
 
 
 def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The difference of logits ratio: `margin` over a distance between logits, so their scale and offset cancel.
+    """The difference of logits ratio: `margin` over a distance between logits, so their
+    scale and offset cancel.
 
-    Let s be max over y in Y of z_y, w the largest wrong logit, and p_1 >= p_2 >= ... the sorted list of s and all wrong
-    logits. The value is
+    Let s be max over y in Y of z_y, w the largest wrong logit, and p_1 >= p_2 >= ...
+    the sorted list of s and all wrong logits. The value is
 
         (w - s) / (p_1 - p_3)                 where the model is right (w <= s): from -1 to 0;
         (w - s) / (p_1 - (p_3 + p_4) / 2)     where it is wrong: over 0.
 
-    The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4, and the denominator of the second is that
-    of their targeted form: with the first one the value would be 1, without a gradient, wherever s comes third, and a
-    search goes on after its first success. We depart from them in three more things. Of several right labels only the
-    largest takes part, or three of them at the top would divide by zero. Where there is no fourth logit, p_2 stands in
-    for it. And `RELIEF` times the distance from the largest to the smallest logit is added to a denominator, so that
-    ties leave it finite and the value within 1 / `RELIEF`; where all logits are the same, it is 1.
+    The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4, and the
+    denominator of the second is that of their targeted form: with the first one the
+    value would be 1, without a gradient, wherever s comes third, and a search goes on
+    after its first success. We depart from them in three more things. Of several right
+    labels only the largest takes part, or three of them at the top would divide by
+    zero. Where there is no fourth logit, p_2 stands in for it. And `RELIEF` times the
+    distance from the largest to the smallest logit is added to a denominator, so that
+    ties leave it finite and the value within 1 / `RELIEF`; where all logits are the
+    same, it is 1.
 
-    Without scale there is no way to say *how far* beyond the others a logit lies. So the value is no measure of
-    confidence: with p_2 = p_3 behind a right prediction it is -1, however sure the model is.
+    Without scale there is no way to say *how far* beyond the others a logit lies. So
+    the value is no measure of confidence: with p_2 = p_3 behind a right prediction it
+    is -1, however sure the model is.
 
     Raises:
-        InputError: fewer than two wrong classes. Of two numbers only the order is left without scale and offset.
+        InputError: fewer than two wrong classes. Of two numbers only the order is left
+            without scale and offset.
     """
     top, spread = _sorted(logits, members(logits, labels), "label")
-    difference, wide = margin(logits, images, labels), top[:, 0] - top[:, 2]
+    difference = margin(logits, images, labels)
+    wide = top[:, 0] - top[:, 2]
     return difference / _safe(torch.where(difference > 0.0, _wider(top), wide), spread)
 
 
 def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """`targeted_margin` over p_1 - (p_3 + p_4) / 2, with p the sorted list of max over T and all logits not in T.
+    """`targeted_margin` over p_1 - (p_3 + p_4) / 2, with p the sorted list of max over
+    T and all logits not in T.
 
-    The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y instead: that is over 0 also
-    where a third class wins. Otherwise as `dlr`.
+    The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y
+    instead: that is over 0 also where a third class wins. Otherwise as `dlr`.
     """
     top, spread = _sorted(logits, members(logits, target, "target"), "target")
     return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
@@ -120,18 +150,23 @@ def _log_odds(logits: Tensor, of: Tensor) -> Tensor:
 
 def _softplus(x: Tensor) -> Tensor:
     """log(1 + exp(x)), continued by its tangent below `SUREST`."""
-    value, slope = math.log1p(math.exp(SUREST)), 1.0 / (1.0 + math.exp(-SUREST))
+    value = math.log1p(math.exp(SUREST))
+    slope = 1.0 / (1.0 + math.exp(-SUREST))
     return torch.where(x < SUREST, value + slope * (x - SUREST), functional.softplus(x))
 
 
 def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
-    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order, the classes of a group
-    taken for a single one with their largest, and the distance (N,) from the largest to the smallest of all. Refuses a
-    label set that leaves fewer than two other classes."""
-    size, others = int(group.sum()), int((~group).sum())
+    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling
+    order, the classes of a group taken for a single one with their largest, and the
+    distance (N,) from the largest to the smallest of all. Refuses a label set that
+    leaves fewer than two other classes.
+    """
+    size = int(group.sum())
+    others = int((~group).sum())
     if others < 2:
         raise InputError(
-            f"`objective` dlr: expected at least 2 classes beside the {size} of `{setting}`, got {others}; "
+            f"`objective` dlr: expected at least 2 classes beside the {size} of "
+            f"`{setting}`, got {others}; "
             "its ratio needs a third logit: use `objective=margin`"
         )
     collapsed = torch.cat([largest(logits, group)[:, None], logits[:, ~group]], dim=1)
@@ -146,42 +181,57 @@ def _wider(top: Tensor) -> Tensor:
 
 def _safe(denominator: Tensor, spread: Tensor) -> Tensor:
     """Return a denominator that is over 0; 1 where all logits are the same."""
-    return torch.where(spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread))
+    return torch.where(
+        spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread)
+    )
 
 
-NEARBY = 1e-3  # distances under this fraction of the clean features' length count as none: it is rounded off there
+# distances under this fraction of the clean features' length count as none: it is
+# rounded off there
+NEARBY = 1e-3
 
 ReadFeatures = Callable[[Tensor], Tensor]
 """From images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N, F): what
 `advsearch.models.features.features_of` returns, say."""
 
 
-def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """How far the features of the picture lie from those of the clean one, in lengths of the clean ones.
+def feature_distance(
+    features: ReadFeatures, clean: Tensor
+) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
+    """How far the features of the picture lie from those of the clean one, in lengths
+    of the clean ones.
 
-    With f0 the features of the clean picture, e = (f - f0) / |f0|, r a fixed unit vector and h = `NEARBY`,
+    With f0 the features of the clean picture, e = (f - f0) / |f0|, r a fixed unit
+    vector and h = `NEARBY`,
 
         sqrt(|e + h r|^2 + h^2) - sqrt(2) h,
 
-    which is |e| to within 3 h, exactly 0 at e = 0, and has a finite gradient everywhere. The plain |e| has none at the
-    clean picture, where every search starts, and |e|^2 and a smoothed |e| have their minimum there: a gradient of zero,
-    which a search without noise would never leave. Hence r: at the clean picture the gradient is r / (sqrt(2) |f0|), at
-    the full strength of a distance, and beyond a few h it is that of |e|. The direction of r (drawn once, from a fixed
-    seed) does not matter: every direction leads away, and after the first step the distance itself shows which leads
-    away fastest. With a noisy renderer the noise does the same.
+    which is |e| to within 3 h, exactly 0 at e = 0, and has a finite gradient
+    everywhere. The plain |e| has none at the clean picture, where every search starts,
+    and |e|^2 and a smoothed |e| have their minimum there: a gradient of zero, which a
+    search without noise would never leave. Hence r: at the clean picture the gradient
+    is r / (sqrt(2) |f0|), at the full strength of a distance, and beyond a few h it is
+    that of |e|. The direction of r (drawn once, from a fixed seed) does not matter:
+    every direction leads away, and after the first step the distance itself shows which
+    leads away fastest. With a noisy renderer the noise does the same.
 
-    The idea is that of Sabour et al. 2016, who lead a picture's features to those of another one; here they lead away.
+    The idea is that of Sabour et al. 2016, who lead a picture's features to those of
+    another one; here they lead away.
 
-    It looks at no label: it needs no right label, leads to no class in particular, and what counts as success is
-    checked by the prediction as ever. Where f0 is zero its length counts as 1.
+    It looks at no label: it needs no right label, leads to no class in particular, and
+    what counts as success is checked by the prediction as ever. Where f0 is zero its
+    length counts as 1.
 
     Args:
-        features: differentiable; called once here, and once more per evaluation. InputError: not (N, F), or not finite.
-        clean: (H, W, 3) or (N, H, W, 3): the clean picture, or several renders of it, whose features are averaged.
-            Take as little noise as you can afford: noise of the search's own renders is a distance as well.
+        features: differentiable; called once here, and once more per evaluation.
+            InputError: not (N, F), or not finite.
+        clean: (H, W, 3) or (N, H, W, 3): the clean picture, or several renders of it,
+            whose features are averaged. Take as little noise as you can afford: noise
+            of the search's own renders is a distance as well.
 
     Returns:
-        An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks at the images only.
+        An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks
+        at the images only.
     """
     reference = _reference(features, clean)
     length = torch.linalg.vector_norm(reference)
@@ -198,19 +248,23 @@ def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor,
     return objective
 
 
-def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """One minus the cosine of the features and those of the clean picture: from 0 where they are the same to 2.
+def cosine_distance(
+    features: ReadFeatures, clean: Tensor
+) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
+    """One minus the cosine of the features and those of the clean picture: from 0 where
+    they are the same to 2.
 
-    That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at the clean picture, where every
-    search starts, so `h` e . r is added, with r and `h` as in `feature_distance`: at the clean picture the gradient
-    leads along r, and beyond a few `h` it is that of the distance.
+    That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at
+    the clean picture, where every search starts, so `h` e . r is added, with r and `h`
+    as in `feature_distance`: at the clean picture the gradient leads along r, and
+    beyond a few `h` it is that of the distance.
 
     Args:
         features: of the clean picture; called once, here.
         clean: as for `feature_distance`.
 
-    Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the
-        features only.
+    Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for
+        `h`^2, that looks at the features only.
     """
     reference = functional.normalize(_reference(features, clean), dim=0)
     away = _away(reference)
@@ -225,7 +279,9 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
 
 def _away(reference: Tensor) -> Tensor:
     """Return a fixed direction (F,) of length `NEARBY`."""
-    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(reference)
+    away = torch.randn(reference.shape, generator=torch.Generator().manual_seed(0)).to(
+        reference
+    )
     return away * (NEARBY / float(torch.linalg.vector_norm(away)))
 
 
@@ -234,10 +290,14 @@ def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     with torch.no_grad():
         reference = features(clean if clean.dim() == 4 else clean[None])
     if reference.dim() != 2:
-        raise InputError(f"objective: expected features of shape (N, F), got {tuple(reference.shape)}")
+        raise InputError(
+            "objective: expected features of shape (N, F), got "
+            f"{tuple(reference.shape)}"
+        )
     if not bool(torch.isfinite(reference).all()):
         raise InputError(
-            "objective: expected finite features of the clean picture, got NaN or infinity; check that the "
+            "objective: expected finite features of the clean picture, got NaN or "
+            "infinity; check that the "
             "model predicts it"
         )
     return reference.mean(dim=0)

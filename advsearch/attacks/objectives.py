@@ -1,16 +1,20 @@
-"""What a search maximises; what counts as success is another thing (`advsearch.tasks`, docs/objectives.md).
+"""What a search maximises; what counts as success is another thing (`advsearch.tasks`,
+docs/objectives.md).
 
-An objective is a callable `(output, images, truth) -> values`, the larger the nearer to what the search is after:
+An objective is a callable `(output, images, truth) -> values`, the larger the nearer to
+what the search is after:
 
-- output: of the model for N pictures, as its task takes it; in classification logits (N, C) float32;
+- output: of the model for N pictures, as its task takes it; in classification logits
+(N, C) float32;
 - images: (N, H, W, 3) float32 that the model saw, display-referred sRGB in [0, 1];
-- truth: what is true of the scene, as the task has it; in classification the indices of the label set Y, every one of
-  which is a right label;
+- truth: what is true of the scene, as the task has it; in classification the indices of
+  the label set Y, every one of which is a right label;
 - values: (N,), differentiable.
 
-What `get_objective` returns is called with a fourth argument where there is a configuration: `more`, which gives what a
-user's function asks for by the names of its parameters: it is called with `(output, images, truth)`, or `(output,
-labels)` as losses of torch are, and asks for more by the names of further ones.
+What `get_objective` returns is called with a fourth argument where there is a
+configuration: `more`, which gives what a user's function asks for by the names of its
+parameters: it is called with `(output, images, truth)`, or `(output, labels)` as losses
+of torch are, and asks for more by the names of further ones.
 """
 
 from __future__ import annotations
@@ -27,7 +31,9 @@ from torch import Tensor, nn
 
 from advsearch.attacks import objective_functions as functions
 from advsearch.attacks.objective_functions import ReadFeatures
-from advsearch.attacks.objective_functions import margin as margin  # for objectives of plugins, docs/extending.md
+
+# for objectives of plugins, docs/extending.md
+from advsearch.attacks.objective_functions import margin as margin
 from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
@@ -37,103 +43,165 @@ from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
-ASKED = ("u", "texture", "textures", "inputs", "configuration")  # what a function may ask for by further parameters
+# what a function may ask for by further parameters
+ASKED = ("u", "texture", "textures", "inputs", "configuration")
 
 TRUTHS = ("target", "targets", "labels", "label", "truth")
-"""What the second of two parameters is called in a loss of outputs and right labels alone."""
+"""What the second of two parameters is called in a loss of outputs and right labels
+alone.
+"""
 
-IMAGES = ("images", "image")  # what the second of two parameters is called in a function that forgot the third
+# what the second of two parameters is called in a function that forgot the third
+IMAGES = ("images", "image")
 
 More = Callable[[str], Any]
-"""Gives what is asked for by one of the names in `ASKED`, at the configuration of each picture."""
+"""Gives what is asked for by one of the names in `ASKED`, at the configuration of each
+picture.
+"""
 
 
 class Objective(Protocol):
-    """The signature of an objective, called by position; see `advsearch.attacks.objectives`."""
+    """The signature of an objective, called by position; see
+    `advsearch.attacks.objectives`.
+    """
 
-    def __call__(self, output: Any, images: Tensor, truth: Any, more: More = ..., /) -> Tensor:
+    def __call__(
+        self, output: Any, images: Tensor, truth: Any, more: More = ..., /
+    ) -> Tensor:
         """Return (N,) values to maximise."""
         ...
 
 
 def nothing_more(name: str) -> Any:
     """Refuse what is asked for where there is no configuration."""
-    raise InputError(f"objective: asks for `{name}`, and no configuration was given; pass `more`, which gives it")
+    raise InputError(
+        f"objective: asks for `{name}`, and no configuration was given; "
+        "pass `more`, which gives it"
+    )
 
 
 @dataclass(frozen=True)
 class Form:
-    """Which arguments a function takes: (output, images, truth), or without `images`, and what it asks for beside them,
-    of `ASKED`."""
+    """Which arguments a function takes: (output, images, truth), or without `images`,
+    and what it asks for beside them, of `ASKED`.
+    """
 
     images: bool = True
     asked: tuple[str, ...] = ()
 
 
 def form_of(function: Callable[..., Any]) -> Form:
-    """Return which arguments a function takes. The names of its first two parameters ask for nothing, nor does a third
-    one in the place of the truth."""
+    """Return which arguments a function takes. The names of its first two parameters
+    ask for nothing, nor does a third one in the place of the truth.
+    """
     if isinstance(function, type):
-        raise InputError(f"objective: expected a name or a function (output, images, truth), got {told(function)}")
+        raise InputError(
+            "objective: expected a name or a function (output, images, "
+            f"truth), got {told(function)}"
+        )
     try:
-        signature = inspect.signature(function.forward if isinstance(function, nn.Module) else function)
+        signature = inspect.signature(
+            function.forward if isinstance(function, nn.Module) else function
+        )
     except ValueError:  # built in: nothing to look at
         return Form()
     parameters = signature.parameters.values()
-    by_position = [parameter.name for parameter in parameters if parameter.kind in (0, 1)]
+    by_position = [
+        parameter.name for parameter in parameters if parameter.kind in (0, 1)
+    ]
     if by_position[:1] and by_position[0] in IMAGES:  # as a metric takes them
         raise InputError(
-            f"objective {name_of(function)!r}: its first argument is called {by_position[0]!r}, but gets what the "
+            f"objective {name_of(function)!r}: its first argument is called "
+            f"{by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
-    asked = tuple(name for name in signature.parameters if name in ASKED and name not in by_position[:2])
+    asked = tuple(
+        name
+        for name in signature.parameters
+        if name in ASKED and name not in by_position[:2]
+    )
     unnamed = [name for name in by_position if name not in asked]
-    images = len(unnamed) < 2 or any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters)
-    images = images or (unnamed[1] not in TRUTHS and (len(unnamed) > 2 or unnamed[1] in (*IMAGES, *ASKED)))
+    images = len(unnamed) < 2 or any(
+        parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
+    )
+    images = images or (
+        unnamed[1] not in TRUTHS
+        and (len(unnamed) > 2 or unnamed[1] in (*IMAGES, *ASKED))
+    )
     try:
         signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
     except TypeError as error:
         raise InputError(
-            f"objective {name_of(function)!r}: expected a function that takes (output, images, truth) or (output, "
+            f"objective {name_of(function)!r}: expected a function that takes (output, "
+            "images, truth) or (output, "
             f"labels), and beside them any of {', '.join(ASKED)} by name: {error}"
         ) from None
     return Form(images, asked)
 
 
 def checked(function: Callable[..., Tensor]) -> Objective:
-    """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost gradient is an InputError.
+    """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost
+    gradient is an InputError.
 
-    The function returns (N,), or a scalar, for which it is called with one picture at a time. A label set of one class
-    comes as (N,) int64, as torch's losses take it. It gets copies, which it may write into. What it raises itself
-    passes through. NaN values pass too: a search has a rule for them.
+    The function returns (N,), or a scalar, for which it is called with one picture at a
+    time. A label set of one class comes as (N,) int64, as torch's losses take it. It
+    gets copies, which it may write into. What it raises itself passes through. NaN
+    values pass too: a search has a rule for them.
     """
-    name, form = name_of(function), form_of(function)
+    name = name_of(function)
+    form = form_of(function)
 
-    def objective(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        asked, count = {asks: more(asks) for asks in form.asked}, images.shape[0]
+    def objective(
+        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+    ) -> Tensor:
+        asked = {asks: more(asks) for asks in form.asked}
+        count = images.shape[0]
         arguments = (output, images, labels_of(truth, output, count))
-        handed, handed_by_name = copied(arguments if form.images else arguments[::2]), copied(asked)
+        handed = copied(arguments if form.images else arguments[::2])
+        handed_by_name = copied(asked)
         try:
             values = function(*handed, **handed_by_name)
         except TypeError as error:
             if not (isinstance(arguments[2], tuple) and "not tuple" in str(error)):
                 raise
             raise InputError(
-                f"objective {name!r}: expected one right label for a loss of torch, got {len(truth)} (indices "
+                f"objective {name!r}: expected one right label for a loss of torch, "
+                f"got {len(truth)} (indices "
                 f"{truth}); use those of advsearch.losses, or name one with `label`"
             ) from error
         if isinstance(values, Tensor) and values.ndim == 0 and count > 1:
-            parts = [(slice(k, k + 1), partial(_of_one, asked, k)) for k in range(count)]
-            values = torch.cat([objective(output[part], images[part], truth, more) for part, more in parts])
+            parts = [
+                (slice(k, k + 1), partial(_of_one, asked, k)) for k in range(count)
+            ]
+            values = torch.cat(
+                [
+                    objective(output[part], images[part], truth, more)
+                    for part, more in parts
+                ]
+            )
         values = _values(name, values, count)
-        if values.requires_grad and any(tensor._version for tensor in _tensors((handed, handed_by_name))):
-            read = [tensor for tensor in _tensors((output, asked)) if tensor.requires_grad]
+        if values.requires_grad and any(
+            tensor._version for tensor in _tensors((handed, handed_by_name))
+        ):
+            read = [
+                tensor for tensor in _tensors((output, asked)) if tensor.requires_grad
+            ]
             _check_in_place(name, values, read or [images])
-        seen = [value for value in (images, output, *asked.values()) if isinstance(value, Tensor)]
-        if torch.is_grad_enabled() and any(value.requires_grad for value in seen) and not values.requires_grad:
+        seen = [
+            value
+            for value in (images, output, *asked.values())
+            if isinstance(value, Tensor)
+        ]
+        if (
+            torch.is_grad_enabled()
+            and any(value.requires_grad for value in seen)
+            and not values.requires_grad
+        ):
             raise InputError(
-                f"objective {name!r}: the result does not depend on the output or the images differentiably; "
-                "remove .detach(), torch.no_grad() or argmax, or choose a policy without gradients (random)"
+                f"objective {name!r}: the result does not depend on the output or the "
+                "images differentiably; "
+                "remove .detach(), torch.no_grad() or argmax, or choose a policy "
+                "without gradients (random)"
             )
         return values
 
@@ -144,20 +212,30 @@ def _tensors(value: Any) -> list[Tensor]:
     """Those that an objective was handed, in tuples, lists and mappings."""
     if isinstance(value, Tensor):
         return [value]
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    parts = (
+        value.values()
+        if isinstance(value, dict)
+        else value
+        if isinstance(value, (list, tuple))
+        else ()
+    )
     return [tensor for part in parts for tensor in _tensors(part)]
 
 
 def _check_in_place(name: str, values: Tensor, read: Sequence[Tensor]) -> None:
-    """Refuse what a function has written into, where torch can't differentiate it any more."""
+    """Refuse what a function has written into, where torch can't differentiate it any
+    more.
+    """
     try:
         torch.autograd.grad(values.sum(), read, retain_graph=True, allow_unused=True)
     except RuntimeError as error:
         if "inplace" not in str(error):
             raise
         raise InputError(
-            f"objective {name!r}: it writes into what it is given, and then torch can't differentiate what it has "
-            "computed before; use the operation that makes a new tensor (`scatter` for `scatter_`, "
+            f"objective {name!r}: it writes into what it is given, and then torch "
+            "can't differentiate what it has "
+            "computed before; use the operation that makes a new tensor (`scatter` for "
+            "`scatter_`, "
             "`logits.clone()` before `logits[...] = ...`)"
         ) from None
 
@@ -170,34 +248,52 @@ def name_of(function: Callable[..., Any]) -> str:
 def _values(name: str, values: Any, count: int) -> Tensor:
     if not isinstance(values, Tensor):
         raise InputError(
-            f"objective {name!r}: expected a torch tensor of shape ({count},), got {type(values).__name__}; "
-            "compute it with torch operations and don't call .item(), float() or .numpy()"
+            f"objective {name!r}: expected a torch tensor of shape ({count},), got "
+            f"{type(values).__name__}; "
+            "compute it with torch operations and don't call .item(), float() or "
+            ".numpy()"
         )
     if not values.is_floating_point():
         raise InputError(
-            f"objective {name!r}: expected floating-point values, got {values.dtype}; a count or a comparison has "
+            f"objective {name!r}: expected floating-point values, got {values.dtype}; "
+            "a count or a comparison has "
             "no gradient"
         )
-    by_picture: Tensor = values.reshape(1) if values.ndim == 0 and count == 1 else values
+    by_picture: Tensor = (
+        values.reshape(1) if values.ndim == 0 and count == 1 else values
+    )
     if by_picture.shape != (count,):
         raise InputError(
-            f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(by_picture.shape)}; "
+            f"objective {name!r}: expected one value per image, shape ({count},), got "
+            f"{tuple(by_picture.shape)}; "
             "reduce over everything but the first axis"
         )
     return by_picture
 
 
 def labels_of(truth: Any, output: Any, count: int) -> Any:
-    """Return the truth as a user's function gets it: a label set of one class as (N,) int64, anything else as it is."""
-    if isinstance(truth, tuple) and len(truth) == 1 and isinstance(truth[0], int) and isinstance(output, Tensor):
+    """Return the truth as a user's function gets it: a label set of one class as (N,)
+    int64, anything else as it is.
+    """
+    if (
+        isinstance(truth, tuple)
+        and len(truth) == 1
+        and isinstance(truth[0], int)
+        and isinstance(output, Tensor)
+    ):
         return torch.full((count,), truth[0], device=output.device)
     return truth
 
 
 def _of_one(asked: Mapping[str, Any], picture: int, name: str) -> Any:
     """Return what was asked for of several pictures for one of them."""
-    value, part = asked[name], slice(picture, picture + 1)
-    return value[part] if isinstance(value, Tensor) else {key: values[part] for key, values in value.items()}
+    value = asked[name]
+    part = slice(picture, picture + 1)
+    return (
+        value[part]
+        if isinstance(value, Tensor)
+        else {key: values[part] for key, values in value.items()}
+    )
 
 
 @final
@@ -206,12 +302,15 @@ class ObjectiveKind:
     """What is known about a named objective.
 
     Args:
-        plain: the function of the right labels, which may ask for more as a user's own does; None for one that has to
-            be made for a run.
+        plain: the function of the right labels, which may ask for more as a user's own
+            does; None for one that has to be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
-        task: name of the task whose outputs it takes, and of those tasks that are kinds of it; None for any.
-        of_features: what makes it from the model's features and a clean picture; None where nothing does.
-        of_task: what makes it from the task, which knows of target and direction itself; None where nothing does.
+        task: name of the task whose outputs it takes, and of those tasks that are kinds
+            of it; None for any.
+        of_features: what makes it from the model's features and a clean picture; None
+            where nothing does.
+        of_task: what makes it from the task, which knows of target and direction
+            itself; None where nothing does.
     """
 
     name: str
@@ -231,19 +330,26 @@ class ObjectiveKind:
     def fits(self, task: str) -> bool:
         """Whether it takes the outputs of the task of that name."""
         return self.task in (None, task) or (
-            self.task in TASKS and task in TASKS and issubclass(TASKS[task], TASKS[self.task])
+            self.task in TASKS
+            and task in TASKS
+            and issubclass(TASKS[task], TASKS[self.task])
         )
 
     def form(self, *, targeted: bool) -> Callable[..., Tensor]:
         """Return the plain or the targeted function."""
         function = self.targeted if targeted else self.plain
         if function is None:
-            raise InputError(f"objective {self.name!r}: has no {'targeted' if targeted else 'plain'} form; use another")
+            raise InputError(
+                f"objective {self.name!r}: has no "
+                f"{'targeted' if targeted else 'plain'} form; use another"
+            )
         return function
 
 
 def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
-    def plain(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+    def plain(
+        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+    ) -> Tensor:
         return function(output, images, truth)
 
     return plain
@@ -252,8 +358,12 @@ def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
 def _handed(objective: Objective) -> Objective:
     """The objective of another package, called with copies."""
 
-    def handed(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        return objective(*copied((output, images, truth)), lambda name: copied(more(name)))
+    def handed(
+        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+    ) -> Tensor:
+        return objective(
+            *copied((output, images, truth)), lambda name: copied(more(name))
+        )
 
     return handed
 
@@ -262,29 +372,37 @@ def _score_of(task: Task) -> Objective:
     return _plain(lambda output, images, truth: task.score(output, truth))
 
 
-_DEPTH_GOALS: Mapping[str, str] = imported("advsearch.tasks.depth:GOALS") if "depth" in TASKS.own else {}
+_DEPTH_GOALS: Mapping[str, str] = (
+    imported("advsearch.tasks.depth:GOALS") if "depth" in TASKS.own else {}
+)
 _OWN = {
     kind.name: kind
     for kind in (
         *(
             ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
             for name, summary, unit in (
-                ("margin", "the margin loss: the largest wrong logit minus the largest right one", "logits (log-odds)"),
+                ("margin", "the margin loss: the largest wrong logit minus the largest "
+                           "right one", "logits (log-odds)"),
                 ("log_odds", "the log-odds of a wrong prediction, over all classes", "logits (log-odds)"),
-                ("cross_entropy", "minus the logarithm of the probability of the right labels", "nats"),
-                ("dlr", "the margin loss over a distance between logits: independent of their scale", "none (a ratio)"),
+                ("cross_entropy", "minus the logarithm of the probability of the right "
+                                  "labels", "nats"),
+                ("dlr", "the margin loss over a distance between logits: independent "
+                        "of their scale", "none (a ratio)"),
             )
         ),
         ObjectiveKind(
-            "feature_distance", "how far the features lie from those of the clean picture",
+            "feature_distance", "how far the features lie from those of the clean "
+                                "picture",
             "lengths of the clean features", of_features=functions.feature_distance,
         ),
         ObjectiveKind(
-            "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
+            "distance", "how far the features lie from those of the clean picture, by "
+                        "the angle", "1 - cosine",
             task="similarity", of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin loss",
+            "score", "the task's own score, over 0 where a prediction is a success; in "
+                     "classification the margin loss",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
@@ -292,7 +410,8 @@ _OWN = {
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
-            Together.objective, "of several tasks at once: each task's own objective, put together by `ensemble`",
+            Together.objective, "of several tasks at once: each task's own objective, "
+                                "put together by `ensemble`",
             "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
@@ -300,7 +419,8 @@ _OWN = {
             for name, summary in _DEPTH_GOALS.items()
         ),
         ObjectiveKind(
-            "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
+            "pixel_margin", "the largest wrong logit minus the largest right one, mean "
+                            "over the object's pixels",
             "logits (log-odds)", task="segmentation",
             of_task=lambda task: _plain(lambda output, images, truth: task.pixel_margin(output, truth)),
         ),
@@ -327,7 +447,8 @@ def objective_summaries() -> dict[str, str]:
     return {name: kind.summary for name, kind in OBJECTIVE_KINDS.items()}
 
 
-# ---- from names and functions to objectives -------------------------------------------------------------------------
+# ---- from names and functions to objectives
+# -------------------------------------------------------------------------
 
 
 def get_objective(
@@ -337,15 +458,19 @@ def get_objective(
     features: ReadFeatures | None = None,
     clean: Tensor | None = None,
 ) -> Objective:
-    """Return the objective of that name, or the user's own function wrapped so that its mistakes are explained.
+    """Return the objective of that name, or the user's own function wrapped so that its
+    mistakes are explained.
 
-    What comes back is called with the truth, whatever the search is after. With a target, a named objective takes its
-    targeted form, and the user's function gets the target in place of the truth. To minimise, either is negated.
+    What comes back is called with the truth, whatever the search is after. With a
+    target, a named objective takes its targeted form, and the user's function gets the
+    target in place of the truth. To minimise, either is negated.
 
     Args:
-        objective: a name, or a function of (output, images, truth) or of (output, labels), which may ask for more.
+        objective: a name, or a function of (output, images, truth) or of (output,
+            labels), which may ask for more.
         task: judges the model; classification of any wrong prediction if None.
-        features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
+        features: for an objective that `needs_features`:
+            `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
 
     Raises:
@@ -354,7 +479,8 @@ def get_objective(
     task = task or Classification()
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
-    kind, by_task = _kind_of(objective), False
+    kind = _kind_of(objective)
+    by_task = False
     ours = kind is not None and _OWN.get(kind.name) is kind
     if kind is None:
         function = checked(objective)  # type: ignore[arg-type]
@@ -363,7 +489,8 @@ def get_objective(
     elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
-                f"objective {kind.name!r}: expected the model's features and a clean picture, got none; use "
+                f"objective {kind.name!r}: expected the model's features and a clean "
+                "picture, got none; use "
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
         function = _plain(kind.of_features(features, clean))
@@ -372,14 +499,26 @@ def get_objective(
         form = kind.form(targeted=targeted)
         function = _plain(form) if ours else checked(form)
         compares_features = isinstance(task, Classification) and not task.reads_logits
-        by_task = compares_features or (isinstance(task, ClassTask) and bool(task.nothing))
+        by_task = compares_features or (
+            isinstance(task, ClassTask) and bool(task.nothing)
+        )
     looks = kind is None and targeted
 
-    def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+    def sought(
+        output: Any, images: Tensor, truth: Any, more: More = nothing_more, /
+    ) -> Tensor:
         nonlocal looks
         wanted = task.target if targeted else truth
-        value = function(task.as_logits(output, wanted) if by_task else output, images, wanted, more)
-        if looks and value.requires_grad and isinstance(output, Tensor) and output.ndim == 2 and output.requires_grad:
+        value = function(
+            task.as_logits(output, wanted) if by_task else output, images, wanted, more
+        )
+        if (
+            looks
+            and value.requires_grad
+            and isinstance(output, Tensor)
+            and output.ndim == 2
+            and output.requires_grad
+        ):
             looks = False
             _warn_of_direction(name_of(objective), value, output, wanted)  # type: ignore[arg-type]
         return -value if task.minimise else value
@@ -389,33 +528,59 @@ def get_objective(
 
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
     """Warn of a user's function that falls as the target's logit rises."""
-    (slope,) = torch.autograd.grad(values.sum(), output, retain_graph=True, allow_unused=True)
-    classes = [index for index in target if isinstance(index, int)] if isinstance(target, tuple) else []
-    if slope is not None and classes and bool((slope[:, classes].sum(dim=1) < 0.0).all()):
+    (slope,) = torch.autograd.grad(
+        values.sum(), output, retain_graph=True, allow_unused=True
+    )
+    classes = (
+        [index for index in target if isinstance(index, int)]
+        if isinstance(target, tuple)
+        else []
+    )
+    if (
+        slope is not None
+        and classes
+        and bool((slope[:, classes].sum(dim=1) < 0.0).all())
+    ):
         warnings.warn(
-            f"objective {name!r} falls as the target becomes more likely, and an objective is maximised: the search "
-            "walks away from the target. Negate it, or take a loss of advsearch.losses that begins with targeted_.",
+            f"objective {name!r} falls as the target becomes more likely, and an "
+            "objective is maximised: the search "
+            "walks away from the target. Negate it, or take a loss of advsearch.losses "
+            "that begins with targeted_.",
             stacklevel=2,
         )
 
 
 def check_objective(
-    objective: object, task: str = Classification.name, *, targeted: bool = False, minimise: bool = False
+    objective: object,
+    task: str = Classification.name,
+    *,
+    targeted: bool = False,
+    minimise: bool = False,
 ) -> None:
-    """Check, before anything is loaded, that there is such an objective and that it can do what is asked: for the task
-    of that name, with a target or where a right prediction is sought. Raises UnknownNameError, or InputError: neither a
-    name nor a function of three arguments; an objective of another task; a target to minimise; an objective of features
-    with either of them."""
+    """Check, before anything is loaded, that there is such an objective and that it can
+    do what is asked: for the task of that name, with a target or where a right
+    prediction is sought. Raises UnknownNameError, or InputError: neither a name nor a
+    function of three arguments; an objective of another task; a target to minimise; an
+    objective of features with either of them.
+    """
     if targeted and minimise:
         raise InputError(
-            "minimise: expected no `target` beside it; to make the object easier to recognise as something else, "
+            "minimise: expected no `target` beside it; to make the object easier to "
+            "recognise as something else, "
             "give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
-        hint = "From Python, objective= also takes a function (output, images, truth), or (output, labels)."
+        hint = (
+            "From Python, objective= also takes a function (output, images, "
+            "truth), "
+            "or (output, labels)."
+        )
         raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
     if not isinstance(objective, str) and not callable(objective):
-        raise InputError(f"objective: expected a name or a function (output, images, truth), got {objective!r}")
+        raise InputError(
+            "objective: expected a name or a function (output, images, "
+            f"truth), got {objective!r}"
+        )
     kind = _kind_of(objective)
     if kind is None:
         form_of(objective)  # type: ignore[arg-type]
@@ -423,26 +588,34 @@ def check_objective(
     if not kind.fits(task):
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(
-            f"objective: expected an objective of task {task} ({', '.join(fitting)}), got {kind.name}, which takes "
+            f"objective: expected an objective of task {task} ({', '.join(fitting)}), "
+            f"got {kind.name}, which takes "
             f"outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
         reason = "it leads away from the clean picture, to no class in particular"
         raise InputError(
-            f"{'target' if targeted else 'minimise'}: expected `objective` {' or '.join(OBJECTIVES)}, got {kind.name}; "
+            f"{'target' if targeted else 'minimise'}: expected `objective` "
+            f"{' or '.join(OBJECTIVES)}, got {kind.name}; "
             f"{reason if targeted else 'it is least at the start already'}"
         )
 
 
 def asked_by(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
-    """Return what an objective, checked already, asks for beside output, images and truth."""
+    """Return what an objective, checked already, asks for beside output, images and
+    truth.
+    """
     kind = _kind_of(objective)
     function = objective if kind is None else kind.plain
     return form_of(function).asked if callable(function) else ()
 
 
 def _kind_of(objective: object) -> ObjectiveKind | None:
-    """Return the kind of a name, or of a function that has one; None for the user's own."""
+    """Return the kind of a name, or of a function that has one; None for the user's
+    own.
+    """
     if isinstance(objective, str):
         return OBJECTIVE_KINDS[objective]
-    return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
+    return next(
+        (kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None
+    )

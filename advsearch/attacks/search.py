@@ -1,4 +1,6 @@
-"""The one search loop: it owns the budget, stopping, the best so far and the log. Policies only propose."""
+"""The one search loop: it owns the budget, stopping, the best so far and the log.
+Policies only propose.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
+from advsearch.attacks.candidates import (
+    Candidate,
+    Failures,
+    admit,
+    best,
+    contenders,
+    with_last,
+)
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
-from advsearch.attacks.evaluation import Counts, Evaluate, Evaluation, Phase, Policy, Proposal, Query, most_at_once
+from advsearch.attacks.evaluation import (
+    Counts,
+    Evaluate,
+    Evaluation,
+    Phase,
+    Policy,
+    Proposal,
+    Query,
+    most_at_once,
+)
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending
 from advsearch.copies import copied
@@ -33,50 +51,69 @@ class StepRecord:
     seed: int  # that it was rendered with
     phase: Phase  # "search", or "ranking" for a candidate rendered again at the end
     objective: float  # raw; NaN where it was not finite
-    best: float  # best raw objective of the search so far, biased upwards; NaN before there is one
+    # best raw objective of the search so far, biased upwards; NaN before there is one
+    best: float
     success: bool  # whether the model was wrong on this render
-    step_size: float  # the policy's, in units of each block's radius; NaN where it has none
+    # the policy's, in units of each block's radius; NaN where it has none
+    step_size: float
     gradient_norm: float  # l2 norm of the gradient after cleaning; NaN without one
     non_finite: int  # gradient elements that had to be set to zero
     seconds: float  # that the evaluation took
-    renders: int = 0  # pictures that all evaluations so far took together, this one included
+    # pictures that all evaluations so far took together, this one included
+    renders: int = 0
     samples: int = 1  # as of `Proposal`
 
 
 Late = Callable[[int], bool]  # whether the time is over after so many evaluations
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
-"""Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
+"""Called after every evaluation, ranking included, with its record, u, and the (usable)
+evaluation.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md, "Verification")."""
+    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md,
+    "Verification").
+    """
 
-    best_u: Tensor  # (d,) float32, what the search found; the start if nothing could be evaluated
+    # (d,) float32, what the search found; the start if nothing could be evaluated
+    best_u: Tensor
     best_objective: float
-    """Mean objective of `best_u` in its new renders; its raw one if it had none. NaN if nothing could be evaluated, or
-    one of these renders was not finite."""
+    """Mean objective of `best_u` in its new renders; its raw one if it had none. NaN if
+    nothing could be evaluated, or one of these renders was not finite.
+    """
     claimed_objective: float  # the raw objective in the search, biased upwards
-    success_rate: float  # share of its new renders (else of its one raw render) that the model got wrong
-    ending: Ending  # INTERRUPTED; FOUND if that share is at least a half; else why the search stopped
+    # share of its new renders (else of its one raw render) that the model got wrong
+    success_rate: float
+    # INTERRUPTED; FOUND if that share is at least a half; else why the search stopped
+    ending: Ending
     stopped: Ending  # why the loop stopped, whatever it had found
     history: tuple[StepRecord, ...]  # one record per evaluation of the search itself
     ranking: tuple[StepRecord, ...]  # one record per new render of a candidate
-    renders: int  # pictures in all, those that differences took and those of the ranking included
+    # pictures in all, those that differences took and those of the ranking included
+    renders: int
     gradients: int  # how many of them included a gradient
     non_finite_objectives: int  # evaluations whose objective was NaN or infinite
-    non_finite_elements: int  # gradient elements that were set to zero, over all evaluations
+    # gradient elements that were set to zero, over all evaluations
+    non_finite_elements: int
     seconds: float  # total time, evaluations included
     agreement: tuple[float, ...] = ()
-    """Cosines of gradients with those before them, in their order: what noise and the way between left of them; none
-    for gradients of zero."""
-    counts: Counts = field(default_factory=Counts)  # what the policy had to do about gradients and steps
-    distribution: Distribution | None = None  # what the policy found beside `best_u`, if it finds a distribution
-    failures: Failures | None = None  # what the policy knows of different failures, if it looks for them
+    """Cosines of gradients with those before them, in their order: what noise and the
+    way between left of them; none for gradients of zero.
+    """
+    # what the policy had to do about gradients and steps
+    counts: Counts = field(default_factory=Counts)
+    # what the policy found beside `best_u`, if it finds a distribution
+    distribution: Distribution | None = None
+    # what the policy knows of different failures, if it looks for them
+    failures: Failures | None = None
 
 
-def planned_renders(steps: int, candidates: int = 4, repeats: int = 2, close: int = 0) -> int:
+def planned_renders(
+    steps: int, candidates: int = 4, repeats: int = 2, close: int = 0
+) -> int:
     """Return how many pictures `search` renders at most with these arguments."""
     return steps + candidates * (repeats + close)
 
@@ -99,41 +136,56 @@ def search(
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
-    1. Until `steps` renders are spent: the policy proposes as many configurations as do not wait for each other; they
-       are checked against the domain and evaluated, each with a new seed (docs/design.md, "The search"); the policy is
-       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for.
-    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds that are
-       the same for all, without gradient. The best by these renders is what the search found (see `candidates`). With
-       `candidates=0`, for an objective without noise, the raw best is what it found. Where evaluations draw conditions
-       (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which all of them led, takes the
-       place of the worst candidate. Those that are not clearly worse than the best by then are rendered again, up to
+    1. Until `steps` renders are spent: the policy proposes as many configurations as do
+       not wait for each other; they are checked against the domain and evaluated, each
+       with a new seed (docs/design.md, "The search"); the policy is told. An evaluation
+       costs `Proposal.cost` renders at most. What cannot be paid is not asked for.
+    2. The `candidates` best distinct configurations are each evaluated `repeats` times
+       more, with new seeds that are the same for all, without gradient. The best by
+       these renders is what the search found (see `candidates`). With `candidates=0`,
+       for an objective without noise, the raw best is what it found. Where evaluations
+       draw conditions (`Domain.drawn`), the raw best had easy ones, and the last
+       configuration, to which all of them led, takes the place of the worst candidate.
+       Those that are not clearly worse than the best by then are rendered again, up to
        `close` times more (see `candidates.contenders`).
 
-    A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
+    A policy that does not handle discrete choices is wrapped in `Choices` where the
+    domain has some.
 
-    A non-finite objective is counted, is never best, and reaches the policy as -inf; `NON_FINITE_LIMIT` in a row end
-    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is.
+    A non-finite objective is counted, is never best, and reaches the policy as -inf;
+    `NON_FINITE_LIMIT` in a row end the search. KeyboardInterrupt, wherever it strikes,
+    ends it with what there is.
 
     Args:
         evaluate: renders and judges configurations.
-        steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
-            spent: the worst case is wanted, not the first.
-        seed, noise: root seeds of the search's own randomness, and of the renders; at least 0.
-        candidates, repeats, close: see above; they cost at most `candidates * (repeats + close)` renders more.
+        steps: renders of the search, at least 1; as many evaluations where no gradient
+            costs any. By default all are spent: the worst case is wanted, not the
+            first.
+        seed, noise: root seeds of the search's own randomness, and of the renders; at
+            least 0.
+        candidates, repeats, close: see above; they cost at most `candidates * (repeats
+            + close)` renders more.
         on_step: called after every evaluation.
-        seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
-            is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
-        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on.
+        seconds: end step 1 after the first evaluation that is done later than this,
+            over 0; None for no limit. There is always one evaluation, and step 2 comes
+            on top. Policies still plan for `steps`.
+        late: says, after so many evaluations, whether the time is over; in place of
+            `seconds`, for a run that goes on.
         kind: of the queries.
 
     Raises:
-        InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
-        RuntimeError, ValueError: the policy left the domain or `evaluate` broke its contract; a bug.
+        InputError: steps, candidates, repeats, close or seconds out of range, or the
+            policy cannot search this domain.
+        RuntimeError, ValueError: the policy left the domain or `evaluate` broke its
+            contract; a bug.
     """
     if steps < 1:
         raise InputError(f"steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:
-        raise InputError(f"candidates and repeats: expected at least 0 and 1, got {candidates} and {repeats}")
+        raise InputError(
+            "candidates and repeats: expected at least 0 and 1, got "
+            f"{candidates} and {repeats}"
+        )
     if close < 0:
         raise InputError(f"close: expected at least 0, got {close}")
     if seconds is not None and not seconds > 0.0:
@@ -143,7 +195,13 @@ def search(
     try:
         with interruptible():
             in_time = math.inf if seconds is None else begun + seconds
-            stopped = _explore(log, policy, steps, seed, late or (lambda _: time.perf_counter() >= in_time))
+            stopped = _explore(
+                log,
+                policy,
+                steps,
+                seed,
+                late or (lambda _: time.perf_counter() >= in_time),
+            )
             if domain.drawn:
                 log.pool = with_last(log.pool, log.last, log.size)
             if candidates:
@@ -178,7 +236,9 @@ def search(
 
 @dataclass(eq=False)
 class _Log:
-    """Evaluates, checks, counts and remembers; the only thing in a search that changes."""
+    """Evaluates, checks, counts and remembers; the only thing in a search that
+    changes.
+    """
 
     evaluate: Evaluate
     domain: Domain
@@ -199,13 +259,26 @@ class _Log:
     state: Any = None
     told: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
 
-    def evaluated(self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase) -> Iterator[Evaluation]:
-        """Have proposals evaluated, each with the seed of an index, and take note of each as it comes."""
-        queries, begun = list[Query](), time.perf_counter()
-        for number, (proposal, index) in enumerate(zip(proposals, indices, strict=True), len(self.records)):
-            u, seed, wanted = proposal.u.clone(), stream(self.noise, self.kind, index), proposal.gradient
-            queries.append(Query(u, seed, self.kind, number, phase, wanted, proposal.samples))
-        for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
+    def evaluated(
+        self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
+    ) -> Iterator[Evaluation]:
+        """Have proposals evaluated, each with the seed of an index, and take note of
+        each as it comes.
+        """
+        queries = list[Query]()
+        begun = time.perf_counter()
+        for number, (proposal, index) in enumerate(
+            zip(proposals, indices, strict=True), len(self.records)
+        ):
+            u = proposal.u.clone()
+            seed = stream(self.noise, self.kind, index)
+            wanted = proposal.gradient
+            queries.append(
+                Query(u, seed, self.kind, number, phase, wanted, proposal.samples)
+            )
+        for proposal, query, raw in zip(
+            proposals, queries, self.evaluate(queries), strict=True
+        ):
             seconds = time.perf_counter() - begun
             _check_evaluation(raw, proposal, self.domain)
             evaluation = raw.usable()
@@ -214,9 +287,16 @@ class _Log:
             if not evaluation.finite:
                 self.non_finite += 1
             elif phase == "search":
-                self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
-                candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
-                self.pool, self.last = admit(self.pool, candidate, self.size), candidate
+                self.best = (
+                    max(evaluation.objective, self.best)
+                    if self.best == self.best
+                    else evaluation.objective
+                )
+                candidate = Candidate(
+                    proposal.u, evaluation.objective, evaluation.success
+                )
+                self.pool = admit(self.pool, candidate, self.size)
+                self.last = candidate
             self.records.append(
                 StepRecord(
                     step=query.number,
@@ -226,7 +306,9 @@ class _Log:
                     best=self.best,
                     success=evaluation.success,
                     step_size=proposal.step_size,
-                    gradient_norm=math.nan if evaluation.gradient is None else float(evaluation.gradient.norm()),
+                    gradient_norm=math.nan
+                    if evaluation.gradient is None
+                    else float(evaluation.gradient.norm()),
                     non_finite=evaluation.non_finite,
                     seconds=seconds,
                     renders=self.renders,
@@ -236,7 +318,13 @@ class _Log:
             gradient = evaluation.gradient
             if gradient is not None and bool(gradient.any()):
                 if self.before is not None:
-                    self.agreement.append(float(torch.cosine_similarity(gradient, self.before, dim=0, eps=1e-30)))
+                    self.agreement.append(
+                        float(
+                            torch.cosine_similarity(
+                                gradient, self.before, dim=0, eps=1e-30
+                            )
+                        )
+                    )
                 self.before = gradient
             if self.on_step is not None:
                 self.on_step(self.records[-1], *copied((proposal.u, evaluation)))
@@ -244,28 +332,41 @@ class _Log:
             begun = time.perf_counter()
 
 
-def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) -> Ending:
-    """Let the policy propose until the budget is spent or something ends it sooner; return what."""
+def _explore(
+    log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late
+) -> Ending:
+    """Let the policy propose until the budget is spent or something ends it sooner;
+    return what.
+    """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name
     policy = log.policy = with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
-    in_a_row, most = 0, most_at_once(log.domain.dim)
+    in_a_row = 0
+    most = most_at_once(log.domain.dim)
     while log.renders < steps:
         asked = min(most, steps - log.renders)
         proposals, state = policy.propose(state, asked)
         if not proposals:
             return Ending.STALLED
         if len(proposals) > asked:
-            raise RuntimeError(f"policy {name!r} proposed {len(proposals)} configurations; expected at most {asked}")
-        batch, left = list[Proposal](), steps - log.renders
+            raise RuntimeError(
+                f"policy {name!r} proposed {len(proposals)} "
+                f"configurations; expected at most {asked}"
+            )
+        batch = list[Proposal]()
+        left = steps - log.renders
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
             if left > 0:
-                own = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
+                # a policy may write into its own later
+                own = replace(proposal, u=proposal.u.clone())
                 batch.append(own.affordable(log.domain, left))
                 left -= batch[-1].cost(log.domain)
-        log.state, log.told, over, first = state, [], False, len(log.records)
+        log.state = state
+        log.told = []
+        over = False
+        first = len(log.records)
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.told.append((proposal.u, evaluation))
@@ -282,9 +383,14 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
 
 
 def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
-    """Render every candidate again, all with the same new seeds, and those that are close once more and once more."""
+    """Render every candidate again, all with the same new seeds, and those that are
+    close once more and once more.
+    """
     end = first + repeats
-    for indices in (range(first, end), *(range(index, index + 1) for index in range(end, end + close))):
+    for indices in (
+        range(first, end),
+        *(range(index, index + 1) for index in range(end, end + close)),
+    ):
         if indices[0] >= end:
             log.pool = contenders(log.pool, indices[0] - first)
             if len(log.pool) < 2:
@@ -294,37 +400,60 @@ def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
         evaluations = log.evaluated(proposals, [*indices] * len(pool), "ranking")
         for place, candidate in enumerate(pool):
             for evaluation in islice(evaluations, len(indices)):
-                candidate = candidate.seen_again(evaluation.objective, evaluation.success)
+                candidate = candidate.seen_again(
+                    evaluation.objective, evaluation.success
+                )
                 log.pool = (*log.pool[:place], candidate, *pool[place + 1 :])
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
-    """Raise RuntimeError unless a configuration of the domain was proposed; a policy that leaves it has a bug."""
+    """Raise RuntimeError unless a configuration of the domain was proposed; a policy
+    that leaves it has a bug.
+    """
     u = proposal.u
     if proposal.samples < 1:
-        raise RuntimeError(f"policy {name!r} proposed {proposal.samples} samples; expected at least 1")
+        raise RuntimeError(
+            f"policy {name!r} proposed {proposal.samples} samples; expected at least 1"
+        )
     if u.shape != domain.start.shape or u.dtype != torch.float32:
         raise RuntimeError(
-            f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected torch.float32 of shape "
+            f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected "
+            "torch.float32 of shape "
             f"{tuple(domain.start.shape)}"
         )
     outside = domain.violation(u)
     if not outside <= TOLERANCE:
-        raise RuntimeError(f"policy {name!r} left its budget by {outside:.3g}; it must project what it proposes")
+        raise RuntimeError(
+            f"policy {name!r} left its budget by {outside:.3g}; it must "
+            "project what it proposes"
+        )
 
 
-def _check_evaluation(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
-    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said."""
-    gradient, u, least, most = evaluation.gradient, proposal.u, proposal.samples, proposal.cost(domain)
+def _check_evaluation(
+    evaluation: Evaluation, proposal: Proposal, domain: Domain
+) -> None:
+    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that
+    the domain said.
+    """
+    gradient = evaluation.gradient
+    u = proposal.u
+    least = proposal.samples
+    most = proposal.cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
-    if proposal.gradient and gradient is not None and (gradient.shape, gradient.dtype) != (u.shape, u.dtype):
+    if (
+        proposal.gradient
+        and gradient is not None
+        and (gradient.shape, gradient.dtype) != (u.shape, u.dtype)
+    ):
         raise RuntimeError(
-            f"evaluate returned a gradient of {gradient.dtype}, shape {tuple(gradient.shape)}; expected "
+            f"evaluate returned a gradient of {gradient.dtype}, shape "
+            f"{tuple(gradient.shape)}; expected "
             f"{u.dtype}, shape {tuple(u.shape)}"
         )
     if not least <= evaluation.cost <= most:
         raise RuntimeError(
-            f"evaluate took {evaluation.cost} renders; expected {least} to {most}, by the proposal's samples and the "
+            f"evaluate took {evaluation.cost} renders; expected {least} to {most}, by "
+            "the proposal's samples and the "
             "domain's gradient_cost"
         )

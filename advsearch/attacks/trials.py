@@ -1,7 +1,9 @@
-"""Counting successes, saying how sure the count is, and how many samples a pixel trials need (docs/design.md).
+"""Counting successes, saying how sure the count is, and how many samples a pixel trials
+need (docs/design.md).
 
-Monte Carlo noise takes part of the margin away, and less of it the more samples there are. So the margin *drifts*
-with the sample count, and a verification in the middle of that drift credits the scene with what the noise did.
+Monte Carlo noise takes part of the margin away, and less of it the more samples there
+are. So the margin *drifts* with the sample count, and a verification in the middle of
+that drift credits the scene with what the noise did.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class Trials:
     successes: int  # from 0 to `trials`
     trials: int  # at least 1
     spp: int  # samples per pixel of every trial
-    confidence: float = CONFIDENCE  # of the interval; larger than 95 % where trials might have ended at several looks
+    # of the interval; larger than 95 % where trials might have ended at several looks
+    confidence: float = CONFIDENCE
 
     @property
     def rate(self) -> float:
@@ -39,33 +42,49 @@ class Trials:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Interval that covers the rate in 95 % of all cases, by Clopper and Pearson."""
+        """Interval that covers the rate in 95 % of all cases, by Clopper and
+        Pearson.
+        """
         return clopper_pearson(self.successes, self.trials, self.confidence)
 
 
 def trial_seed(seed: int, number: int) -> int:
-    """Return the seed of a trial, by its number: the same for all groups with that root."""
+    """Return the seed of a trial, by its number: the same for all groups with that
+    root.
+    """
     return stream(seed, "verification", number)
 
 
-LADDER = (4, 16, 64, 256)  # sample counts to try; each quarters the variance of the one before
-LOOKS = (4, 8)  # renders of a configuration at each sample count after which one looks at them
-MOST_LOOKED_AT = 20  # renders of a sample count of which no more are made to look at, though there be more trials
+# sample counts to try; each quarters the variance of the one before
+LADDER = (4, 16, 64, 256)
+# renders of a configuration at each sample count after which one looks at them
+LOOKS = (4, 8)
+# renders of a sample count of which no more are made to look at, though there be more
+# trials
+MOST_LOOKED_AT = 20
 
-MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]  # (spp, seeds) -> margins in logits, one of each render
+# (spp, seeds) -> margins in logits, one of each render
+MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 
 
-def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False) -> MarginsOf:
-    """Return the margins of one configuration, its scores with their sign turned, under the conditions that the scene
-    comes with, or under those `drawn` by the seeds; the rows of all sample counts are numbered together, and the first
-    `keep` pictures of each are wanted."""
+def margins_of(
+    evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False
+) -> MarginsOf:
+    """Return the margins of one configuration, its scores with their sign turned, under
+    the conditions that the scene comes with, or under those `drawn` by the seeds; the
+    rows of all sample counts are numbered together, and the first `keep` pictures of
+    each are wanted.
+    """
     made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         numbers = range(made[spp], made[spp] + len(seeds))
         asked = enumerate(zip(seeds, numbers, strict=True), made.total())
         made[spp] += len(seeds)
-        queries = [Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep) for row, (seed, number) in asked]
+        queries = [
+            Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep)
+            for row, (seed, number) in asked
+        ]
         return [-evaluation.said.score for evaluation in evaluate(queries)]
 
     return margins
@@ -73,9 +92,11 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn
 
 @dataclass(frozen=True)
 class Rung:
-    """The margins of one configuration at one sample count: their mean, how far it may lie on the other side of the
-    true one (Student's t) in 5 % of all cases, after all looks together, its drift from the rung below, NaN at the
-    first, and whether more samples would leave it on its side of zero; see `choose_spp`."""
+    """The margins of one configuration at one sample count: their mean, how far it may
+    lie on the other side of the true one (Student's t) in 5 % of all cases, after all
+    looks together, its drift from the rung below, NaN at the first, and whether more
+    samples would leave it on its side of zero; see `choose_spp`.
+    """
 
     name: str
     spp: int
@@ -87,8 +108,10 @@ class Rung:
 
 @dataclass(frozen=True)
 class SampleCount:
-    """The samples a pixel to verify with; whether all margins are shown to stay on their sides (if not, it is the last
-    rung of the ladder); a row for each configuration and rung that was measured, in this order; and renders spent."""
+    """The samples a pixel to verify with; whether all margins are shown to stay on
+    their sides (if not, it is the last rung of the ladder); a row for each
+    configuration and rung that was measured, in this order; and renders spent.
+    """
 
     spp: int
     converged: bool
@@ -97,103 +120,164 @@ class SampleCount:
 
 
 def choose_spp(
-    margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = LADDER, trials: int = 0
+    margins: Mapping[str, MarginsOf],
+    *,
+    seed: int,
+    ladder: Sequence[int] = LADDER,
+    trials: int = 0,
 ) -> SampleCount:
-    """Climb a ladder of sample counts with each configuration until more of them would not change the verdict; return
-    the highest rung that one of them needed.
+    """Climb a ladder of sample counts with each configuration until more of them would
+    not change the verdict; return the highest rung that one of them needed.
 
-    A verdict asks on which side of zero the margin is. A configuration has settled at a rung, with the mean margin m
-    there and m' at the rung below, when on that side, with all of their uncertainty, are
+    A verdict asks on which side of zero the margin is. A configuration has settled at a
+    rung, with the mean margin m there and m' at the rung below, when on that side, with
+    all of their uncertainty, are
 
     - m,
-    - m + (m - m'), where the margin would be if noise took once more as much as it took from the rung below to here:
-      the error that is left falls with the sample count, so it is smaller than the change that led here,
-    - every single render of the rung; and, where these are fewer than the trials, m even with the deviation of one.
+    - m + (m - m'), where the margin would be if noise took once more as much as it took
+      from the rung below to here: the error that is left falls with the sample count,
+      so it is smaller than the change that led here,
+    - every single render of the rung; and, where these are fewer than the trials, m
+    even with the deviation of one.
 
-    A margin at zero never settles: its verdict depends on the noise. About 5 % settle on the wrong side at most: 5.1 %
-    of those that are hardest to tell (`benchmarks/verdicts.py`). A rung is looked at after some of the renders, and
-    again after more, and each look has its share of the 5 % (Bonferroni). A look that cannot settle anything, as far as
-    the noise so far tells (`_may_settle`), is left out; where none is left that could, or one configuration has not
-    settled, the last rung, which has three quarters of all samples, is taken as it is and not `converged`.
+    A margin at zero never settles: its verdict depends on the noise. About 5 % settle
+    on the wrong side at most: 5.1 % of those that are hardest to tell
+    (`benchmarks/verdicts.py`). A rung is looked at after some of the renders, and again
+    after more, and each look has its share of the 5 % (Bonferroni). A look that cannot
+    settle anything, as far as the noise so far tells (`_may_settle`), is left out;
+    where none is left that could, or one configuration has not settled, the last rung,
+    which has three quarters of all samples, is taken as it is and not `converged`.
 
-    A rung is chosen because its renders agree, so they are no trials: those have seeds of their own (`run_trials`).
-    Counted among them, they would make what holds in 75 % `found` in 5.9 % of all cases in place of 2.2 %.
+    A rung is chosen because its renders agree, so they are no trials: those have seeds
+    of their own (`run_trials`). Counted among them, they would make what holds in 75 %
+    `found` in 5.9 % of all cases in place of 2.2 %.
 
     Args:
-        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
-            first should be the one that is least likely to settle.
+        margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each
+            renders what it is asked for. The first should be the one that is least
+            likely to settle.
         seed: root seed.
-        ladder: sample counts, rising, at least one, or InputError. A single one is returned unmeasured.
-        trials: that will follow under the same conditions. So many renders are one more look, the last one, at which
-            only the mean and every single render have to be on one side; 0 where other trials follow.
+        ladder: sample counts, rising, at least one, or InputError. A single one is
+            returned unmeasured.
+        trials: that will follow under the same conditions. So many renders are one more
+            look, the last one, at which only the mean and every single render have to
+            be on one side; 0 where other trials follow.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
-        raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")
+        raise InputError(
+            "verify_spp: expected rising sample counts of at least 1, "
+            f"got {list(ladder)}"
+        )
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
-    table, renders, reached, looks = list[Rung](), 0, 1, looks_of(trials)
+    table = list[Rung]()
+    renders = 0
+    reached = 1
+    looks = looks_of(trials)
     for name, render in margins.items():
         values = _climbed(render, seed, ladder, looks, trials)
         below: list[float] = []
         for spp, here in zip(ladder, values, strict=False):
-            half_width = _quantile(len(here), len(looks)) * _deviation(here) / math.sqrt(len(here))
+            half_width = (
+                _quantile(len(here), len(looks))
+                * _deviation(here)
+                / math.sqrt(len(here))
+            )
             drift = fmean(here) - fmean(below) if below else math.nan
             settled = bool(below) and _settled(here, below, len(looks), trials)
             table.append(Rung(name, spp, fmean(here), half_width, drift, settled))
             below = here
-        renders, reached = renders + sum(map(len, values)), max(reached, len(values) - 1)
+        renders = renders + sum(map(len, values))
+        reached = max(reached, len(values) - 1)
         if not table[-1].settled:
             return SampleCount(ladder[-1], False, tuple(table), renders)
     return SampleCount(ladder[reached], True, tuple(table), renders)
 
 
 def _climbed(
-    margins: MarginsOf, seed: int, ladder: Sequence[int], looks: Sequence[int], trials: int
+    margins: MarginsOf,
+    seed: int,
+    ladder: Sequence[int],
+    looks: Sequence[int],
+    trials: int,
 ) -> list[list[float]]:
-    """Return the margins of one configuration at each rung, up to that at which it settles or none above can."""
+    """Return the margins of one configuration at each rung, up to that at which it
+    settles or none above can.
+    """
     values: list[list[float]] = [[] for _ in ladder]
     places = list(product(range(1, len(ladder)), looks))
     for number, (level, count) in enumerate(places):
-        if not any(_may_settle(values, ladder, *later, len(looks)) for later in places[number:]):
+        if not any(
+            _may_settle(values, ladder, *later, len(looks)) for later in places[number:]
+        ):
             break
         if not _may_settle(values, ladder, level, count, len(looks)):
             continue
         for rung in (level - 1, level):
-            if new := [stream(seed, "sample count", number) for number in range(len(values[rung]), count)]:
+            if new := [
+                stream(seed, "sample count", number)
+                for number in range(len(values[rung]), count)
+            ]:
                 values[rung] += margins(ladder[rung], new)
         if _settled(values[level], values[level - 1], len(looks), trials):
             break
     return [measured for measured in values if measured]
 
 
-def _settled(here: Sequence[float], below: Sequence[float], looks: int, trials: int) -> bool:
-    """Whether the margins of a rung and of the one below show that more samples change nothing; see `choose_spp`."""
-    mean, count, one = fmean(here), min(len(here), len(below)), _deviation(here)
-    ahead, ahead_error = 2.0 * mean - fmean(below), math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
-    side, quantile = math.copysign(1.0, mean), _quantile(count, looks)
+def _settled(
+    here: Sequence[float], below: Sequence[float], looks: int, trials: int
+) -> bool:
+    """Whether the margins of a rung and of the one below show that more samples change
+    nothing; see `choose_spp`.
+    """
+    mean = fmean(here)
+    count = min(len(here), len(below))
+    one = _deviation(here)
+    ahead = 2.0 * mean - fmean(below)
+    ahead_error = math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
+    side = math.copysign(1.0, mean)
+    quantile = _quantile(count, looks)
     error = one / math.sqrt(count) if count == trials else one
     far = side * mean > quantile * error and side * ahead > quantile * ahead_error
     return far and all(side * value > 0.0 for value in here)
 
 
-def _may_settle(values: Sequence[list[float]], ladder: Sequence[int], level: int, count: int, looks: int) -> bool:
-    """Whether so many renders at a rung may show that the margin has settled there, by what has been rendered.
+def _may_settle(
+    values: Sequence[list[float]],
+    ladder: Sequence[int],
+    level: int,
+    count: int,
+    looks: int,
+) -> bool:
+    """Whether so many renders at a rung may show that the margin has settled there, by
+    what has been rendered.
 
-    The mean may be off by its standard error, and may move on by as much as it has moved before. Deviations stay; at
-    rungs that were not rendered they fall with the root of the samples.
+    The mean may be off by its standard error, and may move on by as much as it has
+    moved before. Deviations stay; at rungs that were not rendered they fall with the
+    root of the samples.
     """
     known = [rung for rung in range(level + 1) if values[rung]]
     if not known:
         return True
     if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
         return False
-    best, mean = values[known[-1]], fmean(values[known[-1]])
-    largest = abs(mean) + abs(mean - fmean(values[known[-2]])) + _deviation(best) / math.sqrt(len(best))
+    best = values[known[-1]]
+    mean = fmean(values[known[-1]])
+    largest = (
+        abs(mean)
+        + abs(mean - fmean(values[known[-2]]))
+        + _deviation(best) / math.sqrt(len(best))
+    )
     below, here = (
-        _deviation(values[rung]) if values[rung] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[rung])
+        _deviation(values[rung])
+        if values[rung]
+        else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[rung])
         for rung in (level - 1, level)
     )
-    return math.hypot(2.0 * here, below) * _quantile(count, looks) / math.sqrt(count) <= largest
+    return (
+        math.hypot(2.0 * here, below) * _quantile(count, looks) / math.sqrt(count)
+        <= largest
+    )
 
 
 def looks_of(trials: int = 0) -> tuple[int, ...]:
@@ -201,8 +285,12 @@ def looks_of(trials: int = 0) -> tuple[int, ...]:
     return (*LOOKS, trials) if LOOKS[-1] < trials <= MOST_LOOKED_AT else LOOKS
 
 
-def most_samples(configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0) -> int:
-    """Return the samples a pixel that `choose_spp` renders in all, at most: where only the last rung settles it."""
+def most_samples(
+    configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0
+) -> int:
+    """Return the samples a pixel that `choose_spp` renders in all, at most: where only
+    the last rung settles it.
+    """
     return configurations * looks_of(trials)[-1] * sum(ladder) if len(ladder) > 1 else 0
 
 
@@ -212,49 +300,70 @@ def _deviation(values: Sequence[float]) -> float:
 
 
 def _quantile(count: int, looks: int) -> float:
-    """Of Student's t, for one end of the interval of a mean of so many values at one of the looks."""
+    """Of Student's t, for one end of the interval of a mean of so many values at one of
+    the looks.
+    """
     return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / looks))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # How many samples a pixel trials over many conditions need: of a rate (docs/design.md).
 
-CONDITIONS = 30  # conditions under which each configuration is rendered at each sample count
+# conditions under which each configuration is rendered at each sample count
+CONDITIONS = 30
 MOVED = 0.05  # share of the conditions that more samples may carry over zero
 OVER_LADDER = LADDER[:3]  # sample counts to try
-MOST_TIMES = 2  # samples of a check over those of the searches, at most, beyond the second rung
+# samples of a check over those of the searches, at most, beyond the second rung
+MOST_TIMES = 2
 
 Floats = npt.NDArray[np.float64]
 
 
 def affordable(ladder: Sequence[int], pictures: int, searched: int) -> Sequence[int]:
-    """Return the rungs at which so many pictures take at most `MOST_TIMES` the samples of the searches, and the first
-    two in any case."""
-    return [spp for place, spp in enumerate(ladder) if place < 2 or pictures * spp <= MOST_TIMES * searched]
+    """Return the rungs at which so many pictures take at most `MOST_TIMES` the samples
+    of the searches, and the first two in any case.
+    """
+    return [
+        spp
+        for place, spp in enumerate(ladder)
+        if place < 2 or pictures * spp <= MOST_TIMES * searched
+    ]
 
 
-def choose_rate_spp(margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER) -> SampleCount:
-    """Climb a ladder of sample counts until more of them would leave the share of conditions with a margin below
-    zero where it is, of each configuration; return the highest rung that one of them needed.
+def choose_rate_spp(
+    margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER
+) -> SampleCount:
+    """Climb a ladder of sample counts until more of them would leave the share of
+    conditions with a margin below zero where it is, of each configuration; return the
+    highest rung that one of them needed.
 
-    Each is rendered under the same `CONDITIONS` at a rung and at the one below. It has settled where the mean change of
-    the margin, taken once more and at either end of its 95 % interval (Student's t), would carry at most `MOVED` of the
-    conditions over zero (`moved`). The error that is left falls with the sample count, so it is smaller than the change
-    that led here (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a trial. Arguments are
-    as of `choose_spp`; conditions are drawn by the seeds.
+    Each is rendered under the same `CONDITIONS` at a rung and at the one below. It has
+    settled where the mean change of the margin, taken once more and at either end of
+    its 95 % interval (Student's t), would carry at most `MOVED` of the conditions over
+    zero (`moved`). The error that is left falls with the sample count, so it is smaller
+    than the change that led here (`benchmarks/verdicts.py` has how far the rate is off
+    then). No render of it is a trial. Arguments are as of `choose_spp`; conditions are
+    drawn by the seeds.
     """
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
-    table, reached = list[Rung](), 1
+    table = list[Rung]()
+    reached = 1
     seeds = [stream(seed, "sample count", number) for number in range(CONDITIONS)]
     for name, render in margins.items():
         below: Floats | None = None
         for place, spp in enumerate(ladder):
             here = np.array(render(spp, seeds), dtype=np.float64)
-            half = stdtrit(len(here) - 1, CONFIDENCE) * here.std(ddof=1) / math.sqrt(len(here))
+            half = (
+                stdtrit(len(here) - 1, CONFIDENCE)
+                * here.std(ddof=1)
+                / math.sqrt(len(here))
+            )
             drift = math.nan if below is None else float(here.mean() - below.mean())
             settled = below is not None and moved(here, below) <= MOVED
-            table.append(Rung(name, spp, float(here.mean()), float(half), drift, settled))
+            table.append(
+                Rung(name, spp, float(here.mean()), float(half), drift, settled)
+            )
             if settled:
                 reached = max(reached, place)
                 break
@@ -265,13 +374,19 @@ def choose_rate_spp(margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequ
 
 
 def moved(here: Floats, below: Floats) -> float:
-    """Return the share of conditions that the mean change of the margins (n,) from one rung to the next, taken once
-    more, would carry over zero at most; NaN where a margin is no number. The margins are smoothed by normal kernels of
-    Silverman's width."""
-    change, width = here - below, 0.9 * here.std(ddof=1) * len(here) ** -0.2
+    """Return the share of conditions that the mean change of the margins (n,) from one
+    rung to the next, taken once more, would carry over zero at most; NaN where a margin
+    is no number. The margins are smoothed by normal kernels of Silverman's width.
+    """
+    change = here - below
+    width = 0.9 * here.std(ddof=1) * len(here) ** -0.2
     if not np.isfinite(change).all():
         return math.nan
-    half = stdtrit(len(here) - 1, 0.5 + CONFIDENCE / 2.0) * change.std(ddof=1) / math.sqrt(len(here))
+    half = (
+        stdtrit(len(here) - 1, 0.5 + CONFIDENCE / 2.0)
+        * change.std(ddof=1)
+        / math.sqrt(len(here))
+    )
     ends = np.array([0.0, change.mean() - half, change.mean() + half])[:, None]
     shares = ndtr((here + ends) / max(width, 1e-12)).mean(axis=1)
     return float(np.abs(shares[1:] - shares[0]).max())

@@ -1,5 +1,7 @@
-"""The independent re-check of what a search found (docs/design.md, "Verification"): fresh seeds, enough samples, 8
-bits, a task that judges, and a control group of the clean configuration. A verdict's rule stands here only."""
+"""The independent re-check of what a search found (docs/design.md, "Verification"):
+fresh seeds, enough samples, 8 bits, a task that judges, and a control group of the
+clean configuration. A verdict's rule stands here only.
+"""
 
 from __future__ import annotations
 
@@ -20,52 +22,83 @@ from advsearch.tasks import Judgement
 
 
 class Ending(Enum):
-    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person. What a
-    search ends with is a claim; only `verify` makes it a finding (docs/design.md, "Verification")."""
+    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one
+    sentence for a person. What a search ends with is a claim; only `verify` makes it a
+    finding (docs/design.md, "Verification").
+    """
 
     explanation: str
     FOUND = "found", "A configuration inside the budget makes the model wrong."
-    BUDGET_SPENT = "budget spent", "All renders were spent and no configuration made the model wrong."
+    BUDGET_SPENT = (
+        "budget spent",
+        ("All renders were spent and no configuration made the model wrong."),
+    )
     NOT_VERIFIED = (
         "not verified",
-        "The search claimed a wrong prediction, but it did not hold in the trials with fresh seeds.",
+        "The search claimed a wrong prediction, but it did not hold in the trials with "
+        "fresh seeds.",
     )
     ALREADY_WRONG = (
         "already wrong",
-        "The model is wrong on the clean configuration already, so there is nothing to attack.",
+        "The model is wrong on the clean configuration already, so there is nothing to "
+        "attack.",
     )
-    STALLED = "stalled", "The policy had nothing more to propose before the budget was spent."
-    NON_FINITE = "non-finite objective", "The objective was NaN or infinite several times in a row."
-    INTERRUPTED = "interrupted", "The search was interrupted; the best configuration so far was kept."
+    STALLED = (
+        "stalled",
+        ("The policy had nothing more to propose before the budget was spent."),
+    )
+    NON_FINITE = (
+        "non-finite objective",
+        ("The objective was NaN or infinite several times in a row."),
+    )
+    INTERRUPTED = (
+        "interrupted",
+        ("The search was interrupted; the best configuration so far was kept."),
+    )
 
     def __new__(cls, value: str, explanation: str) -> Ending:
         ending = object.__new__(cls)
-        ending._value_, ending.explanation = value, explanation
+        ending._value_ = value
+        ending.explanation = explanation
         return ending
 
 
-PASS_PERCENT = 95  # of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of 20
-PASS_PERCENT_OVER = 90  # of conditions in which a claim must hold, of those in which the clean configuration is right
+# of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of
+# 20
+PASS_PERCENT = 95
+# of conditions in which a claim must hold, of those in which the clean configuration is
+# right
+PASS_PERCENT_OVER = 90
 
 TRIAL_LOOKS = 14, 23
-"""Trials after which a verdict may stand, where nobody asked for a number: `found` takes 14 of 14, or 22 of 23.
+"""Trials after which a verdict may stand, where nobody asked for a number: `found`
+takes 14 of 14, or 22 of 23.
 
-What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and the interval of what is found
-begins at 77 %, by 19 of 20 at 75 %. `benchmarks/verdicts.py` has both exactly."""
+What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and
+the interval of what is found begins at 77 %, by 19 of 20 at 75 %.
+`benchmarks/verdicts.py` has both exactly.
+"""
 
 OVER_EARLY = {30: 30, 60: 59, 100: 95, 150: 141}
 OVER_LOOKS = *OVER_EARLY, 200
-"""Trials over many conditions after which a verdict may stand, where nobody asked for a number: of those that count at
-all but the last, with the successes of `OVER_EARLY`, and of all at the last.
+"""Trials over many conditions after which a verdict may stand, where nobody asked for a
+number: of those that count at all but the last, with the successes of `OVER_EARLY`, and
+of all at the last.
 
-What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180 of 200 alone."""
+What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180
+of 200 alone.
+"""
 OVER_CONFIDENCE = 0.97
-"""Confidence of a Clopper-Pearson interval after `OVER_LOOKS`, so that it covers the rate in 95 % of all cases
-(`benchmarks/verdicts.py`): somebody who looks five times is lucky more often than somebody who looks once."""
+"""Confidence of a Clopper-Pearson interval after `OVER_LOOKS`, so that it covers the
+rate in 95 % of all cases (`benchmarks/verdicts.py`): somebody who looks five times is
+lucky more often than somebody who looks once.
+"""
 
 LEAST_RATE = 0.5
-"""Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are
-the fewest that can verify anything (54 to 100 %); 5 of 5 begin at 48 %."""
+"""Where the 95 % interval of a claim's rate may begin: what is called found holds more
+often than not. So 6 trials are the fewest that can verify anything (54 to 100 %); 5 of
+5 begin at 48 %.
+"""
 
 
 @dataclass(frozen=True)
@@ -74,55 +107,84 @@ class Rule:
 
     percent: int = PASS_PERCENT  # of the trials in which it must hold
     control: bool = True
-    """A success counts only where the clean configuration is right, which it has to be in as many per cent."""
+    """A success counts only where the clean configuration is right, which it has to be
+    in as many per cent.
+    """
     conditional: bool = False
-    """The percentage is one of the trials in which the clean configuration is right, and it has to be right in half of
-    all: for conditions that vary, and may be hard ones by themselves."""
+    """The percentage is one of the trials in which the clean configuration is right,
+    and it has to be right in half of all: for conditions that vary, and may be hard
+    ones by themselves.
+    """
 
     def needed(self, trials: int, *, early: bool = False) -> int:
-        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`. Of
-        conditions, `early` asks for those of `OVER_EARLY`: more of them could follow."""
-        return max(OVER_EARLY[trials] if early and self.conditional else self.share(trials), self.fewest)
+        """Return how many of `trials` must succeed: the percentage, rounded up, and
+        never under `fewest`. Of conditions, `early` asks for those of `OVER_EARLY`:
+        more of them could follow.
+        """
+        return max(
+            OVER_EARLY[trials] if early and self.conditional else self.share(trials),
+            self.fewest,
+        )
 
     def allowed(self, trials: int) -> int:
         return trials - self.needed(trials)
 
     @property
     def fewest(self) -> int:
-        """Trials under which nothing is verified: even without a failure their interval begins under `LEAST_RATE`."""
-        return next(n for n in itertools.count(1) if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE)
+        """Trials under which nothing is verified: even without a failure their interval
+        begins under `LEAST_RATE`.
+        """
+        return next(
+            n
+            for n in itertools.count(1)
+            if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE
+        )
 
     def share(self, trials: int) -> int:
         return -(-self.percent * trials // 100)
 
     def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
-        """Whether a trial counts beside that of the clean configuration with the same seed: which has to be right, so
-        that what the noise does by itself does not count; where it may be wrong, the trial has the larger score."""
-        return trial.success and (clean.right if self.control else trial.score > clean.score)
+        """Whether a trial counts beside that of the clean configuration with the same
+        seed: which has to be right, so that what the noise does by itself does not
+        count; where it may be wrong, the trial has the larger score.
+        """
+        return trial.success and (
+            clean.right if self.control else trial.score > clean.score
+        )
 
     def counted(self, clean: Sequence[Judgement]) -> int:
         """Return how many trials count, beside these of the clean configuration."""
         return sum(trial.right for trial in clean) if self.conditional else len(clean)
 
     def already_wrong(self, clean: Trials) -> bool:
-        """Whether a clean configuration is no start at all: right in less than half of its trials."""
+        """Whether a clean configuration is no start at all: right in less than half of
+        its trials.
+        """
         return self.control and 2 * clean.successes < clean.trials
 
     def decided(self, successes: int, trials: int) -> bool | None:
-        """Return what so many trials of one configuration say: success, none, or None where it depends on the noise."""
+        """Return what so many trials of one configuration say: success, none, or None
+        where it depends on the noise.
+        """
         if min(successes, trials - successes) > self.allowed(trials):
             return None
         return successes >= self.needed(trials)
 
     def verdict(self, search: Ending, clean: Trials, adversarial: Trials) -> Ending:
-        """Return the run's ending from the search's ending and the trials of both groups: FOUND if both reach what the
-        rule needs, whatever the search itself believed."""
+        """Return the run's ending from the search's ending and the trials of both
+        groups: FOUND if both reach what the rule needs, whatever the search itself
+        believed.
+        """
         if search is Ending.INTERRUPTED:
             return search
         if self.already_wrong(clean):
             return Ending.ALREADY_WRONG
         enough = adversarial.successes >= self.needed(adversarial.trials)
-        control = not self.control or self.conditional or clean.successes >= self.needed(clean.trials)
+        control = (
+            not self.control
+            or self.conditional
+            or clean.successes >= self.needed(clean.trials)
+        )
         if control and enough:
             return Ending.FOUND
         return Ending.NOT_VERIFIED if search is Ending.FOUND else search
@@ -131,8 +193,10 @@ class Rule:
 WORST_CASE = Rule()
 OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, conditional=True)
 EASIER = Rule(control=False)
-"""For `--minimise`: the clean configuration may be wrong, so there is no control group to pass; but a success has to be
-recognised better than the clean one with the same seed."""
+"""For `--minimise`: the clean configuration may be wrong, so there is no control group
+to pass; but a success has to be recognised better than the clean one with the same
+seed.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,19 +208,27 @@ class Verification:
     u: Tensor  # (d,) the configuration verified, projected into its budget again
     clean: Trials  # right predictions of the control group
     adversarial: Trials  # successes, by `Rule.succeeded`
-    clean_trials: tuple[Judgement, ...]  # every single trial, in the order of their seeds
-    adversarial_trials: tuple[Judgement, ...]  # likewise; of curtailed ones this group is the shorter
+    # every single trial, in the order of their seeds
+    clean_trials: tuple[Judgement, ...]
+    # likewise; of curtailed ones this group is the shorter
+    adversarial_trials: tuple[Judgement, ...]
     renders: int  # spent here
-    stopped: str  # why there are no more trials: "asked for" (as many as were), "decided" (the verdict stands)
+    # why there are no more trials: "asked for" (as many as were), "decided" (the
+    # verdict stands)
+    stopped: str
     outcomes: tuple[bool | None, ...]
-    """Of each trial of the second group, whether it is a success; None where it does not count, as under its conditions
-    the clean configuration is wrong."""
+    """Of each trial of the second group, whether it is a success; None where it does
+    not count, as under its conditions the clean configuration is wrong.
+    """
     begin: int = 0  # the number of the first trial
 
     @property
     def counting(self) -> tuple[Judgement, ...]:
         trials = zip(self.adversarial_trials, self.outcomes, strict=True)
-        return tuple(trial for trial, outcome in trials if outcome is not None) or self.adversarial_trials
+        return (
+            tuple(trial for trial, outcome in trials if outcome is not None)
+            or self.adversarial_trials
+        )
 
     @property
     def successes(self) -> tuple[Judgement, ...]:
@@ -176,12 +248,14 @@ def run_trials(
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Render and judge one configuration (d,) `trials` times, trial k with seed k of the stream "verification" of the
-    root `seed`: two groups of one root get the same seeds, which is what a control group needs.
+    """Render and judge one configuration (d,) `trials` times, trial k with seed k of
+    the stream "verification" of the root `seed`: two groups of one root get the same
+    seeds, which is what a control group needs.
 
     Args:
         evaluate: answers the queries; see `Query`.
-        spp, trials: samples a pixel, and how many trials there are then; under 1 they are an InputError.
+        spp, trials: samples a pixel, and how many trials there are then; under 1 they
+            are an InputError.
         first: how many of them there are already, which are left out.
         begin: the number of the first of all.
         kind: of their rows.
@@ -194,7 +268,14 @@ def run_trials(
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
     done: list[Judgement] = []
     queries = [
-        Query(u, trial_seed(seed, number), kind, number, spp=spp, keep=number < begin + keep)
+        Query(
+            u,
+            trial_seed(seed, number),
+            kind,
+            number,
+            spp=spp,
+            keep=number < begin + keep,
+        )
         for number in range(begin + first, begin + trials)
     ]
     for evaluation in evaluate(queries):
@@ -228,39 +309,50 @@ def verify(
     curtailed: bool = False,
     begin: int = 0,
 ) -> Verification:
-    """Check what a search found in fresh trials against the clean configuration as control group.
+    """Check what a search found in fresh trials against the clean configuration as
+    control group.
 
-    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which that is
-    found. Over conditions, those that count are looked at (`OVER_LOOKS`), and the last look is at all.
+    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the
+    first at which that is found. Over conditions, those that count are looked at
+    (`OVER_LOOKS`), and the last look is at all.
 
-    Curtailed trials end with the first failure that is one more than the rule allows of all of them. The verdict is
-    that of all trials, whatever the rest would have said, and the Clopper-Pearson interval of those that were made
-    still covers the rate as often as it says: it contains the exact interval of that stopping rule, under which an
-    outcome is the better the later it stops (Jennison and Turnbull 1983). Trials with several looks are always
-    curtailed, but have at least `Rule.fewest`, so that they say something of the rate; that their intervals cover it
-    is shown by the probability of every outcome (`benchmarks/verdicts.py`).
+    Curtailed trials end with the first failure that is one more than the rule allows of
+    all of them. The verdict is that of all trials, whatever the rest would have said,
+    and the Clopper-Pearson interval of those that were made still covers the rate as
+    often as it says: it contains the exact interval of that stopping rule, under which
+    an outcome is the better the later it stops (Jennison and Turnbull 1983). Trials
+    with several looks are always curtailed, but have at least `Rule.fewest`, so that
+    they say something of the rate; that their intervals cover it is shown by the
+    probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
-        evaluate, spp, keep, begin: as of `run_trials`; of a configuration that was chosen by trials, fresh ones begin
-            after these.
+        evaluate, spp, keep, begin: as of `run_trials`; of a configuration that was
+            chosen by trials, fresh ones begin after these.
         domain: the budget; the clean configuration is its start.
         u: (d,) the adversarial configuration; projected into the domain again.
         claim: the search's ending.
-        seed: root seed. Must not be one that the search rendered with through the same stream.
+        seed: root seed. Must not be one that the search rendered with through the same
+            stream.
         trials: per group; or rising numbers, see above.
-        clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
-            (one control group serves the attack and its baseline); what is missing is run here.
+        clean: the first trials of the clean configuration, where `run_trials` has run
+            them with the same spp and seed (one control group serves the attack and its
+            baseline); what is missing is run here.
         rule: what counts as a success, and which ending it is.
-        kind, control: of the rows of its trials, and of those of the clean configuration.
+        kind, control: of the rows of its trials, and of those of the clean
+            configuration.
         curtailed: see above; where of what was found only the verdict matters.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     least = 0 if curtailed or len(looks) == 1 else rule.fewest
-    u, beside, done = domain.project(u), list(clean), list[Judgement]()
+    u = domain.project(u)
+    beside = list(clean)
+    done = list[Judgement]()
 
     def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
         return tuple(
-            rule.succeeded(trial, clean) if clean.right or not rule.conditional else None
+            rule.succeeded(trial, clean)
+            if clean.right or not rule.conditional
+            else None
             for trial, clean in zip(others, beside, strict=False)
         )
 
@@ -278,22 +370,32 @@ def verify(
             count = min(count + short, looks[-1])
             beside += more(domain.start, trials=count, first=len(beside), kind=control)
         until = lost if curtailed or len(looks) > 1 else None
-        done += more(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
+        done += more(
+            u, trials=count, first=len(done), kind=kind, keep=keep, until=until
+        )
         early = count < looks[-1]
         needed = rule.needed(rule.counted(beside[:count]), early=early)
-        enough = tried(done).count(True) >= needed and not rule.already_wrong(count_right(beside[:count], spp))
+        enough = tried(done).count(True) >= needed and not rule.already_wrong(
+            count_right(beside[:count], spp)
+        )
         if len(done) < count or lost(()) or enough or not early:
             break
-    outcomes, right, renders = tried(done), count_right(beside, spp), len(done) + len(beside) - len(clean)
-    successes, counted = outcomes.count(True), max(1, len(outcomes) - outcomes.count(None))
+    outcomes = tried(done)
+    right = count_right(beside, spp)
+    renders = len(done) + len(beside) - len(clean)
+    successes = outcomes.count(True)
+    counted = max(1, len(outcomes) - outcomes.count(None))
     confidence = OVER_CONFIDENCE if rule.conditional and len(looks) > 1 else CONFIDENCE
     verified = Trials(successes, counted, spp, confidence)
     ending = rule.verdict(claim, right, verified)
     reason = (
         f"{ending.explanation} A success in {successes} of {counted} trials, "
-        f"{rule.needed(counted, early=enough and early)} are needed; clean right in {right.successes} of "
+        f"{rule.needed(counted, early=enough and early)} are needed; clean right in "
+        f"{right.successes} of "
         f"{right.trials}."
     )
     stopped = "asked for" if len(looks) == 1 and len(done) == looks[0] else "decided"
     groups = tuple(beside), tuple(done)
-    return Verification(ending, reason, u, right, verified, *groups, renders, stopped, outcomes, begin)
+    return Verification(
+        ending, reason, u, right, verified, *groups, renders, stopped, outcomes, begin
+    )

@@ -1,1 +1,3 @@
-"""The command line: parse, call the API, print. One small file for each command; nothing imports this package."""
+"""The command line: parse, call the API, print. One small file for each command;
+nothing imports this package.
+"""

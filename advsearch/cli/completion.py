@@ -1,4 +1,6 @@
-"""`advsearch completion`: a script with which the Tab key finishes commands, flags, names and files in a shell."""
+"""`advsearch completion`: a script with which the Tab key finishes commands, flags,
+names and files in a shell.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,13 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.main import add_command, argument, command, list_commands, without_commands
+from advsearch.cli.main import (
+    add_command,
+    argument,
+    command,
+    list_commands,
+    without_commands,
+)
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
@@ -26,7 +34,11 @@ OR_A_FILE = ("--object", "--environment", "--model")
 
 
 @command(
-    argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for"),
+    argument(
+        "shell",
+        choices=["bash", "zsh", "tcsh"],
+        help="the shell that the script is for",
+    ),
     output.add_flags,
     more=". It needs the package shtab (pip install shtab)",
     examples=(
@@ -38,9 +50,13 @@ def completion(args: argparse.Namespace) -> int:
     try:
         import shtab  # an optional extra
     except ImportError as error:
-        raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
+        raise InputError(
+            "completion needs the package shtab; install it with: pip install shtab"
+        ) from error
     parser, commands = without_commands()
-    names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
+    names = {
+        kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES
+    }
     for name in list_commands():
         for action in add_command(commands, name)._actions:
             flag = action.option_strings[-1] if action.option_strings else ""
@@ -52,13 +68,21 @@ def completion(args: argparse.Namespace) -> int:
                 continue
             ways: dict[str, Any] = shtab.FILE
             if named:  # or a file
-                function, words = f"_advsearch{flag.replace('-', '_')}", " ".join(named)
+                function = f"_advsearch{flag.replace('-', '_')}"
+                words = " ".join(named)
                 ways = {
-                    "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
+                    "preamble": {
+                        "bash": f'{function}() {{ compgen -W "{words}" -- '
+                        f'"$1"; compgen -f -- "$1"; }}'
+                    },
                     "bash": function,
                     "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
                     "tcsh": "f",
                 }
             action.complete = ways  # type: ignore[attr-defined]  # where shtab looks for it
     script = shtab.complete(parser, shell=args.shell)
-    return output.say(args.json, {"command": "completion", "shell": args.shell, "script": script}, script)
+    return output.say(
+        args.json,
+        {"command": "completion", "shell": args.shell, "script": script},
+        script,
+    )

@@ -1,4 +1,6 @@
-"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of a run anew."""
+"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of
+a run anew.
+"""
 
 from __future__ import annotations
 
@@ -21,47 +23,78 @@ PORT = 8265
 PHOTOGRAPH_PAGES = "advsearch.questions.photographs.pages:PhotographPages"
 
 SEEN = (
-    "Whoever has this address sees the runs and can send photographs. Each is judged on this machine, by the model "
-    "that the run's settings name, and kept in the run's folder, as a picture and as rows; nothing else is written."
+    "Whoever has this address sees the runs and can send photographs. Each is judged "
+    "on this machine, by the model "
+    "that the run's settings name, and kept in the run's folder, as a picture and as "
+    "rows; nothing else is written."
 )
 
 
 @command(
-    argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)"),
+    argument(
+        "runs",
+        nargs="*",
+        metavar="RUN",
+        help="names or folders of runs (default: all in runs/)",
+    ),
     argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen at (default: %(default)s); at others, whoever has the printed "
+        help="address to listen at (default: %(default)s); at others, whoever has the "
+        "printed "
         "token sees the runs and can add photographs, which the run's model judges here",
     ),
-    argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)"),
     argument(
-        "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
+        "--port",
+        type=int,
+        default=PORT,
+        help="port; 0 takes a free one (default: %(default)s)",
+    ),
+    argument(
+        "--https",
+        action="store_true",
+        help="speak HTTPS on this machine too; at other addresses that is always so",
     ),
     argument("--json", action="store_true", help="print the address as JSON"),
     output.add_code_flag,
-    more=". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C",
-    examples=("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
+    more=". It keeps the photographs that are taken on a run's page, writes nothing "
+    "else, and ends with Ctrl-C",
+    examples=(
+        "dashboard",
+        "dashboard mug-sweep-001 mug-sweep-002",
+        "dashboard --host 0.0.0.0",
+    ),
 )
 def dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    runs = [find_run(name, checked=False) for name in args.runs]  # the list says what is wrong with one
+    # the list says what is wrong with one
+    runs = [find_run(name, checked=False) for name in args.runs]
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
     photographs = imported(PHOTOGRAPH_PAGES)() if has_photographs else None
-    server = Dashboard(runs, args.host, args.port, https=args.https, photographs=photographs)
-    facts = {"address": server.address, "token": server.token, "fingerprint": server.fingerprint}
+    server = Dashboard(
+        runs, args.host, args.port, https=args.https, photographs=photographs
+    )
+    facts = {
+        "address": server.address,
+        "token": server.token,
+        "fingerprint": server.fingerprint,
+    }
     output.say(args.json, {"command": "dashboard", **facts}, server.address)
     sys.stdout.flush()
     if server.fingerprint:
         print(
-            "The browser will warn of the certificate, which was made for this server alone. Its SHA-256 is "
+            "The browser will warn of the certificate, which was made for this server "
+            "alone. Its SHA-256 is "
             f"{server.fingerprint}.",
             file=sys.stderr,
         )
     if server.token:
         print(SEEN, file=sys.stderr)
-        print(qr_text(server.address) or f"For a code to point a phone at: {NO_QR}", file=sys.stderr)
+        print(
+            qr_text(server.address) or f"For a code to point a phone at: {NO_QR}",
+            file=sys.stderr,
+        )
     print("Ctrl-C ends it.", file=sys.stderr)
     try:
         server.serve_forever()
@@ -71,15 +104,37 @@ def dashboard(args: argparse.Namespace) -> int:
 
 
 @command(
-    argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle"),
-    argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures"),
+    argument(
+        "runs",
+        nargs="+",
+        metavar="RUN",
+        help="a run's name or folder; several sweeps with --bundle",
+    ),
+    argument(
+        "--bundle",
+        metavar="DIR",
+        help="write a folder: a page, the rows and the small pictures",
+    ),
     output.add_flags,
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
 )
 def view(args: argparse.Namespace) -> int:
-    """Make the page of a run anew, or a folder with it that any web server can serve."""
+    """Make the page of a run anew, or a folder with it that any web server can
+    serve.
+    """
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:
-        raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")
-    out = write_page(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
-    return output.say(args.json, {"command": "view", "runs": list(map(str, folders)), "out": str(out)}, str(out))
+        raise InputError(
+            "--bundle: pages of several runs go into a folder; name one, "
+            "or give one run"
+        )
+    out = (
+        write_page(folders[0])
+        if args.bundle is None
+        else write_bundle(folders, Path(args.bundle))
+    )
+    return output.say(
+        args.json,
+        {"command": "view", "runs": list(map(str, folders)), "out": str(out)},
+        str(out),
+    )

@@ -1,7 +1,9 @@
-"""What `advsearch doctor` checks: every part that a run needs, its version, whether it works, and what to do if not.
+"""What `advsearch doctor` checks: every part that a run needs, its version, whether it
+works, and what to do if not.
 
-Whatever loads native code is tried in a process of its own (`advsearch.cli.doctor_probe`): a libLLVM that is too old
-takes its process down, and the rest should still be told.
+Whatever loads native code is tried in a process of its own
+(`advsearch.cli.doctor_probe`): a libLLVM that is too old takes its process down, and
+the rest should still be told.
 """
 
 from __future__ import annotations
@@ -30,13 +32,19 @@ from advsearch.scene.mitsuba_backend import llvm
 from advsearch.trust.code import OWN_FOLDER
 from advsearch.version import __version__
 
-OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
+OK = "ok"
+WARNING = "warning"
+MISSING = "missing"
+BROKEN = "broken"
 """The states of a part. A warning does not keep anything from running."""
 COLOURS = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
 
 GIB = 2**30
-DISK_WANTED, MEMORY_WANTED = 1 * GIB, 3 * GIB
-"""Below these a warning: a run's pictures and the kernel cache; the peak of a search (2.5 GiB) and what else runs."""
+DISK_WANTED = 1 * GIB
+MEMORY_WANTED = 3 * GIB
+"""Below these a warning: a run's pictures and the kernel cache; the peak of a search
+(2.5 GiB) and what else runs.
+"""
 
 SECONDS_ALLOWED = 300
 OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
@@ -49,8 +57,10 @@ _SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow
 
 @dataclass(frozen=True)
 class Component:
-    """One part of the installation: its version ("" where there is none to tell), a status (ok, warning, missing or
-    broken), what was tried or found, and what to type or do ("" when nothing has to be done)."""
+    """One part of the installation: its version ("" where there is none to tell), a
+    status (ok, warning, missing or broken), what was tried or found, and what to type
+    or do ("" when nothing has to be done).
+    """
 
     name: str
     version: str
@@ -61,28 +71,46 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
-    print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
+    print(
+        "advsearch: trying every part, a first render among them; that takes some "
+        "seconds",
+        file=sys.stderr,
+    )
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
-        output.print_json({"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]})
+        output.print_json(
+            {
+                "schema": 1,
+                "command": "doctor",
+                "ok": good,
+                "parts": [asdict(part) for part in parts],
+            }
+        )
         return 0 if good else FELL_SHORT
     # late: what is missing is told without it, too
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    console, table = Console(highlight=False), Table(box=None, pad_edge=False)
+    console = Console(highlight=False)
+    table = Table(box=None, pad_edge=False)
     for heading in ("part", "version", "", "detail"):
         table.add_column(heading, overflow="fold")
     for part in parts:
         state = f"[{COLOURS[part.status]}]{part.status}[/]"
-        table.add_row(escape(part.name), escape(part.version), state, escape(part.detail))
+        table.add_row(
+            escape(part.name), escape(part.version), state, escape(part.detail)
+        )
     console.print(table)
     console.print()
     for part in (part for part in parts if part.fix):
         console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
-    console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
+    console.print(
+        "Everything that is necessary works."
+        if good
+        else "[red]Something necessary does not work.[/]"
+    )
     return 0 if good else FELL_SHORT
 
 
@@ -103,20 +131,47 @@ def diagnose() -> list[Component]:
 
 
 def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
-    """Try the parts that load native code, in another process: name to whether it worked and a detail or the error. The
-    part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended."""
+    """Try the parts that load native code, in another process: name to whether it
+    worked and a detail or the error. The part that ended the process, and those after
+    it, are absent; under the name ``""`` stands how it ended.
+    """
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False, cwd=OWN_FOLDER
+            command,
+            capture_output=True,
+            text=True,
+            timeout=SECONDS_ALLOWED,
+            check=False,
+            cwd=OWN_FOLDER,
         )
-        printed, status, good = done.stdout, done.returncode, done.returncode == 0
-        telling = [line.strip() for line in done.stderr.splitlines() if "ERROR" in line or "Error" in line]
-        how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
-        ending = f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "") if status else ""
+        printed = done.stdout
+        status = done.returncode
+        good = done.returncode == 0
+        telling = [
+            line.strip()
+            for line in done.stderr.splitlines()
+            if "ERROR" in line or "Error" in line
+        ]
+        how = (
+            f"signal {signal.Signals(-status).name}"
+            if status < 0
+            else f"status {status}"
+        )
+        ending = (
+            f"the trial ended with {how}"
+            + (f" ({telling[0][:120]})" if telling else "")
+            if status
+            else ""
+        )
     except subprocess.TimeoutExpired as expired:
         partial = expired.stdout
-        printed = partial.decode("utf-8", "replace") if isinstance(partial, bytes) else partial or ""
-        good, ending = False, f"the trial took longer than {SECONDS_ALLOWED} s"
+        printed = (
+            partial.decode("utf-8", "replace")
+            if isinstance(partial, bytes)
+            else partial or ""
+        )
+        good = False
+        ending = f"the trial took longer than {SECONDS_ALLOWED} s"
     tried = {}
     for line in printed.splitlines():
         try:
@@ -128,35 +183,76 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
 
 
 def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
-    """The packages that were tried, with their versions; a render stands for Mitsuba and Dr.Jit together."""
-    for name in ("numpy", "torch", "mitsuba", "drjit", "render", "mitsuba-oidn", *_SMALL_PACKAGES):
+    """The packages that were tried, with their versions; a render stands for Mitsuba
+    and Dr.Jit together.
+    """
+    for name in (
+        "numpy",
+        "torch",
+        "mitsuba",
+        "drjit",
+        "render",
+        "mitsuba-oidn",
+        *_SMALL_PACKAGES,
+    ):
         version = "" if name == "render" else installed_version(name)
         if version is None:
-            status, why = (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
+            status, why = (
+                (WARNING, f": {OPTIONAL[name]}") if name in OPTIONAL else (MISSING, "")
+            )
             yield Component(name, "", status, f"not installed{why}", _reinstall(name))
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         elif name not in tried:
-            yield Component(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
+            yield Component(
+                name,
+                version,
+                BROKEN,
+                f"not reached: {tried[''][1]}",
+                "see libLLVM below",
+            )
         elif tried[name][0]:
             yield Component(name, version, OK, tried[name][1])
         else:
             mend = "see libLLVM below, then mend mitsuba and drjit: make setup"
             mend = mend if name == "render" else _reinstall(name)
-            yield Component(name, version, WARNING if name in OPTIONAL else BROKEN, tried[name][1], mend)
+            yield Component(
+                name,
+                version,
+                WARNING if name in OPTIONAL else BROKEN,
+                tried[name][1],
+                mend,
+            )
 
 
 def other_packages(requirements: Sequence[str] | None = None) -> Component:
-    """The dependencies that need no trial: present or not. Requirements are as in the package's metadata, e.g.
-    ``"rich>=13"``; None reads them there."""
-    wanted = (metadata.requires("advsearch") or []) if requirements is None else requirements
-    names = {re.split(r"[^\w.-]", wish, maxsplit=1)[0] for wish in wanted if "extra ==" not in wish}
-    rest = sorted(names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}, key=str.lower)
+    """The dependencies that need no trial: present or not. Requirements are as in the
+    package's metadata, e.g. ``"rich>=13"``; None reads them there.
+    """
+    wanted = (
+        (metadata.requires("advsearch") or []) if requirements is None else requirements
+    )
+    names = {
+        re.split(r"[^\w.-]", wish, maxsplit=1)[0]
+        for wish in wanted
+        if "extra ==" not in wish
+    }
+    rest = sorted(
+        names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES},
+        key=str.lower,
+    )
     versions = {name: installed_version(name) for name in rest}
     if absent := [name for name, version in versions.items() if version is None]:
         why = f"not installed: {', '.join(absent)}"
-        return Component("other packages", "", MISSING, why, _reinstall(" ".join(absent)))
-    return Component("other packages", "", OK, ", ".join(f"{name} {version}" for name, version in versions.items()))
+        return Component(
+            "other packages", "", MISSING, why, _reinstall(" ".join(absent))
+        )
+    return Component(
+        "other packages",
+        "",
+        OK,
+        ", ".join(f"{name} {version}" for name, version in versions.items()),
+    )
 
 
 def installed_version(name: str) -> str | None:
@@ -167,7 +263,10 @@ def installed_version(name: str) -> str | None:
 
 
 def _reinstall(name: str) -> str:
-    return f"pip install --force-reinstall --no-deps {name}, or make clean setup in a checkout"
+    return (
+        f"pip install --force-reinstall --no-deps {name}, or make clean setup in a "
+        "checkout"
+    )
 
 
 def check_llvm() -> Component:
@@ -177,10 +276,18 @@ def check_llvm() -> Component:
     try:
         chosen = llvm.ensure_llvm()
     except AdvsearchError as error:
-        fix = f"unset {llvm.VARIABLE}" if given else f"{llvm.install_command()} (or name a file in {llvm.VARIABLE})"
-        return Component("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
+        fix = (
+            f"unset {llvm.VARIABLE}"
+            if given
+            else (f"{llvm.install_command()} (or name a file in {llvm.VARIABLE})")
+        )
+        return Component(
+            "libLLVM", "", BROKEN if others or given else MISSING, str(error), fix
+        )
     refused = [str(c) for c in others if c.refused]
-    usable = [str(c) for c in others if not c.refused and c.path != chosen.path.resolve()]
+    usable = [
+        str(c) for c in others if not c.refused and c.path != chosen.path.resolve()
+    ]
     detail = f"chosen: {chosen.path}" + (f", named by {llvm.VARIABLE}" if given else "")
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""
@@ -189,24 +296,41 @@ def check_llvm() -> Component:
 
 def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
-    name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore advsearch/bundled/data"
+    name = "bundled scenes"
+    fix = "reinstall advsearch; in a checkout: git restore advsearch/bundled/data"
     try:
-        from advsearch.scene.library import list_environments, list_objects  # what is tried
+        # what is tried
+        from advsearch.scene.library import list_environments, list_objects
 
-        objects, environments = list_objects(), list_environments()
+        objects = list_objects()
+        environments = list_environments()
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
         return Component(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
     detail = f"{len(objects)} objects, {len(environments)} environments"
-    return Component(name, "", OK, detail) if objects and environments else Component(name, "", MISSING, detail, fix)
+    return (
+        Component(name, "", OK, detail)
+        if objects and environments
+        else Component(name, "", MISSING, detail, fix)
+    )
 
 
 def reference_weights() -> Component:
     """The weights and labels of the bundled classifier."""
     folder = resources.files("advsearch.models") / "data"
-    absent = [n for n in ("reference.safetensors", "reference.json") if not folder.joinpath(n).is_file()]
+    absent = [
+        n
+        for n in ("reference.safetensors", "reference.json")
+        if not folder.joinpath(n).is_file()
+    ]
     if absent:
         fix = "reinstall advsearch; in a checkout: git restore advsearch/models/data"
-        return Component("reference model", "", MISSING, f"{' and '.join(absent)} not in {folder}", fix)
+        return Component(
+            "reference model",
+            "",
+            MISSING,
+            f"{' and '.join(absent)} not in {folder}",
+            fix,
+        )
     size = os.path.getsize(str(folder.joinpath("reference.safetensors")))
     return Component("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
 
@@ -219,10 +343,15 @@ def kernel_cache(folder: Path) -> Component:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        detail = f"{folder} cannot be written ({error.strerror}): every run compiles its kernels again"
+        detail = (
+            f"{folder} cannot be written ({error.strerror}): every run compiles "
+            "its kernels again"
+        )
         return Component(name, "", WARNING, detail, f"make {folder} writable")
     files = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
-    return Component(name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB")
+    return Component(
+        name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB"
+    )
 
 
 def disk(folder: Path) -> Component:
@@ -230,7 +359,9 @@ def disk(folder: Path) -> Component:
     free = shutil.disk_usage(folder).free
     if free < DISK_WANTED:
         mend = "free some space, or --run elsewhere"
-        return Component("disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", mend)
+        return Component(
+            "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", mend
+        )
     return Component("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
 
 
@@ -239,8 +370,16 @@ def check_hardware() -> Component:
     memory = 0  # where the system does not tell
     with suppress(AttributeError, ValueError, OSError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    detail = f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
+    detail = (
+        f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
+    )
     detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
     if memory and memory < MEMORY_WANTED:
-        return Component("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
+        return Component(
+            "machine",
+            "",
+            WARNING,
+            detail,
+            "a search peaks at 2.5 GiB: close other programs",
+        )
     return Component("machine", "", OK, detail)

@@ -1,7 +1,9 @@
-"""What `advsearch doctor` tries in a process of its own, because a libLLVM that is too old takes its process down.
+"""What `advsearch doctor` tries in a process of its own, because a libLLVM that is too
+old takes its process down.
 
-Each part that was tried prints one line of JSON: its name, whether it worked, and a detail or the error. A line that is
-missing at the end names the part that ended the process. Run by `advsearch.cli.doctor`, never imported by it.
+Each part that was tried prints one line of JSON: its name, whether it worked, and a
+detail or the error. A line that is missing at the end names the part that ended the
+process. Run by `advsearch.cli.doctor`, never imported by it.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from collections.abc import Callable
 from functools import partial
 
 PIXELS = 8
-NOISE = 0.08  # four standard deviations of the brightness of those pixels at 4 samples; the slope's are twice as large
+# four standard deviations of the brightness of those pixels at 4 samples; the slope's
+# are twice as large
+NOISE = 0.08
 
 
 def imported(name: str) -> str:
@@ -24,30 +28,58 @@ def imported(name: str) -> str:
 
 
 def probe_renderer() -> str:
-    """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba  # what is probed
+    """Render a few pixels of a lit wall and differentiate them with respect to its
+    colour, which is linear.
+    """
+    # what is probed
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
     mi = mitsuba()
     import drjit as dr  # what is probed
 
-    wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
-    film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
-    view = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
+    wall = {
+        "type": "rectangle",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    }
+    film = {
+        "type": "hdrfilm",
+        "width": PIXELS,
+        "height": PIXELS,
+        "rfilter": {"type": "box"},
+    }
+    view = mi.ScalarTransform4f().look_at(
+        origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0]
+    )
     sensor = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
     light = {"type": "constant"}
     integrator = {"type": "prb", "max_depth": 2}
     scene = mi.load_dict(
-        {"type": "scene", "wall": wall, "sensor": sensor, "light": light, "integrator": integrator}, optimize=False
+        {
+            "type": "scene",
+            "wall": wall,
+            "sensor": sensor,
+            "light": light,
+            "integrator": integrator,
+        },
+        optimize=False,
     )
-    parameters, key = mi.traverse(scene), "wall.bsdf.reflectance.value"
+    parameters = mi.traverse(scene)
+    key = "wall.bsdf.reflectance.value"
     dr.enable_grad(parameters[key])
     image = mi.render(scene, parameters, spp=4, seed=0)
     dr.backward(dr.mean(image, axis=None))
-    brightness, slope = float(image.numpy().mean()), float(dr.sum(dr.grad(parameters[key])).numpy().sum())
+    brightness = float(image.numpy().mean())
+    slope = float(dr.sum(dr.grad(parameters[key])).numpy().sum())
     if not (abs(brightness - 0.5) < NOISE and abs(slope - 1.0) < 2 * NOISE):
-        raise ArithmeticError(f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}")
+        raise ArithmeticError(
+            f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}"
+        )
     version = ".".join(map(str, dr.detail.llvm_version()))
-    return f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM {version}, {dr.thread_count()} threads"
+    return (
+        f"{PIXELS} x {PIXELS} pixels and their gradient, {VARIANT}, LLVM "
+        f"{version}, "
+        f"{dr.thread_count()} threads"
+    )
 
 
 def probe_denoiser() -> str:
@@ -56,16 +88,31 @@ def probe_denoiser() -> str:
     import mitsuba_oidn
     import numpy as np
 
-    result = np.asarray(mitsuba_oidn.denoise(np.full((32, 32, 3), 0.5, np.float32), hdr=True))
+    result = np.asarray(
+        mitsuba_oidn.denoise(np.full((32, 32, 3), 0.5, np.float32), hdr=True)
+    )
     if result.shape != (32, 32, 3) or not np.allclose(result, 0.5, atol=0.05):
         raise ArithmeticError("a constant picture did not stay constant")
     return ""
 
 
-MODULES = {"imageio": "imageio.v3", "matplotlib": "matplotlib.figure", "pyarrow": "pyarrow.parquet"}
+MODULES = {
+    "imageio": "imageio.v3",
+    "matplotlib": "matplotlib.figure",
+    "pyarrow": "pyarrow.parquet",
+}
 """What is imported of a package, where it is not of its name."""
 
-PACKAGES = ("numpy", "torch", "OpenEXR", "imageio", "matplotlib", "cma", "pyarrow", "xatlas")
+PACKAGES = (
+    "numpy",
+    "torch",
+    "OpenEXR",
+    "imageio",
+    "matplotlib",
+    "cma",
+    "pyarrow",
+    "xatlas",
+)
 
 TRIALS: dict[str, Callable[[], str]] = {
     **{name: partial(imported, MODULES.get(name, name)) for name in PACKAGES},
@@ -83,7 +130,11 @@ def main() -> int:
             with contextlib.redirect_stdout(printed):
                 outcome = {"name": name, "ok": True, "detail": trial()}
         except Exception as error:
-            outcome = {"name": name, "ok": False, "detail": f"{type(error).__name__}: {error}"}
+            outcome = {
+                "name": name,
+                "ok": False,
+                "detail": f"{type(error).__name__}: {error}",
+            }
         print(json.dumps(outcome), flush=True)
     return 0
 

@@ -1,4 +1,6 @@
-"""`advsearch export`: a run's rows as a table for other programs, or what else comes out of it in another format."""
+"""`advsearch export`: a run's rows as a table for other programs, or what else comes
+out of it in another format.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,10 @@ OPTIONS = ("all", "size", "sheets", "paper", "icc")
 
 def _add_format(parser: argparse.ArgumentParser) -> None:
     lines = [f"{name}: {_begin_lower(EXPORTERS.get_help(name))}" for name in EXPORTERS]
-    text = f"csv, json or parquet: the rows as a table; {'; '.join(lines)} (default: by the name of --out, or csv)"
+    text = (
+        f"csv, json or parquet: the rows as a table; {'; '.join(lines)} (default: "
+        "by the name of --out, or csv)"
+    )
     parser.add_argument("--format", help=text.replace("%", "%%"))
 
 
@@ -34,23 +39,30 @@ def _begin_lower(sentence: str) -> str:
 @command(
     argument("run", metavar="RUN", help="a run's name or folder"),
     _add_format,
-    argument("--out", metavar="FILE", help="the file to write (default: standard output)"),
-    argument("--json", action="store_true", help="the same as --format json; with --out, tell what was written"),
-    argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)"),
+    argument("--out", metavar="FILE", help="the file to write (default: standard "
+                                           "output)"),
+    argument("--json", action="store_true", help="the same as --format json; with "
+                                                 "--out, tell what was written"),
+    argument("--kind", help="only rows of this kind: search, baseline, sweep, ... "
+                            "(default: all)"),
     argument(
         "--size", metavar="MM", type=float,
-        help="print: the real object's longest side in millimetres (default: its own where that is known, or 100)",
+        help="print: the real object's longest side in millimetres (default: its own "
+             "where that is known, or 100)",
     ),
     argument(
-        "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
+        "--sheets", metavar="N", type=int, help="print: sheets that may be written; "
+                                                "more are refused (default: 200)"
     ),
     argument("--paper", help="print: a4, a3 or letter (default: a4)"),
     argument(
         "--all", action="store_true", default=None,
-        help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
+        help="coco, yolo: right predictions too (default: pictures that a model is "
+             "wrong about)",
     ),
     output.add_code_flag,
-    argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)"),
+    argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer "
+                                           "(default: sRGB)"),
     examples=(
         "export mug-texture-001",
         "export runs/mug-texture-001 --kind search --out search.parquet",
@@ -63,16 +75,24 @@ def export(args: argparse.Namespace) -> int:
     usable = EXPORTERS.list_usable()
     suffixes = {table: table for table in FORMATS}
     for name, usable_exporter in usable.items():
-        suffixes.setdefault(usable_exporter.suffix or name, name)  # a package takes none of ours
+        # a package takes none of ours
+        suffixes.setdefault(usable_exporter.suffix or name, name)
     format = args.format or suffixes.get(by_name, by_name)
     if format == "fiftyone":
-        raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
+        raise InputError(
+            "--format: fiftyone was removed, since FiftyOne reads COCO; "
+            "use --format coco"
+        )
     if args.format and format not in (*EXPORTERS, *FORMATS):
         raise UnknownNameError("format", format, (*EXPORTERS, *FORMATS))
     for option in OPTIONS:
-        owners = [name for name, exporter in usable.items() if option in exporter.options]
+        owners = [
+            name for name, exporter in usable.items() if option in exporter.options
+        ]
         if format not in owners and getattr(args, option) is not None:
-            raise InputError(f"--{option}: belongs to --format {' and '.join(owners)}; leave it out")
+            raise InputError(
+                f"--{option}: belongs to --format {' and '.join(owners)}; leave it out"
+            )
     if format in FORMATS or format not in EXPORTERS:
         return _table(args, out, by_name)
     exporter = EXPORTERS[format]()
@@ -88,19 +108,33 @@ def export(args: argparse.Namespace) -> int:
 
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
+    otherwise = (
+        by_name
+        if by_name in FORMATS
+        else "json"
+        if args.json and out is None
+        else "csv"
+    )
     format = args.format or otherwise
     if args.json and out is None and format != "json":
-        raise InputError(f"--json: prints JSON, but --format asks for {format}; leave one of them out")
+        raise InputError(
+            f"--json: prints JSON, but --format asks for {format}; leave "
+            "one of them out"
+        )
     if out is not None and os.path.isdir(out):
         raise InputError(f"--out: expected the name of a file, got the folder {out}")
     folder = find_run(args.run)
     if (folder / PARTS).is_dir():
         parts = ", ".join(map(str, sorted((folder / PARTS).iterdir())))
-        raise InputError(f"{folder}: is a study, whose rows are those of its parts; export one of {parts}")
+        raise InputError(
+            f"{folder}: is a study, whose rows are those of its parts; "
+            f"export one of {parts}"
+        )
     on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
     with Store(folder / NAME, read_only=True) as store, output_errors():
-        count = write_rows(store, format, out, on_screen or sys.stdout.buffer, args.kind)
+        count = write_rows(
+            store, format, out, on_screen or sys.stdout.buffer, args.kind
+        )
     if on_screen is not None:
         print(on_screen.getvalue().decode("utf-8", "replace"), end="")
     if out is None:

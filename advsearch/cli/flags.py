@@ -1,6 +1,8 @@
-"""Flags made from the settings of a command, and a configuration made from flags or from a file.
+"""Flags made from the settings of a command, and a configuration made from flags or
+from a file.
 
-Values are texts, which the configuration reads: a wrong one is reported in one way wherever it came from.
+Values are texts, which the configuration reads: a wrong one is reported in one way
+wherever it came from.
 """
 
 from __future__ import annotations
@@ -18,24 +20,35 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.settings import Config, Setting, read_yaml, settings, split_names
 from advsearch.trust.code import allow_named
 
-_NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
+_NO_SETTINGS = {
+    "code": "--code",
+    "sheets": "--sheets",
+    "paper": "--paper",
+    "size": "--size",
+}
 """Flags which messages name too and which are no setting of a configuration."""
 
 SCENE = (
-    "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or shapes by name, and the rest its "
+    "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or "
+    "shapes by name, and the rest its "
     "surroundings (the same as --object FILE#NAME)"
 )
 
-IN_A_FILE = tuple(name for name in CONFIGS if name != "render")  # what the `command` of a file may say
+# what the `command` of a file may say
+IN_A_FILE = tuple(name for name in CONFIGS if name != "render")
 MOST_NAMES = 50  # names of what is in a scene that one message lists
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 
 def add_settings(
-    parser: argparse.ArgumentParser, config: type[Config] = AttackConfig, only: Collection[str] = ()
+    parser: argparse.ArgumentParser,
+    config: type[Config] = AttackConfig,
+    only: Collection[str] = (),
 ) -> None:
-    """Add a flag for each setting of a configuration, or for some of them, under the headings of their groups."""
+    """Add a flag for each setting of a configuration, or for some of them, under the
+    headings of their groups.
+    """
     headings: dict[str, argparse._ArgumentGroup] = {}
     for setting in settings(config):
         if only and setting.field not in only:
@@ -45,50 +58,78 @@ def add_settings(
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             add("--scene", metavar="FILE", help=SCENE)
-        options: dict[str, Any] = {"action": "append" if setting.repeats else "store", "metavar": setting.metavar}
+        options: dict[str, Any] = {
+            "action": "append" if setting.repeats else "store",
+            "metavar": setting.metavar,
+        }
         if setting.is_switch:
             options = {"action": "store_const", "const": not setting.default}
         add(setting.flag, dest=setting.field, help=help_text(setting), **options)
 
 
-def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
-    """Return the configuration of a kind that the flags describe, with values for settings that were not given. Raises
-    InputError where a value is not allowed."""
-    typed = {setting.field: getattr(args, setting.field) for setting in settings(config) if setting.field in args}
+def config_from(
+    args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any
+) -> AnyConfig:
+    """Return the configuration of a kind that the flags describe, with values for
+    settings that were not given. Raises InputError where a value is not allowed.
+    """
+    typed = {
+        setting.field: getattr(args, setting.field)
+        for setting in settings(config)
+        if setting.field in args
+    }
     data = {**otherwise, **typed}
     if "scene" in args and data.get("object") is None:
-        raise InputError(f"object: expected something in {args.scene}, got nothing; name one of {_inside(args.scene)}")
+        raise InputError(
+            f"object: expected something in {args.scene}, got nothing; "
+            f"name one of {_inside(args.scene)}"
+        )
     if "scene" in args and isinstance(data.get("object"), str):
-        data["object"] = ",".join(f"{args.scene}#{name}" for name in split_names(data["object"]))
+        data["object"] = ",".join(
+            f"{args.scene}#{name}" for name in split_names(data["object"])
+        )
     read = config(**data)
     allow_named({name: getattr(read, name) for name in typed})
     return read
 
 
 def command_in(file: str | Path) -> str:
-    """Return the command that a file is for. Raises FileFormatError where it is not a file with settings."""
+    """Return the command that a file is for. Raises FileFormatError where it is not a
+    file with settings.
+    """
     return str(read_yaml(file).get("command", "attack"))
 
 
-def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
-    """Return the configuration that a file describes, `changes` put over it. Raises UnknownNameError where there is no
-    such command."""
+def config_of_file(
+    command: str, file: str | Path, changes: Mapping[str, object]
+) -> Config:
+    """Return the configuration that a file describes, `changes` put over it. Raises
+    UnknownNameError where there is no such command.
+    """
     if command not in IN_A_FILE:
         raise UnknownNameError("command", command, IN_A_FILE, f"It stands in {file}.")
     return CONFIGS[command].from_yaml(file, changes)
 
 
 def _inside(scene: str) -> str:
-    from advsearch.scene.importing.files import shown  # late: another thing has this name here
+    # late: another thing has this name here
+    from advsearch.scene.importing.files import shown
 
     # late, so that --help answers at once
     from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
     from advsearch.scene.mitsuba_backend.scene_files import contents
 
     path = Path(scene)
-    names = contents(path).objects if path.suffix.lower() == MITSUBA_FILE else node_names(path)
+    names = (
+        contents(path).objects
+        if path.suffix.lower() == MITSUBA_FILE
+        else node_names(path)
+    )
     if not names:
-        raise InputError(f"--scene: {path} has nothing that can be the object; expected a shape or a node with a mesh")
+        raise InputError(
+            f"--scene: {path} has nothing that can be the object; "
+            "expected a shape or a node with a mesh"
+        )
     more = f" or {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
     return ", ".join(shown(name, quoted=False) for name in names[:MOST_NAMES]) + more
 
@@ -96,24 +137,35 @@ def _inside(scene: str) -> str:
 def with_flags(message: str) -> str:
     """Return an error's message with the flags of the settings that it names.
 
-    Messages name a setting as Python and YAML do: before a colon at their beginning, or else in backticks, with a value
-    or without. ``epsilon: ...; lower `steps` or use `denoise=none` `` becomes
-    ``--epsilon: ...; lower --steps or use --denoise none``.
+    Messages name a setting as Python and YAML do: before a colon at their beginning, or
+    else in backticks, with a value or without. ``epsilon: ...; lower `steps` or use
+    `denoise=none` `` becomes ``--epsilon: ...; lower --steps or use --denoise none``.
     """
     known = [setting for config in CONFIGS.values() for setting in settings(config)]
     flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}
     switches = {setting.name for setting in known if setting.is_switch}
 
     def written(match: re.Match[str]) -> str:
-        name, value = match["name"], match["value"]
-        return flags[name] if value is None or name in switches else f"{flags[name]} {value}"
+        name = match["name"]
+        value = match["value"]
+        return (
+            flags[name]
+            if value is None or name in switches
+            else f"{flags[name]} {value}"
+        )
 
     names = f"(?P<name>{'|'.join(flags)})"
     message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", written, message)
-    return re.sub(rf"(?P<before>^|; ){names}(?=: )", lambda match: match["before"] + flags[match["name"]], message)
+    return re.sub(
+        rf"(?P<before>^|; ){names}(?=: )",
+        lambda match: match["before"] + flags[match["name"]],
+        message,
+    )
 
 
 def help_text(setting: Setting) -> str:
     """Return what the help says of a setting; of a switch, what its flag does."""
-    text = setting.switched or setting.description if setting.is_switch else setting.text
+    text = (
+        setting.switched or setting.description if setting.is_switch else setting.text
+    )
     return text.replace("%", "%%")

@@ -1,4 +1,6 @@
-"""`advsearch import`: what is understood of a mesh or scene file, before anything is searched; and `import-3db`."""
+"""`advsearch import`: what is understood of a mesh or scene file, before anything is
+searched; and `import-3db`.
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,39 @@ from advsearch.runs.summary import read_result
 if TYPE_CHECKING:
     from advsearch.scene.importing.scenes import Contents
 
-VIEWS, SIDE = 4, 192  # views of the picture, and the side of each in pixels
-Understood = tuple[dict[str, Any], list[str]]  # what is understood of a file, as JSON and in lines
+VIEWS = 4  # views of the picture, and the side of each in pixels
+SIDE = 192
+# what is understood of a file, as JSON and in lines
+Understood = tuple[dict[str, Any], list[str]]
 
 
 @command(
-    argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba"),
-    argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)"),
+    argument(
+        "file",
+        metavar="FILE",
+        help=f"a {either(MESHES)} file, or an .xml file of Mitsuba",
+    ),
+    argument(
+        "--out",
+        metavar="FILE",
+        help="a picture of all that is in it, from four sides (.png)",
+    ),
     output.add_flags,
     more=". Nothing is written but the picture",
-    examples=("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
+    examples=(
+        "import mug.obj",
+        "import room.glb --json",
+        "import room.glb --out room.png",
+        "import box.xml --json",
+    ),
 )
 def file(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
-        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents  # late: another thing has this name here
+        # late: another thing has this name here
+        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
 
         if Path(args.file).suffix.lower() == MITSUBA_FILE:
             facts, lines = _mitsuba_file(args.file, out)
@@ -41,48 +59,82 @@ def file(args: argparse.Namespace) -> int:
             inside = contents(Path(args.file))
             facts, lines = _mesh_file(args.file, inside)
             if out is not None:
-                advsearch.render(advsearch.load_scene(inside.object), around=VIEWS, resolution=SIDE).save(out)
+                advsearch.render(
+                    advsearch.load_scene(inside.object), around=VIEWS, resolution=SIDE
+                ).save(out)
     facts = {"command": "import", "file": args.file, **facts, "out": args.out}
     return output.say(args.json, facts, "\n".join(lines))
 
 
 def _mesh_file(file: str, inside: Contents) -> Understood:
-    whole, nodes, rig = inside.object, inside.nodes, inside.object.mesh.rig
+    whole = inside.object
+    nodes = inside.nodes
+    rig = inside.object.mesh.rig
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
     up = None if whole.up is None else whole.up.axis
     front = None if whole.front is None else whole.front.axis
-    clips, moved = (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
+    clips, moved = (
+        (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
+    )
     joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
-    targets = [name.removesuffix(".weight") for name in moved if name.endswith(".weight")]
-    features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
+    targets = [
+        name.removesuffix(".weight") for name in moved if name.endswith(".weight")
+    ]
+    features = {
+        "what it lets light through": whole.opacity,
+        "its normal map": whole.normal_map,
+    }
     features["its emission"] = whole.emission
     held = [name for name, feature in features.items() if feature is not None]
     slow = held and [
-        f"slow: for {either(held, 'and')}, controls that move outlines (pose, camera, geometry) are differentiated by "
-        "differences, which takes several renders a step; textures and light are not slower"
+        f"slow: for {either(held, 'and')}, controls that move outlines (pose, camera, "
+        "geometry) are differentiated by "
+        "differences, which takes several renders a step; textures and light are not "
+        "slower"
     ]
     facts = {
         "triangles": len(whole.mesh.faces),
         "texture": [width, height],
         "up": up,
         "front": front,
-        "materials": [{"name": name, "triangles": count} for name, count in materials.items()],
-        "nodes": [{"name": n.name, "mesh": n.mesh, "triangles": n.triangles, "size": list(n.size)} for n in nodes],
+        "materials": [
+            {"name": name, "triangles": count} for name, count in materials.items()
+        ],
+        "nodes": [
+            {
+                "name": n.name,
+                "mesh": n.mesh,
+                "triangles": n.triangles,
+                "size": list(n.size),
+            }
+            for n in nodes
+        ],
         "lights": list(inside.lights),
         "cameras": list(inside.cameras),
         **{"clips": clips, "joints": joints, "targets": targets},
         "slow": slow,
         "warnings": list(whole.warnings),
     }
-    lines = [f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x {height}, {up} up, front {front}"]
+    lines = [
+        f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x "
+        f"{height}, {up} up, front {front}"
+    ]
     if nodes:
         sizes = [" x ".join(f"{side:.3g}" for side in node.size) for node in nodes]
-        rows = [[n.name, n.mesh, f"{n.triangles:,} triangles", size] for n, size in zip(nodes, sizes, strict=True)]
+        rows = [
+            [n.name, n.mesh, f"{n.triangles:,} triangles", size]
+            for n, size in zip(nodes, sizes, strict=True)
+        ]
         lines.append(output.aligned([["node", "in controls", "", "size"], *rows]))
-        lines.append(f"One of them as the object, the rest around it: --object '{file}#{nodes[-1].name}'")
+        lines.append(
+            "One of them as the object, the rest around it: --object "
+            f"'{file}#{nodes[-1].name}'"
+        )
         if len(nodes) > 1:
-            lines.append(f"Another one moves with it: --control pose,pose:{nodes[0].mesh}")
+            lines.append(
+                f"Another one moves with it: --control pose,pose:{nodes[0].mesh}"
+            )
     listed = {
         "materials (--control 'texture={materials: [NAME]}')": materials,
         "lights": inside.lights,
@@ -96,32 +148,46 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
 
 
 def _mitsuba_file(file: str, out: Path | None) -> Understood:
-    from advsearch.scene.mitsuba_backend.scene_files import contents  # late: another thing has this name here
+    # late: another thing has this name here
+    from advsearch.scene.mitsuba_backend.scene_files import contents
 
     inside = contents(Path(file))
     warnings: tuple[str, ...] = ()
     if inside.objects:
-        plain = next((name for name in inside.objects if name not in inside.lights), inside.objects[0])
+        plain = next(
+            (name for name in inside.objects if name not in inside.lights),
+            inside.objects[0],
+        )
         scene = advsearch.load_scene(plain, scene=file)
         warnings = scene.description.object.warnings
         if out is not None:
             advsearch.render(scene, resolution=2 * SIDE).save(out)
     elif out is not None:
-        raise InputError(f"{file}: no shape of it can be the object, so that it cannot be pictured; leave --out out")
+        raise InputError(
+            f"{file}: no shape of it can be the object, so that it cannot "
+            "be pictured; leave --out out"
+        )
     kept = dict(inside.kept)
-    listed = {"objects": list(inside.objects), "kept": [f"{name} ({why})" for name, why in kept.items()]}
+    listed = {
+        "objects": list(inside.objects),
+        "kept": [f"{name} ({why})" for name, why in kept.items()],
+    }
     listed |= {"lights": list(inside.lights), "cameras": list(inside.cameras)}
     lines = [f"{file}: a Mitsuba scene"]
     lines += [f"{what}: {', '.join(names)}" for what, names in listed.items() if names]
     if inside.objects:
-        lines.append(f"One of them as the object, the rest around it: --scene {file} --object {inside.objects[-1]}")
+        lines.append(
+            f"One of them as the object, the rest around it: --scene {file} "
+            f"--object {inside.objects[-1]}"
+        )
     lines += [f"Note: {warning}" for warning in warnings]
     return {**listed, "kept": kept, "warnings": list(warnings)}, lines
 
 
 def _describe(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
+        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small "
+        "pictures, a page."
     )
 
 

@@ -1,6 +1,8 @@
-"""`advsearch`: run the command that is asked for, and turn what goes wrong into a message and an exit status.
+"""`advsearch`: run the command that is asked for, and turn what goes wrong into a
+message and an exit status.
 
-Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell short, 130 interrupted.
+Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell
+short, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -19,10 +21,29 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from advsearch.catalog import is_present
 from advsearch.cli import output
-from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
-from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
+from advsearch.cli.output import (
+    BAD_INPUT,
+    INTERRUPTED,
+    OK,
+    at_work,
+    end_output,
+    open_descriptors,
+    screens,
+    shortened,
+)
+from advsearch.errors import (
+    AdvsearchError,
+    CodeNotAllowedError,
+    InputError,
+    UnknownNameError,
+)
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import EXPERIMENTS, get_experiment, get_experiment_help, imported
+from advsearch.registry import (
+    EXPERIMENTS,
+    get_experiment,
+    get_experiment_help,
+    imported,
+)
 from advsearch.trust.code import allow_code, nothing_allowed
 from advsearch.version import __version__
 
@@ -33,8 +54,9 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------------------------------------------------------------
 # The commands: what the help lists, and what carries each out.
 #
-# An experiment's command is made from it (`advsearch.experiment.Experiment`). Others are functions of this package made
-# a `command`, imported when they are used, so that `advsearch --help` answers at once.
+# An experiment's command is made from it (`advsearch.experiment.Experiment`). Others
+# are functions of this package made a `command`, imported when they are used, so that
+# `advsearch --help` answers at once.
 
 Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a parser
 
@@ -48,8 +70,10 @@ def argument(*names: str, **options: Any) -> Argument:
 class PlainCommand:
     """A command that runs no experiment."""
 
-    run: Callable[[argparse.Namespace], int]  # does what the arguments say, and returns the exit status
-    arguments: tuple[Argument, ...]  # what adds them, in the order in which the help shows them
+    # does what the arguments say, and returns the exit status
+    run: Callable[[argparse.Namespace], int]
+    # what adds them, in the order in which the help shows them
+    arguments: tuple[Argument, ...]
     more: str = ""  # what its help says after what it does
     examples: tuple[str, ...] = ()  # lines of a shell, without `advsearch`
 
@@ -67,7 +91,9 @@ def command(
 
 @dataclass(frozen=True)
 class ExperimentCommand:
-    """The command of an experiment. `--code` allows Python code that the run or file which it is about names."""
+    """The command of an experiment. `--code` allows Python code that the run or file
+    which it is about names.
+    """
 
     experiment: Experiment[Any]
 
@@ -102,28 +128,39 @@ class ExperimentCommand:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Run the experiment that the arguments describe. Raises InputError where what it is about is missing."""
+        """Run the experiment that the arguments describe. Raises InputError where what
+        it is about is missing.
+        """
         about = self.experiment.about
         subject = getattr(args, about, None)
         if self.experiment.choices and subject == "list":
             lines = imported(self.experiment.choices)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
-            return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
+            return output.say(
+                args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()])
+            )
         if self.experiment.positional and subject in (None, []):
             command = f"advsearch {self.name}"
-            raise InputError(f"{command}: expected {self.experiment.positional.expected}; see {command} --help")
+            raise InputError(
+                f"{command}: expected {self.experiment.positional.expected}; see {command} --help"
+            )
         if isinstance(subject, list):
             setattr(args, about, ",".join(subject))
-        return self.run_config(self.read_config(args), as_json=args.json, quiet=args.quiet)
+        return self.run_config(
+            self.read_config(args), as_json=args.json, quiet=args.quiet
+        )
 
     def read_config(self, args: argparse.Namespace) -> Config:
-        """Return the settings that the arguments describe, over those of the first run that it is about."""
+        """Return the settings that the arguments describe, over those of the first run
+        that it is about.
+        """
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
         from advsearch.runs.directory import CONFIG, find_run
         from advsearch.settings import settings, split_names
 
-        config_type, about = self.experiment.settings, self.experiment.about
+        config_type = self.experiment.settings
+        about = self.experiment.about
         read_defaults = self.experiment.defaults_from_run
         if read_defaults is None:
             return config_from(args, config_type)
@@ -131,20 +168,40 @@ class ExperimentCommand:
             run_name = getattr(args, about)
             if self.experiment.positional and self.experiment.positional.many:
                 run_name = next(iter(split_names(run_name)), run_name)
-            return config_from(args, config_type, **read_defaults(find_run(run_name) / CONFIG, vars(args)))
-        missing = [one.flag for one in settings(config_type) if one.required and one.field not in args]
+            return config_from(
+                args,
+                config_type,
+                **read_defaults(find_run(run_name) / CONFIG, vars(args)),
+            )
+        missing = [
+            one.flag
+            for one in settings(config_type)
+            if one.required and one.field not in args
+        ]
         if missing:
-            command, run_flag = f"advsearch {self.name}", f"--{about.replace('_', '-')} RUN"
-            raise InputError(f"{command}: expected {missing[0]} NAME, or {run_flag}; see {command} --help")
+            command = f"advsearch {self.name}"
+            run_flag = f"--{about.replace('_', '-')} RUN"
+            raise InputError(
+                f"{command}: expected {missing[0]} NAME, or {run_flag}; "
+                f"see {command} --help"
+            )
         return config_from(args, config_type)
 
-    def run_config(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-        """Run the experiment with settings, or continue a run; print the result and return the exit status."""
+    def run_config(
+        self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None
+    ) -> int:
+        """Run the experiment with settings, or continue a run; print the result and
+        return the exit status.
+        """
         with at_work(as_json=as_json, quiet=quiet) as progress:
             from advsearch import experiment  # late, so that --help answers at once
 
-            result = experiment.run_experiment(config, progress=progress, resumed=resumed)
-        return output.finish(result, as_json=as_json) or self.experiment.exit_status(result)
+            result = experiment.run_experiment(
+                config, progress=progress, resumed=resumed
+            )
+        return output.finish(result, as_json=as_json) or self.experiment.exit_status(
+            result
+        )
 
 
 GROUPS = {
@@ -153,56 +210,82 @@ GROUPS = {
     ),
     "look: at scenes, names and predictions": {
         "render": "",
-        "show": "show:show show what a run found, or the details of a control, a policy, a task or a recipe",
-        "view": "dashboard:view write the page of a run again, or a folder that any web server can serve",
-        "dashboard": "dashboard:dashboard show the pages of runs in a browser on this machine",
-        "report": "report:report write what runs show, and no more than that, for a model card or a safety case",
-        "list": "show:list_all list all names: objects, environments, controls, policies, tasks, objectives, models "
+        "show": "show:show show what a run found, or the details of a control, a "
+        "policy, a task or a recipe",
+        "view": "dashboard:view write the page of a run again, or a folder that any "
+        "web server can serve",
+        "dashboard": "dashboard:dashboard show the pages of runs in a browser on this "
+        "machine",
+        "report": "report:report write what runs show, and no more than that, for a "
+        "model card or a safety case",
+        "list": "show:list_all list all names: objects, environments, controls, "
+        "policies, tasks, objectives, models "
         "and recipes",
-        "labels": "show:labels find the names of a model's classes, as --label takes them",
+        "labels": "show:labels find the names of a model's classes, as --label takes "
+        "them",
     },
     "trust: does a result hold, and is the tool right?": {
         **dict.fromkeys(("test", "replay", "check", "precision", "stability"), ""),
-        "doctor": "doctor:doctor check every part that a run needs, with versions and how to mend it",
+        "doctor": "doctor:doctor check every part that a run needs, with versions and "
+        "how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {
         "run": "run:run do what a YAML file describes; the run.yaml of a run repeats it",
         "resume": "run:resume continue a run that was stopped, from where it stopped",
         "runs": "run:runs list the runs in a folder and how each ended",
-        "export": "export:export export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an "
+        "export": "export:export export a run: its rows as a table, a texture for "
+        "printing, a scene for Mitsuba or an "
         "object as glTF",
-        "import": "imports:file show what advsearch reads from a mesh or scene file, as text or as a picture",
+        "import": "imports:file show what advsearch reads from a mesh or scene file, "
+        "as text or as a picture",
         "completion": "completion:completion "
-        "print a script with which Tab finishes commands, flags and names in bash, zsh or tcsh",
+        "print a script with which Tab finishes commands, flags and names in bash, zsh "
+        "or tcsh",
         "import-3db": "imports:threedb turn a folder that 3DB wrote into a run",
     },
 }
-"""Each command, in the groups and the order of the help: empty for an experiment; for another command its module in
-this package, its function there and what it does."""
+"""Each command, in the groups and the order of the help: empty for an experiment; for
+another command its module in this package, its function there and what it does.
+"""
 
-COMMANDS_OF_THIS_PACKAGE = {name: target for group in GROUPS.values() for name, target in group.items() if target}
+COMMANDS_OF_THIS_PACKAGE = {
+    name: target
+    for group in GROUPS.values()
+    for name, target in group.items()
+    if target
+}
 
 
 def list_commands() -> list[str]:
-    """Return the names of all commands in the order of the help; experiments of packages follow the built-in ones."""
+    """Return the names of all commands in the order of the help; experiments of
+    packages follow the built-in ones.
+    """
     groups = group_commands()
     return [name for group in groups.values() for name in group]
 
 
 def group_commands() -> dict[str, list[str]]:
-    """Return the names of the commands by the heading that the help has for them, without those that are missing."""
+    """Return the names of the commands by the heading that the help has for them,
+    without those that are missing.
+    """
     groups = {
         title: [name for name, target in group.items() if _is_available(name, target)]
         for title, group in GROUPS.items()
     }
     known = {name for group in groups.values() for name in group}
-    next(iter(groups.values())).extend(name for name in EXPERIMENTS if name not in known)
+    next(iter(groups.values())).extend(
+        name for name in EXPERIMENTS if name not in known
+    )
     return groups
 
 
 def _is_available(name: str, target: str) -> bool:
     """Return whether the module of a command is there; `target` as in `GROUPS`."""
-    return is_present(f"advsearch.cli.{target.partition(':')[0]}") if target else name in EXPERIMENTS
+    return (
+        is_present(f"advsearch.cli.{target.partition(':')[0]}")
+        if target
+        else name in EXPERIMENTS
+    )
 
 
 def get_command(name: str) -> ExperimentCommand | PlainCommand:
@@ -234,7 +317,9 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status. An exception that is a bug of ours passes through."""
+    """Run one command and return its exit status. An exception that is a bug of ours
+    passes through.
+    """
     if argv is None:  # this process is ours
         open_descriptors()
     with screens(), nothing_allowed():
@@ -246,7 +331,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _interruptible(words: list[str]) -> int:
-    """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
+    """As `_status`, with Ctrl-C for as long as there is something to interrupt, and
+    never a traceback of it.
+    """
     sys.unraisablehook = unless_interrupted
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
@@ -262,11 +349,13 @@ def _interruptible(words: list[str]) -> int:
 def _status(words: list[str]) -> int:
     try:
         status = _run_and_tell(words)
-        if status != INTERRUPTED and INTERRUPTS.count:  # whatever has swallowed one: it was asked to stop
+        # whatever has swallowed one: it was asked to stop
+        if status != INTERRUPTED and INTERRUPTS.count:
             raise KeyboardInterrupt
         return status
     except BaseException as error:
-        # Modules that are being imported, and native code, make other errors of an interrupt.
+        # Modules that are being imported, and native code, make other errors of an
+        # interrupt.
         if not INTERRUPTS.count and not isinstance(error, KeyboardInterrupt):
             raise
         print("advsearch: interrupted", file=sys.stderr)
@@ -279,9 +368,11 @@ def _run_and_tell(words: list[str]) -> int:
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
-        from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+        # late, so that --help answers at once
+        from advsearch.cli.flags import with_flags
 
-        asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))  # no file may name its own code
+        # no file may name its own code
+        asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
         in_a_file = words[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
         print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
@@ -293,9 +384,14 @@ def _run_and_tell(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":
-        raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
+        raise InputError(
+            "`plan` is a part of `check` now: use advsearch check --loss "
+            "model, with the same flags"
+        )
     if name is not None and name not in list_commands():
-        raise UnknownNameError("command", name, list_commands(), "See advsearch --help.")
+        raise UnknownNameError(
+            "command", name, list_commands(), "See advsearch --help."
+        )
     try:
         args = _parse(words, name)
     except SystemExit as stop:  # --help and --version have printed their text
@@ -310,7 +406,9 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
         add_command(subparsers, name, whole=name == command)
     args, unknown = parser.parse_known_args(_join_negative_axis(words))
     if unknown:
-        raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
+        raise _unknown_argument(
+            unknown[0], subparsers.choices[args.command] if args.command else parser
+        )
     if args.command is None:
         parser.print_help()
         parser.exit()
@@ -328,7 +426,9 @@ def _join_negative_axis(words: list[str]) -> list[str]:
     return joined
 
 
-def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:
+def without_commands() -> tuple[
+    argparse.ArgumentParser, argparse._SubParsersAction[Any]
+]:
     """Return the parser, and what `add_command` adds the commands to."""
     groups = group_commands()
     column = 4 + max(len(name) for group in groups.values() for name in group)
@@ -336,7 +436,14 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
     lines = []
     for title, names in groups.items():
         texts = [f"  {name}".ljust(column) + get_command_help(name) for name in names]
-        lines += [title, *(textwrap.fill(text, width, subsequent_indent=" " * column) for text in texts), ""]
+        lines += [
+            title,
+            *(
+                textwrap.fill(text, width, subsequent_indent=" " * column)
+                for text in texts
+            ),
+            "",
+        ]
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
@@ -344,7 +451,9 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"advsearch {__version__}")
+    parser.add_argument(
+        "--version", action="version", version=f"advsearch {__version__}"
+    )
     subparsers = parser.add_subparsers(
         dest="command",
         metavar="COMMAND",
@@ -358,17 +467,22 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
 def add_command(
     subparsers: argparse._SubParsersAction[Any], name: str, *, whole: bool = True
 ) -> argparse.ArgumentParser:
-    """Return the new parser of a command; if not `whole` it has no arguments, and serves the list of commands."""
+    """Return the new parser of a command; if not `whole` it has no arguments, and
+    serves the list of commands.
+    """
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
-    command, text = get_command(name), get_command_help(name)
+    command = get_command(name)
+    text = get_command_help(name)
     examples = "".join(f"  advsearch {line}\n" for line in command.examples)
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         help=text,
         description=f"{text[0].upper()}{text[1:]}{command.more}.",
         epilog=f"examples:\n{examples}" if examples else None,
-        formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
+        formatter_class=argparse.RawDescriptionHelpFormatter
+        if examples
+        else argparse.HelpFormatter,
         allow_abbrev=False,
     )
     command.add_arguments(parser)
@@ -384,15 +498,32 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     name = argument.partition("=")[0]
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
-        hint = f"; for the object write --object {argument}" if "--object" in known else ""
-        return InputError(f"expected flags, got {argument!r}{hint}; see {parser.prog} --help")
-    owners = [owner for owner, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
+        hint = (
+            f"; for the object write --object {argument}" if "--object" in known else ""
+        )
+        return InputError(
+            f"expected flags, got {argument!r}{hint}; see {parser.prog} --help"
+        )
+    owners = [
+        owner
+        for owner, config in CONFIGS.items()
+        if name in (setting.flag for setting in settings(config))
+    ]
     if owners:
-        return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")
+        return InputError(
+            f"{parser.prog} has no {name}, a flag of advsearch "
+            f"{', '.join(owners)}; leave it out"
+        )
     meant, reason = meant_by(name[2:].replace("-", "_"), [flag[2:] for flag in known])
     if meant or reason:
-        hint = f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?" if meant else ""
-        return InputError(f"{parser.prog} has no {name}{hint}{f' ({reason})' if reason else ''}")
+        hint = (
+            f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?"
+            if meant
+            else ""
+        )
+        return InputError(
+            f"{parser.prog} has no {name}{hint}{f' ({reason})' if reason else ''}"
+        )
     return UnknownNameError("flag", name, set(known))
 
 

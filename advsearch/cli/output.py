@@ -1,8 +1,11 @@
-"""What every command prints with: JSON alone on standard output, messages and progress on standard error.
+"""What every command prints with: JSON alone on standard output, messages and progress
+on standard error.
 
-What is printed holds names that others chose: of files, labels, objects, runs. Here is the one place where the control
-characters in them, which could steer a terminal or forge a line, become readable escapes; and where a full disk behind
-standard output becomes a message. Progress is bars on a terminal, and a plain line now and then elsewhere.
+What is printed holds names that others chose: of files, labels, objects, runs. Here is
+the one place where the control characters in them, which could steer a terminal or
+forge a line, become readable escapes; and where a full disk behind standard output
+becomes a message. Progress is bars on a terminal, and a plain line now and then
+elsewhere.
 """
 
 from __future__ import annotations
@@ -26,23 +29,31 @@ if TYPE_CHECKING:
     from advsearch.runs.results import Result
 
 
-OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
-"""Exit statuses of a command that did its work, was given what it cannot take, and was interrupted."""
+OK = 0
+BAD_INPUT = 2
+INTERRUPTED = 130
+"""Exit statuses of a command that did its work, was given what it cannot take, and was
+interrupted.
+"""
 
-LONGEST_WORD = 300  # most characters of a name in a message; of a longer one the ends are shown
+# most characters of a name in a message; of a longer one the ends are shown
+LONGEST_WORD = 300
 
 
 def shortened(text: str) -> str:
     """Return a message with the middle of its overlong words left out."""
     return " ".join(
-        word if len(word) <= LONGEST_WORD else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
+        word
+        if len(word) <= LONGEST_WORD
+        else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
         for word in text.split(" ")
     )
 
 
 class Screen:
-    """A text stream that prints text `escaped`. All but writing is the stream's own. Unless it is `needed`, what cannot
-    be written is dropped."""
+    """A text stream that prints text `escaped`. All but writing is the stream's own.
+    Unless it is `needed`, what cannot be written is dropped.
+    """
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
         self.stream = stream
@@ -63,21 +74,28 @@ class Screen:
 
 @contextmanager
 def output_errors() -> Iterator[None]:
-    """Turn what goes wrong with standard output inside the block into a message. Raises StorageError: it could not be
-    written, for another reason than that nobody reads any more; BrokenPipeError: nobody reads any more."""
+    """Turn what goes wrong with standard output inside the block into a message. Raises
+    StorageError: it could not be written, for another reason than that nobody reads any
+    more; BrokenPipeError: nobody reads any more.
+    """
     try:
         yield
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise StorageError(f"cannot write to standard output: {error.strerror or error}") from None
+        raise StorageError(
+            f"cannot write to standard output: {error.strerror or error}"
+        ) from None
 
 
 @contextmanager
 def screens() -> Iterator[None]:
     """Let everything that is printed inside the block go through a `Screen`."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = _screen(before[0], needed=True), _screen(before[1], needed=False)
+    sys.stdout, sys.stderr = (
+        _screen(before[0], needed=True),
+        _screen(before[1], needed=False),
+    )
     try:
         yield
     finally:
@@ -85,12 +103,16 @@ def screens() -> Iterator[None]:
 
 
 def raw(stream: IO[str]) -> IO[str]:
-    """Return the stream behind a `Screen`, for what draws on a terminal and escapes names itself."""
+    """Return the stream behind a `Screen`, for what draws on a terminal and escapes
+    names itself.
+    """
     return stream.stream if isinstance(stream, Screen) else stream
 
 
 def open_descriptors() -> None:
-    """Point standard streams that were closed at nothing, or the next file that is opened would be one of them."""
+    """Point standard streams that were closed at nothing, or the next file that is
+    opened would be one of them.
+    """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -99,7 +121,9 @@ def open_descriptors() -> None:
 
 
 def end_output() -> None:
-    """Write out what is left; where that fails, drop it, so that the interpreter's own end does not complain."""
+    """Write out what is left; where that fails, drop it, so that the interpreter's own
+    end does not complain.
+    """
     try:
         sys.stdout.flush()
     except (OSError, ValueError, StorageError):
@@ -108,31 +132,49 @@ def end_output() -> None:
 
 
 def _screen(stream: Any, *, needed: bool) -> TextIO:
-    if not isinstance(stream, Screen):  # Python has none where the descriptor was closed
-        stream = Screen(open(os.devnull, "w", encoding="utf-8") if stream is None else stream, needed=needed)
+    # Python has none where the descriptor was closed
+    if not isinstance(stream, Screen):
+        stream = Screen(
+            open(os.devnull, "w", encoding="utf-8") if stream is None else stream,
+            needed=needed,
+        )
     return cast(TextIO, stream)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print one JSON value on standard output")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON value on standard output"
+    )
 
 
 def add_code_flag(parser: argparse.ArgumentParser) -> None:
     """Add ``--code``, for commands that carry out the settings of a file."""
-    text = "Python code that a file or a run names and that may be imported, as it stands there; may be repeated"
-    parser.add_argument("--code", action="append", default=[], metavar="MODULE:NAME", help=text)
+    text = (
+        "Python code that a file or a run names and that may be imported, as it "
+        "stands there; may be repeated"
+    )
+    parser.add_argument(
+        "--code", action="append", default=[], metavar="MODULE:NAME", help=text
+    )
 
 
 def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
     """Add ``--json`` and ``--quiet``, for commands that take their time."""
     add_flags(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
+    parser.add_argument(
+        "--quiet",
+        action="store_true",
+        help="no progress and no messages on standard error",
+    )
 
 
-def say(as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None) -> int:
-    """Print what a command has to say: facts as JSON, or a text, on standard output or another stream. Return the exit
-    status of a command that did its work."""
+def say(
+    as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None
+) -> int:
+    """Print what a command has to say: facts as JSON, or a text, on standard output or
+    another stream. Return the exit status of a command that did its work.
+    """
     if as_json:
         print_json({"schema": 1, **facts})
     else:
@@ -145,8 +187,12 @@ def print_json(value: Any) -> None:
     from advsearch.runs.results import plain  # late, so that --help answers at once
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
-    text = "".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text)
-    print(text.replace("\x7f", "\\u007f"))  # JSON escapes all others that a terminal would not show
+    text = "".join(
+        sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1]
+        for sign in text
+    )
+    # JSON escapes all others that a terminal would not show
+    print(text.replace("\x7f", "\\u007f"))
 
 
 def finish(result: Result, *, as_json: bool) -> int:
@@ -160,36 +206,47 @@ def finish(result: Result, *, as_json: bool) -> int:
 
 
 def go_on_text(result: Result) -> str:
-    """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
+    """Return how to go on with a run that was stopped; nothing of one that was not, or
+    that is kept nowhere.
+    """
     run: Any = getattr(result, "run", None)
     stopped = run and result.goes_on and getattr(result, "ending", None) != "running"
     return f"\n\nGo on with: {go_on_command(run)}" if stopped else ""
 
 
 def go_on_command(run: str | Path) -> str:
-    """Return the shell command that goes on with the run in a folder, with the Python code that its settings name."""
+    """Return the shell command that goes on with the run in a folder, with the Python
+    code that its settings name.
+    """
     # late, so that --help answers at once
     from advsearch.cli.flags import command_in, config_of_file
     from advsearch.config import SceneConfig
     from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.settings import split_names
 
-    words, file = ["advsearch", "resume", typed_name(run)], Path(run) / CONFIG
+    words = ["advsearch", "resume", typed_name(run)]
+    file = Path(run) / CONFIG
     with suppress(AdvsearchError):
         config = config_of_file(command_in(file), file, {})
         metrics = getattr(config, "metrics", {}).values()
-        if isinstance(config, SceneConfig) and ":" in "".join([config.model, *config.kinds_of_controls, *metrics]):
+        if isinstance(config, SceneConfig) and ":" in "".join(
+            [config.model, *config.kinds_of_controls, *metrics]
+        ):
             from advsearch.engine.naming import code_of  # takes seconds
 
-            names = code_of(split_names(config.model), config.kinds_of_controls, metrics)
+            names = code_of(
+                split_names(config.model), config.kinds_of_controls, metrics
+            )
             words += [word for name in names for word in ("--code", name)]
     return shlex.join(words)
 
 
 @contextmanager
 def output_kept_clean() -> Iterator[None]:
-    """Send whatever is printed inside the block to standard error, be it by Python or by a native library. So one JSON
-    value, printed afterwards, is all that standard output holds."""
+    """Send whatever is printed inside the block to standard error, be it by Python or
+    by a native library. So one JSON value, printed afterwards, is all that standard
+    output holds.
+    """
     sys.stdout.flush()
     kept: int | None = None
     with suppress(OSError):  # where one of them is closed
@@ -200,47 +257,79 @@ def output_kept_clean() -> Iterator[None]:
             yield
     finally:
         if kept is not None:
-            with suppress(OSError, AttributeError):  # what the C library holds back, before its descriptor changes
+            # what the C library holds back, before its descriptor changes
+            with suppress(OSError, AttributeError):
                 ctypes.CDLL(None).fflush(None)
             os.dup2(kept, 1)
             os.close(kept)
 
 
 def shown_text(result: Result) -> str:
-    """Return what is shown of a result as text: what it says, its parts, by what it came about, and notes."""
+    """Return what is shown of a result as text: what it says, its parts, by what it
+    came about, and notes.
+    """
     # late, so that --help answers at once
     from advsearch.cli.flags import with_flags
     from advsearch.report.views import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
-    content, run = shown(result), getattr(result, "run", None)
+    content = shown(result)
+    run = getattr(result, "run", None)
     parts = [content.said]
     for part in content.sections:
         if part.only not in ("", "text") or part.empty:
             continue
         table = aligned([part.heads, *part.rows] if part.heads else part.rows)
-        pictures = [[picture.file, picture.caption] for group in part.pictures for picture in group]
-        inside = [*map(with_flags, part.text), "\n".join(filter(None, [table, aligned(pictures)]))]
-        parts.append("\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))])))
+        pictures = [
+            [picture.file, picture.caption]
+            for group in part.pictures
+            for picture in group
+        ]
+        inside = [
+            *map(with_flags, part.text),
+            "\n".join(filter(None, [table, aligned(pictures)])),
+        ]
+        parts.append(
+            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))]))
+        )
     facts = [[name.lower(), text] for name, text in facts_of(result, content).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    return "\n\n".join([*filter(None, parts), *(f"Note: {with_flags(text)}" for text in remarks_of(result, content))])
+    return "\n\n".join(
+        [
+            *filter(None, parts),
+            *(f"Note: {with_flags(text)}" for text in remarks_of(result, content)),
+        ]
+    )
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns."""
-    wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]
+    wide = [
+        max(len(row[i]) for row in rows if i < len(row))
+        for i in range(max(map(len, rows), default=0))
+    ]
     return "\n".join(
-        ("  " + "   ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
+        (
+            "  "
+            + "   ".join(
+                cell.ljust(width) for cell, width in zip(row, wide, strict=False)
+            )
+        ).rstrip()
+        for row in rows
     )
 
 
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
-    """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
+    """Watch a command's work; where JSON is to be printed, keep everything else off
+    standard output meanwhile.
+    """
     from advsearch.cli.flags import with_flags  # late, so that --help answers at once
 
-    with output_kept_clean() if as_json else nullcontext(), watched(not quiet, with_flags) as watcher:
+    with (
+        output_kept_clean() if as_json else nullcontext(),
+        watched(not quiet, with_flags) as watcher,
+    ):
         progress = LookingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
@@ -248,14 +337,25 @@ def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
 
 
 class LookingProgress:
-    """A watcher that raises an interrupt which was lost where it struck, when a step or a stage ends: modules that are
-    being imported, destructors and native code make other errors of one, or none. All is told to `progress`."""
+    """A watcher that raises an interrupt which was lost where it struck, when a step or
+    a stage ends: modules that are being imported, destructors and native code make
+    other errors of one, or none. All is told to `progress`.
+    """
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
 
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has handled."""
+    def stage(
+        self,
+        name: str,
+        total: int | None = None,
+        *,
+        hint: str = "",
+        at_most: bool = False,
+    ) -> None:
+        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has
+        handled.
+        """
         INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)
 

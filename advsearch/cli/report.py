@@ -15,33 +15,62 @@ from advsearch.cli.main import argument, command
 from advsearch.extend import InputError
 
 NAME = "evidence"
-POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photographs were taken, and its most bytes
+# the file that says where photographs were taken, and its most bytes
+POSES = "poses.csv"
+LARGEST_POSES = 1 << 20
 
 
 @command(
-    argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts"),
-    argument("--evidence", action="store_true", help="claims with what a reader needs to judge them"),
-    argument("--criterion", metavar="SHARE", type=float, help="share of right predictions that is asked for"),
+    argument(
+        "runs",
+        nargs="+",
+        metavar="RUN",
+        help="names or folders of runs; of a recipe, its parts",
+    ),
+    argument(
+        "--evidence",
+        action="store_true",
+        help="claims with what a reader needs to judge them",
+    ),
+    argument(
+        "--criterion",
+        metavar="SHARE",
+        type=float,
+        help="share of right predictions that is asked for",
+    ),
     argument(
         "--exposure",
         metavar="FILE",
-        help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
+        help="how common conditions are: YAML such as environment: {street: 0.8, noon: "
+        "0.2}",
     ),
     argument(
         "--photographs",
         metavar="FOLDER",
-        help="photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
+        help="photographs aligned with renderings of the first run, by their names: "
+        "rendering-12.jpg, "
         "rendering-12-again.jpg; its model judges them, and the run keeps them",
     ),
-    argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default=""),
-    argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME),
+    argument(
+        "--by",
+        metavar="NAME",
+        help="who answers for it, as it is to be written",
+        default="",
+    ),
+    argument(
+        "--out",
+        metavar="FOLDER",
+        help="where the three files go (default: %(default)s)",
+        default=NAME,
+    ),
     argument("--overwrite", action="store_true", help="replace what is there"),
     output.add_code_flag,
     output.add_flags,
     more=": a page, Markdown and JSON",
     examples=(
         "report mug-texture-001 mug-sweep-001 --evidence",
-        "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
+        "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card "
+        "--json",
     ),
 )
 def report(args: argparse.Namespace) -> int:
@@ -52,74 +81,122 @@ def report(args: argparse.Namespace) -> int:
 
     if not args.evidence:
         raise InputError(
-            "report: expected --evidence, which writes the claims of all these runs; the page of one run is "
+            "report: expected --evidence, which writes the claims of all these runs; "
+            "the page of one run is "
             "report.html in its folder"
         )
     folder = Path(args.out)
     names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
     there = [name for name in names if name.exists()]
     if there and not args.overwrite:
-        raise InputError(f"{there[0]}: exists already; add --overwrite or choose another folder with --out")
+        raise InputError(
+            f"{there[0]}: exists already; add --overwrite or choose "
+            "another folder with --out"
+        )
     if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
-        raise InputError(f"--criterion: expected a share over 0 and at most 1, such as 0.9, got {args.criterion:g}")
+        raise InputError(
+            "--criterion: expected a share over 0 and at most 1, such as "
+            f"0.9, got {args.criterion:g}"
+        )
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
         _take_in(args.photographs, args.runs[0])
-    evidence, pictures = collected(args.runs, criterion=args.criterion, exposure=exposure, by=args.by)
+    evidence, pictures = collected(
+        args.runs, criterion=args.criterion, exposure=exposure, by=args.by
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
+        raise InputError(
+            f"--out: cannot make the folder {folder}: {error.strerror}"
+        ) from None
     for name, data in pictures.items():
         writing.write_bytes(folder / name, data)
-    texts = (evidence_page(evidence, pictures), markdown(evidence), directory.summary.to_json(evidence) + "\n")
+    texts = (
+        evidence_page(evidence, pictures),
+        markdown(evidence),
+        directory.summary.to_json(evidence) + "\n",
+    )
     for path, text in zip(names, texts, strict=True):
         writing.write_text(path, text)
-    lines = [text for run in evidence.runs for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))]
+    lines = [
+        text
+        for run in evidence.runs
+        for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))
+    ]
     notes = "".join(f"\nNote: {text}" for text in evidence.warnings)
-    return output.say(args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)]))
+    return output.say(
+        args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)])
+    )
 
 
 def _take_in(folder: str, name: str) -> None:
-    """Have a run's model judge the photographs in a folder that the run does not have yet."""
+    """Have a run's model judge the photographs in a folder that the run does not have
+    yet.
+    """
     from advsearch.extend import directory, settings, workbench  # the last brings torch
 
     run = directory.find_run(name)
-    task: Any = settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
+    task: Any = (
+        settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
+    )
     with tempfile.TemporaryDirectory() as named:
         place = Path(folder)
         if (place / POSES).is_file():
             place = _named_by_pose(place, run, Path(named))
         photographs = workbench.load_photographs()
         files = photographs.list_files(place, task)
-        if loose := [file.name for file in files if not file.stem.startswith("rendering-")]:
+        if loose := [
+            file.name for file in files if not file.stem.startswith("rendering-")
+        ]:
             raise InputError(
-                f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
+                f"photographs: {loose[0]}: expected the number of a rendering in its "
+                "name, such as rendering-12.jpg, "
                 f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
             )
         if not files:
-            raise InputError(f"photographs: {folder}: expected a folder with photographs, got none in it")
+            raise InputError(
+                f"photographs: {folder}: expected a folder with "
+                "photographs, got none in it"
+            )
         photographs.add_files(run, files)
 
 
 def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
-    """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
+    """Copy the photographs that `POSES` lists, each under the name of the rendering
+    that has its pose.
+    """
     # late, so that --help answers at once
     from advsearch.extend import Store, stored_files
 
     with Store.open_to_read(run) as store:
-        rows = [(row.step, {name: value["value"] for name, value in row.values.items()}) for row in store.rows("sweep")]
+        rows = [
+            (row.step, {name: value["value"] for name, value in row.values.items()})
+            for row in store.rows("sweep")
+        ]
     for line, pose in enumerate(
-        csv.DictReader(stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2
+        csv.DictReader(
+            stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()
+        ),
+        2,
     ):
-        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(pose.pop("file", ""))).name
+        where = f"photographs: {folder / POSES}, line {line}"
+        file = folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
-            raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")
-        steps = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in pose.items())]
+            raise InputError(
+                f"{where}: expected the name of a photograph beside it "
+                f"under `file`, got {file.name!r}"
+            )
+        steps = [
+            step
+            for step, values in rows
+            if all(_is_at(values.get(name), text) for name, text in pose.items())
+        ]
         if len(steps) != 1:
             told = ", ".join(f"{name} {text}" for name, text in pose.items())
             raise InputError(
-                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(steps)} have; "
+                f"{where}: expected a pose that one rendering of {run.name} has, got "
+                f"{told}, which {len(steps)} have; "
                 "sweep a grid of the poses"
             )
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")

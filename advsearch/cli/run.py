@@ -1,4 +1,6 @@
-"""`advsearch run`: do what a YAML file describes; `resume`: go on with a run that was stopped; `runs`: those here."""
+"""`advsearch run`: do what a YAML file describes; `resume`: go on with a run that was
+stopped; `runs`: those here.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,21 @@ from advsearch.viewer.pages import write_page
 
 
 @command(
-    argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml"),
-    argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"),
-    argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder"),
-    argument("--overwrite", action="store_true", help="replace a run that is there already"),
+    argument(
+        "file",
+        metavar="FILE",
+        help="YAML with settings and values, such as a run's run.yaml",
+    ),
+    argument(
+        "change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"
+    ),
+    argument(
+        "--run",
+        help="where the run is kept: a name (kept in runs/) or the path of a folder",
+    ),
+    argument(
+        "--overwrite", action="store_true", help="replace a run that is there already"
+    ),
     output.add_code_flag,
     output.add_quiet_flags,
 )
@@ -40,9 +53,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def changes_in(words: Sequence[str]) -> dict[str, object]:
-    """Return setting to value from ``NAME=VALUE``, which allows the code that they name. Raises InputError where a word
-    is no such assignment."""
-    changes, typed = dict(parse_assignment(text, f"change {text!r}") for text in words), dict[str, object]()
+    """Return setting to value from ``NAME=VALUE``, which allows the code that they
+    name. Raises InputError where a word is no such assignment.
+    """
+    changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
+    typed = dict[str, object]()
     for name, value in changes.items():
         put(typed, name, value)
     allow_named(typed)
@@ -50,23 +65,42 @@ def changes_in(words: Sequence[str]) -> dict[str, object]:
 
 
 def run_file(
-    file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
+    file: str | Path,
+    changes: Mapping[str, object],
+    args: argparse.Namespace,
+    resumed: Path | None = None,
 ) -> int:
-    """Do what a YAML file describes, with `changes` put over it. Raises UnknownNameError where there is no such
-    command. If the file is a run's own, `resumed` is its folder; `args` has `json` and `quiet`."""
+    """Do what a YAML file describes, with `changes` put over it. Raises
+    UnknownNameError where there is no such command. If the file is a run's own,
+    `resumed` is its folder; `args` has `json` and `quiet`.
+    """
     config = config_of_file(command_in(file), file, changes)
     for setting in config.left_out:
         if resumed is None or setting.name not in config.free:
-            raise InputError(f"{file}: {setting.name}: {setting.does}, which a file can't ask for; type {setting.ask}")
+            raise InputError(
+                f"{file}: {setting.name}: {setting.does}, which a file "
+                f"can't ask for; type {setting.ask}"
+            )
         if not args.quiet:
-            print(f"advsearch: {setting.name} is left out: it {setting.does}; type {setting.ask}", file=sys.stderr)
+            print(
+                f"advsearch: {setting.name} is left out: it {setting.does}; type "
+                f"{setting.ask}",
+                file=sys.stderr,
+            )
     command = main.ExperimentCommand(get_experiment(config.command))
-    return command.run_config(config, as_json=args.json, quiet=args.quiet, resumed=resumed)
+    return command.run_config(
+        config, as_json=args.json, quiet=args.quiet, resumed=resumed
+    )
 
 
 @command(
     argument("run", metavar="RUN", help="a run's name or folder"),
-    argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"),
+    argument(
+        "change",
+        metavar="NAME=VALUE",
+        nargs="*",
+        help="a setting to change that decides no number: threads=2",
+    ),
     output.add_code_flag,
     output.add_quiet_flags,
     more="; what it has evaluated is not rendered again",
@@ -78,22 +112,31 @@ def run_file(
     ),
 )
 def resume(args: argparse.Namespace) -> int:
-    """Do what is left of the run and print its result; of a run that is done, its result."""
-    path, changes = find_run(args.run), changes_in(args.change)
+    """Do what is left of the run and print its result; of a run that is done, its
+    result.
+    """
+    path = find_run(args.run)
+    changes = changes_in(args.change)
     if not (path / CONFIG).is_file():
-        raise InputError(f"{path}: expected a run with its {CONFIG}, got none; start it again")
+        raise InputError(
+            f"{path}: expected a run with its {CONFIG}, got none; start it again"
+        )
     asked = command_in(path / CONFIG)
-    # the map of a sweep's surface, or a recipe's figures anew, with the photographs that were taken since
+    # the map of a sweep's surface, or a recipe's figures anew, with the photographs
+    # that were taken since
     adds = asked == "recipe" or (changes.get("surface") is True and asked == "sweep")
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
-        if not (path / REPORT).is_file():  # the disk was full as it was written, or it was removed
+        # the disk was full as it was written, or it was removed
+        if not (path / REPORT).is_file():
             write_page(path)
         return show_run(str(path), args.json)
     if only := [part.text for part in read_python_only(path)]:
         raise InputError(
-            f"{path}: cannot resume from here: {', '.join(only)} existed only in the Python session of the run; call "
-            "the same function with the same arguments again, an attack with `resume=True`"
+            f"{path}: cannot resume from here: {', '.join(only)} existed only in the "
+            "Python session of the run; call "
+            "the same function with the same arguments again, an attack with "
+            "`resume=True`"
         )
     return run_file(path / CONFIG, changes, args, resumed=path)
 
@@ -101,20 +144,44 @@ def resume(args: argparse.Namespace) -> int:
 MOST_NAMES = 4  # controls of a run that the table names
 
 
-@command(argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"), output.add_flags)
+@command(
+    argument(
+        "folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"
+    ),
+    output.add_flags,
+)
 def runs(args: argparse.Namespace) -> int:
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
-        raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
+        raise InputError(
+            f"{folder}: expected a folder with runs in it, got no such folder"
+        )
     listed = listed_runs(folder)
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
     for run in listed:
-        names, more = ",".join(run.controls), len(run.controls) - MOST_NAMES
+        names = ",".join(run.controls)
+        more = len(run.controls) - MOST_NAMES
         if more > 1:
             names = f"{','.join(run.controls[:MOST_NAMES])} and {more} more"
-        rows.append([run.name, run.command, run.object, names, str(run.rows), run.state, run.answer])
-    text = output.aligned(rows) if listed else f"no runs in {folder}/ yet; advsearch attack makes one"
-    output.say(args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text)
+        rows.append(
+            [
+                run.name,
+                run.command,
+                run.object,
+                names,
+                str(run.rows),
+                run.state,
+                run.answer,
+            ]
+        )
+    text = (
+        output.aligned(rows)
+        if listed
+        else (f"no runs in {folder}/ yet; advsearch attack makes one")
+    )
+    output.say(
+        args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text
+    )
     for run in listed:
         if run.fault and not args.json:
             print(f"advsearch: {run.name}: {run.fault}", file=sys.stderr)

@@ -1,6 +1,8 @@
-"""`advsearch show`: what a run found, what a control can vary, the options of a policy or a task, or a recipe.
+"""`advsearch show`: what a run found, what a control can vary, the options of a policy
+or a task, or a recipe.
 
-And what `advsearch render` says: a picture of a scene, or a sheet of views around it, with the model's predictions.
+And what `advsearch render` says: a picture of a scene, or a sheet of views around it,
+with the model's predictions.
 """
 
 from __future__ import annotations
@@ -20,7 +22,13 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import EXPERIMENTS, Registry, get_experiment, get_first_doc_line, imported
+from advsearch.registry import (
+    EXPERIMENTS,
+    Registry,
+    get_experiment,
+    get_first_doc_line,
+    imported,
+)
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -33,7 +41,10 @@ if TYPE_CHECKING:
 
 
 def _set_usage(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
+    parser.usage = (
+        "advsearch show [--json] RUN [--picture] | control NAME | policy "
+        "NAME | task NAME | recipe NAME"
+    )
 
 
 @command(
@@ -42,18 +53,28 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
         "what",
         nargs="+",
         metavar="WHAT",
-        help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
+        help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe "
+        "NAME",
     ),
-    argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can"),
+    argument(
+        "--picture",
+        action="store_true",
+        help="draw a run's pictures in a terminal that can",
+    ),
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
     if args.picture and (args.json or len(args.what) > 1):
-        raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
+        raise InputError(
+            "--picture: draws the pictures of one run, after its text; "
+            "give one run, and leave --json out"
+        )
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
-        case [command, name] if command in EXPERIMENTS and (target := get_experiment(command).choice_description):
+        case [command, name] if command in EXPERIMENTS and (
+            target := get_experiment(command).choice_description
+        ):
             text, facts = imported(target)(name)
             return output.say(args.json, {command: name, **facts}, text)
         case [name]:
@@ -61,39 +82,52 @@ def show(args: argparse.Namespace) -> int:
                 return show_run(name, args.json, picture=args.picture)
             except UnknownNameError as error:
                 raise InputError(
-                    f"{error} For anything but a run, put its kind before the name, as in: advsearch show control pose"
+                    f"{error} For anything but a run, put its kind before the name, as "
+                    "in: advsearch show control pose"
                 ) from None
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
-    raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
+    raise InputError(
+        f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}"
+    )
 
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
-    """Print the result of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
+    """Print the result of a run, or how far one has come that has none yet, and draw
+    its pictures if wanted.
+    """
     path = find_run(name)
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
     photos = photos_of(path)
     if as_json:
-        output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
+        output.print_json(
+            {**result.to_dict(), "photos": photos.to_dict()} if photos else result
+        )
     else:
         print(output.shown_text(result) + output.go_on_text(result))
     if photos and photos.interval is not None and not as_json:
-        agreeing, total = photos.right_right + photos.wrong_wrong, count(photos.photos, "photograph")
+        agreeing = photos.right_right + photos.wrong_wrong
+        total = count(photos.photos, "photograph")
         sure = f"95 % interval {interval_text(photos.interval)}"
         lines = [
             ["", "photograph right", "photograph wrong"],
             ["rendering right", str(photos.right_right), str(photos.right_wrong)],
             ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
         ]
-        print(f"\nRenderings and reality agree in {agreeing} of {total}, {sure}:\n{output.aligned(lines)}")
+        print(
+            f"\nRenderings and reality agree in {agreeing} of {total}, "
+            f"{sure}:\n{output.aligned(lines)}"
+        )
     if picture:
         show_pictures(best_pictures(path))
     return 0
 
 
 def photos_of(run: Path) -> Any:
-    """Return how photographs agree with the run's renderings (`advsearch.photo_agreement`); None where it has none."""
+    """Return how photographs agree with the run's renderings
+    (`advsearch.photo_agreement`); None where it has none.
+    """
     if not (run / PHOTOGRAPHS).is_dir():
         return None
     from advsearch import photo_agreement  # takes seconds
@@ -102,18 +136,29 @@ def photos_of(run: Path) -> Any:
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:
-    go_on = output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
+    go_on = (
+        output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
+    )
     what = run.command
     if run.object:
         what += f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
-    how = {"running": "A process is working on it"}.get(run.state, "It was stopped before its end")
+    how = {"running": "A process is working on it"}.get(
+        run.state, "It was stopped before its end"
+    )
     kept = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
-    lines = [f"{run.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]
+    lines = [
+        f"{run.name}: {what}.",
+        f"{how}; evaluations kept so far: {kept or 'none'}.",
+    ]
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
     elif run.state == "stopped":
         lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
-    return output.say(as_json, {**vars(run), "run": run.path, "ending": None, "resume": go_on}, "\n".join(lines))
+    return output.say(
+        as_json,
+        {**vars(run), "run": run.path, "ending": None, "resume": go_on},
+        "\n".join(lines),
+    )
 
 
 PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
@@ -125,26 +170,42 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     allow_named({"controls": name} if kind == "control" else {})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
-    entry, parts = registry[name], list[str]()
+    entry = registry[name]
+    parts = list[str]()
     facts: dict[str, object] = {kind: name}
     if kind == "control":
-        facts |= {"parameters": plain(entry.parameters), "choices": plain(entry.choices)}
+        facts |= {
+            "parameters": plain(entry.parameters),
+            "choices": plain(entry.choices),
+        }
         if entry.parameters:
-            parts.append("parameters, searched or fixed:\n" + _table(list(map(_of_parameter, entry.parameters))))
+            parts.append(
+                "parameters, searched or fixed:\n"
+                + _table(list(map(_of_parameter, entry.parameters)))
+            )
         else:
-            parts.append(f"The scene names its parameters: --control {name}:KEY=[low, high]")
+            parts.append(
+                f"The scene names its parameters: --control {name}:KEY=[low, high]"
+            )
         if entry.choices:
-            parts.append("settings, chosen:\n" + _table(list(map(_of_choice, entry.choices))))
+            parts.append(
+                "settings, chosen:\n" + _table(list(map(_of_choice, entry.choices)))
+            )
     else:
         options = list[dict[str, Any]]()
         for option, field in declared_options(entry).items():
             default = default_of(field)
             default = plain(getattr(default, "name", default))
             options.append({"name": option, "type": type_of(field), "default": default})
-        facts["options"], rows = options, [{**option, "default": _cell(option["default"])} for option in options]
+        facts["options"], rows = (
+            options,
+            [{**option, "default": _cell(option["default"])} for option in options],
+        )
         how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
         parts.append(f"{how}\n{_table(rows)}" if rows else "It has no options.")
-    return output.say(as_json, facts, "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *parts]))
+    return output.say(
+        as_json, facts, "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *parts])
+    )
 
 
 def _of_parameter(parameter: Parameter) -> dict[str, str]:
@@ -154,8 +215,13 @@ def _of_parameter(parameter: Parameter) -> dict[str, str]:
     return {
         "name": parameter.name,
         "unit": parameter.unit + (f" ({count})" if count else ""),
-        "allowed": ", ".join(parameter.options) or f"{parameter.low:g} to {parameter.high:g}",
-        "searched": "if asked" if parameter.search is None else "all" if parameter.options else searched,
+        "allowed": ", ".join(parameter.options)
+        or f"{parameter.low:g} to {parameter.high:g}",
+        "searched": "if asked"
+        if parameter.search is None
+        else "all"
+        if parameter.options
+        else searched,
         "default": _cell(parameter.default),
         "periodic": _cell(parameter.periodic),
         "moves outlines": _cell(parameter.moves_silhouettes),
@@ -173,7 +239,12 @@ def _of_choice(choice: Choice) -> dict[str, str]:
     elif choice.most:
         allowed = f"over 0 to {choice.most:g}"
     default = _cell(choice.default)
-    return {"name": choice.name, "allowed": allowed, "default": default, "description": choice.description}
+    return {
+        "name": choice.name,
+        "allowed": allowed,
+        "default": default,
+        "description": choice.description,
+    }
 
 
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -183,13 +254,20 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 def _cell(value: JsonValue) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return (
+        ""
+        if value is None
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )
 
 
 HEIGHT = 16  # of a picture, in lines
 EXTRA = "pip install 'advsearch[terminal]'"
 
-FIRST = ("clean", "adversarial")  # what is shown of an attack; of another run, the first picture there is
+# what is shown of an attack; of another run, the first picture there is
+FIRST = ("clean", "adversarial")
 
 
 def best_pictures(run: Path) -> list[Path]:
@@ -202,7 +280,9 @@ def best_pictures(run: Path) -> list[Path]:
 
 
 def show_pictures(files: Sequence[Path]) -> None:
-    """Draw pictures where standard output is a terminal that can, and say where each is."""
+    """Draw pictures where standard output is a terminal that can, and say where each
+    is.
+    """
     if not files:
         print("\nThis run has no pictures.")
         return
@@ -213,7 +293,11 @@ def show_pictures(files: Sequence[Path]) -> None:
             try:
                 draw(file)
             except Exception as error:  # whatever a terminal answers, the path is said
-                draw, why = None, f"The pictures could not be drawn here: {type(error).__name__}: {error}"
+                draw = None
+                why = (
+                    f"The pictures could not be drawn here: {type(error).__name__}: "
+                    f"{error}"
+                )
         print(f"  picture   {file}")
     if why:
         print(f"\n{why}")
@@ -227,14 +311,19 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
     except ImportError:
         return None, f"Terminals with kitty's protocol or Sixel draw them here: {EXTRA}"
     if renderable.Image not in (renderable.SixelImage, renderable.TGPImage):
-        return None, "This terminal draws no pictures: it has neither kitty's protocol nor Sixel."
+        return None, (
+            "This terminal draws no pictures: it has neither kitty's "
+            "protocol "
+            "nor Sixel."
+        )
     from rich.console import Console  # only where pictures are drawn
 
     console = Console(file=raw(sys.stdout))
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
 
 
-# ---- names -----------------------------------------------------------------------------------------------------------
+# ---- names
+# -----------------------------------------------------------------------------------------------------------
 
 
 CASES = "cases"  # of `stability`, which are not among all names
@@ -250,14 +339,25 @@ _EVERY = {
     "recipes": "advsearch.questions.recipe.description:titles",
     CASES: "advsearch.questions.stability.scenes:sentences",
 }
-REGISTRIES = {kind: target for kind, target in _EVERY.items() if is_present(target.partition(":")[0])}
-"""Where the names of each kind are: a mapping from them, or a function that returns them."""
+REGISTRIES = {
+    kind: target
+    for kind, target in _EVERY.items()
+    if is_present(target.partition(":")[0])
+}
+"""Where the names of each kind are: a mapping from them, or a function that returns
+them.
+"""
 
-MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}
+MODELS = {
+    "reference": "the bundled classifier of household objects; models of your "
+    "own are given as files"
+}
 
 
 def list_names(kind: str) -> dict[str, str]:
-    """Return the names of one kind, each with one line about it where its registry has one."""
+    """Return the names of one kind, each with one line about it where its registry has
+    one.
+    """
     entries = _registry(kind)
     if isinstance(entries, Registry):
         return {name: entries.get_help(name) for name in entries}
@@ -272,28 +372,54 @@ def _registry(kind: str) -> Any:
 
 
 @command(
-    argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags
+    argument(
+        "kind",
+        nargs="?",
+        default="all",
+        choices=[*REGISTRIES, "all"],
+        help="default: all",
+    ),
+    output.add_flags,
 )
 def list_all(args: argparse.Namespace) -> int:
-    kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
+    kinds = (
+        [kind for kind in REGISTRIES if kind != CASES]
+        if args.kind == "all"
+        else [args.kind]
+    )
     with at_work(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}
-    tables = {kind: output.aligned([*entries.items()]) for kind, entries in names.items()}
+    tables = {
+        kind: output.aligned([*entries.items()]) for kind, entries in names.items()
+    }
     text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
     facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.say(args.json, facts, text if args.kind == "all" else tables[args.kind])
+    return output.say(
+        args.json, facts, text if args.kind == "all" else tables[args.kind]
+    )
 
 
 @command(
-    argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),
+    argument(
+        "word",
+        metavar="WORD",
+        nargs="?",
+        help="what the names should be like; all without it",
+    ),
     partial(add_settings, only=("model", "labels")),
     output.add_flags,
-    more=". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out",
-    examples=("labels", "labels mug --labels labels.json", "labels mug --model model.pt2 --labels labels.json --json"),
+    more=". With --labels the model itself is not loaded. What stands for no thing, "
+    "such as background, is left out",
+    examples=(
+        "labels",
+        "labels mug --labels labels.json",
+        "labels mug --model model.pt2 --labels labels.json --json",
+    ),
 )
 def labels(args: argparse.Namespace) -> int:
-    """Print index and name of the classes, best first. Raises InputError where no class is like the word, or the model
-    has no names for its classes."""
+    """Print index and name of the classes, best first. Raises InputError where no class
+    is like the word, or the model has no names for its classes.
+    """
     with at_work(as_json=True, quiet=False):
         # late, so that --help answers at once
         from advsearch.models import load_model, read_labels
@@ -309,11 +435,24 @@ def labels(args: argparse.Namespace) -> int:
                 what = f"model {loaded.name} has {loaded.classes} classes without names"
                 raise InputError(f"{what}; give a file with `labels`")
             names = loaded.labels
-        like = range(len(names)) if args.word is None else [index for index, _ in matching_labels(args.word, names)]
+        like = (
+            range(len(names))
+            if args.word is None
+            else [index for index, _ in matching_labels(args.word, names)]
+        )
         asked = args.word is not None and names_nothing(args.word)
-        classes = {index: names[index] for index in like if asked or not names_nothing(names[index])}
+        classes = {
+            index: names[index]
+            for index in like
+            if asked or not names_nothing(names[index])
+        }
     if not classes:
-        raise InputError(f"none of the {len(names)} labels is like {args.word!r}; leave the word out to see all")
+        raise InputError(
+            f"none of the {len(names)} labels is like {args.word!r}; "
+            "leave the word out to see all"
+        )
     listed = [{"index": index, "label": name} for index, name in classes.items()]
     text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
-    return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)
+    return output.say(
+        args.json, {"command": "labels", "word": args.word, "labels": listed}, text
+    )

@@ -1,8 +1,11 @@
-"""Work on several processors: batches, done here (`InProcess`) or by worker processes (`workers.open_workers`).
+"""Work on several processors: batches, done here (`InProcess`) or by worker processes
+(`workers.open_workers`).
 
-Workers stand behind one interface, `concurrent.futures.Executor`: a pure function of a module and picklable arguments
-go in, a future comes out. What a batch comes to depends on the batch and the run's settings alone, so that anybody may
-do it, any number of times."""
+Workers stand behind one interface, `concurrent.futures.Executor`: a pure function of a
+module and picklable arguments go in, a future comes out. What a batch comes to depends
+on the batch and the run's settings alone, so that anybody may do it, any number of
+times.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +28,18 @@ DEATHS = 3  # workers that may die of a call before it is given up
 class WorkerTask:
     """What a worker does with batches, in a form that can be sent to it."""
 
-    function: str  # "package.module:function", which takes the settings and returns a `Call`
+    # "package.module:function", which takes the settings and returns a `Call`
+    function: str
     settings: JsonObject
-    files: tuple[str, ...] = ()  # settings that may hold paths, separated by commas, whose files are sent along
+    # settings that may hold paths, separated by commas, whose files are sent along
+    files: tuple[str, ...] = ()
     threads: int = 1  # for rendering, of a worker
-    seconds: float | None = None  # that a batch may take at least; None: by the median of those before
-    code: tuple[str, ...] = field(default_factory=allowed_code)  # that a worker may import by its name, as this process
-    digests: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of the files by path, for workers elsewhere
+    # that a batch may take at least; None: by the median of those before
+    seconds: float | None = None
+    # that a worker may import by its name, as this process
+    code: tuple[str, ...] = field(default_factory=allowed_code)
+    # SHA-256 of the files by path, for workers elsewhere
+    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +49,8 @@ class BatchResult:
     items: Sequence[Any]
     value: Any  # what the call returned
     worker: str = ""  # who did it; empty in this process
-    machine: str | None = None  # by its name in `WorkerStats.machines`; None where it is like this one
+    # by its name in `WorkerStats.machines`; None where it is like this one
+    machine: str | None = None
     lost: str = ""  # why nothing came back, only of a single item
 
     def require_value(self, title: str) -> Any:
@@ -68,13 +77,17 @@ class WorkerStats:
     busy: float = 0.0  # seconds that workers were at batches
     loading: float = 0.0  # seconds that they loaded scenes and models
     alive: float = 0.0  # seconds that they were there, those of loading left out
-    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # that are not like this one, by name
+    # that are not like this one, by name
+    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def told(self) -> dict[str, float | str]:
         """The same, beside a progress bar."""
         counts = {"lost": self.lost, "retried": self.retried}
-        return {"workers": self.workers, **{name: count for name, count in counts.items() if count}}
+        return {
+            "workers": self.workers,
+            **{name: count for name, count in counts.items() if count},
+        }
 
 
 class Workers(Protocol):
@@ -87,8 +100,10 @@ class Workers(Protocol):
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """Do batches, and yield what comes of them, in any order, each once.
 
-        Only as many are taken from `batches` before their results are asked for as there are workers. Raises an
-        AdvsearchError that a batch raises, or ClusterError where there is nobody to do it."""
+        Only as many are taken from `batches` before their results are asked for as
+        there are workers. Raises an AdvsearchError that a batch raises, or ClusterError
+        where there is nobody to do it.
+        """
 
 
 class InProcess:
@@ -112,12 +127,16 @@ class WorkerDiedError(Exception):
 class WorkerExecutor(Executor):
     """An executor that gives a call to another worker where one dies of it.
 
-    A future ends with a WorkerDiedError where `DEATHS` died; with a BrokenExecutor or cancelled where the way to the
-    workers was lost, so that the call has to be submitted again."""
+    A future ends with a WorkerDiedError where `DEATHS` died; with a BrokenExecutor or
+    cancelled where the way to the workers was lost, so that the call has to be
+    submitted again.
+    """
 
     where: str  # what it is, in a user's words
     stats: WorkerStats
 
     @abstractmethod
     def count_workers(self) -> int:
-        """Return how many calls can be under way now. Raises ClusterError where there has been no worker for long."""
+        """Return how many calls can be under way now. Raises ClusterError where there
+        has been no worker for long.
+        """

@@ -1,8 +1,10 @@
 """An executor on the workers of a Dask scheduler, on other machines or this one.
 
-Dask itself gives a call to another worker where one dies, and starts workers again (their nannies do). Why not
-`Client.get_executor`: its future never ends where fetching the result fails, and it cannot leave out a worker that has
-another advsearch. Relied on (https://distributed.dask.org): a worker plugin reaches also workers that come later."""
+Dask itself gives a call to another worker where one dies, and starts workers again
+(their nannies do). Why not `Client.get_executor`: its future never ends where fetching
+the result fails, and it cannot leave out a worker that has another advsearch. Relied on
+(https://distributed.dask.org): a worker plugin reaches also workers that come later.
+"""
 
 from __future__ import annotations
 
@@ -20,38 +22,68 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from advsearch.cluster import DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats, WorkerTask
-from advsearch.cluster.worker import INPUTS, Failure, Reply, file_digests, own_folder, read_files, version, write_files
+from advsearch.cluster import (
+    DEATHS,
+    WorkerDiedError,
+    WorkerExecutor,
+    WorkerStats,
+    WorkerTask,
+)
+from advsearch.cluster.worker import (
+    INPUTS,
+    Failure,
+    Reply,
+    file_digests,
+    own_folder,
+    read_files,
+    version,
+    write_files,
+)
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
-CONNECT, RECONNECT = 30.0, 120.0  # seconds to find a scheduler at first, and to find it again when it has gone
+# seconds to find a scheduler at first, and to find it again when it has gone
+CONNECT = 30.0
+RECONNECT = 120.0
 LOOK = 0.5  # seconds between two looks at who is there, and between two tries
 TRIES = 10  # of a call that workers cannot begin
-RESTART = 20.0  # seconds that a worker may take to end, and that a scheduler may take to say who is there
+# seconds that a worker may take to end, and that a scheduler may take to say who is
+# there
+RESTART = 20.0
 
 SILENT = logging.CRITICAL + 1
-"""Level of Dask's log: what matters of it is said in a user's words, and a worker that dies is no error here."""
+"""Level of Dask's log: what matters of it is said in a user's words, and a worker that
+dies is no error here.
+"""
 
 CONFIG = {
-    "distributed.scheduler.allowed-failures": DEATHS - 1,  # that of a scheduler started by itself is its own
-    "distributed.comm.timeouts.connect": "120s",  # a worker that starts on a busy machine takes its time
+    # that of a scheduler started by itself is its own
+    "distributed.scheduler.allowed-failures": DEATHS - 1,
+    # a worker that starts on a busy machine takes its time
+    "distributed.comm.timeouts.connect": "120s",
     "distributed.comm.timeouts.tcp": "120s",
-    "distributed.deploy.lost-worker-timeout": "1h",  # one that is not back after this is not started again
+    # one that is not back after this is not started again
+    "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
 }
 
-PATIENCE, LESS_PATIENCE = 300.0, 15.0
-"""Seconds without any worker after which there is no hope; where those that are there are refused, fewer."""
+PATIENCE = 300.0
+LESS_PATIENCE = 15.0
+"""Seconds without any worker after which there is no hope; where those that are there
+are refused, fewer.
+"""
 
-NO_WORKER = ("NoValidWorkerError", "NoWorkerError")  # that end a call whose worker is not there
+# that end a call whose worker is not there
+NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where workers are, in a user's words: the address of a scheduler that runs, or what starts a cluster and with how
-    many workers (None: as it starts); and keywords of Dask's `Security`."""
+    """Where workers are, in a user's words: the address of a scheduler that runs, or
+    what starts a cluster and with how many workers (None: as it starts); and keywords
+    of Dask's `Security`.
+    """
 
     where: str
     address: str = ""
@@ -67,7 +99,8 @@ def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
 
     class SentFiles(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            with suppress(OSError):  # a worker that lacks files says so with its next call
+            # a worker that lacks files says so with its next call
+            with suppress(OSError):
                 write_files(contents, own_folder() / INPUTS)
 
     return SentFiles()
@@ -82,9 +115,13 @@ def call_there(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
 
 
 class DaskExecutor(WorkerExecutor):
-    """See `WorkerExecutor`; `contents` are files for workers that lack them. Shut it down."""
+    """See `WorkerExecutor`; `contents` are files for workers that lack them. Shut it
+    down.
+    """
 
-    def __init__(self, site: Site, contents: Mapping[str, bytes], tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, site: Site, contents: Mapping[str, bytes], tell: Callable[[str], None]
+    ) -> None:
         self.where = site.where
         self.stats = WorkerStats()
         self.link = ""  # of a page that shows the workers; empty where there is none
@@ -97,8 +134,10 @@ class DaskExecutor(WorkerExecutor):
         self._connection: Any = None
         self._sending: asyncio.Future[Any] | None = None  # of the files
         self._calls: set[Future[Any]] = set()
-        self._fit: frozenset[str] = frozenset()  # addresses of workers that may be given calls
-        self._refused: dict[str, str] = {}  # why others are given none, by their addresses
+        # addresses of workers that may be given calls
+        self._fit: frozenset[str] = frozenset()
+        # why others are given none, by their addresses
+        self._refused: dict[str, str] = {}
         self._looked_at = float("-inf")
         self._counted_at = self._alone_since = time.monotonic()
         try:
@@ -113,46 +152,68 @@ class DaskExecutor(WorkerExecutor):
         import distributed
 
         untyped: Any = distributed
-        security = untyped.Security(**self._site.security) if self._site.security else None
+        security = (
+            untyped.Security(**self._site.security) if self._site.security else None
+        )
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
         while True:
             try:
                 if self._site.start is not None and self._cluster is None:
-                    self._cluster = self._site.start(**({} if security is None else {"security": security}))
+                    self._cluster = self._site.start(
+                        **({} if security is None else {"security": security})
+                    )
                     if self._site.count is not None:
                         self._cluster.scale(self._site.count)
                 left = max(1.0, min(CONNECT, deadline - time.monotonic()))
                 where = self._cluster or self._site.address
-                self._client = untyped.Client(where, security=security, timeout=left, set_as_default=False)
+                self._client = untyped.Client(
+                    where, security=security, timeout=left, set_as_default=False
+                )
                 break
-            except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
+            except (
+                OSError,
+                TimeoutError,
+                asyncio.TimeoutError,
+                RuntimeError,
+                ValueError,
+            ) as error:
                 if time.monotonic() >= deadline:
                     raise ClusterError(
-                        f"{self.where}: there is no scheduler that answers ({error or type(error).__name__}); start "
-                        "one with dask scheduler, check address and certificates, and go on with advsearch resume"
+                        f"{self.where}: there is no scheduler that answers "
+                        f"({error or type(error).__name__}); start "
+                        "one with dask scheduler, check address and certificates, and "
+                        "go on with advsearch resume"
                     ) from error
                 time.sleep(LOOK)
         self._connection = self._client.scheduler_comm
-        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
+        # what Dask draws its pages with
+        drawn = importlib.util.find_spec("bokeh") is not None
         self.link = str(self._client.dashboard_link or "") if drawn else ""
         if self.link:
             self._tell(f"Dask shows its workers at {self.link}")
 
-    # ---- who is there -----------------------------------------------------------------------------------------------
+    # ---- who is there
+    # -----------------------------------------------------------------------------------------------
 
     def count_workers(self) -> int:
         now = time.monotonic()
         if now - self._looked_at >= LOOK:
             client = self._client
-            # A client that connects again does so by a connection of its own. What was under way is lost all the same.
-            if client.status != "running" or client.scheduler_comm is not self._connection:
+            # A client that connects again does so by a connection of its own. What was
+            # under way is lost all the same.
+            if (
+                client.status != "running"
+                or client.scheduler_comm is not self._connection
+            ):
                 self._reconnect()
-            with suppress(OSError, TimeoutError, asyncio.TimeoutError):  # slow, or going; the next look will tell
+            # slow, or going; the next look will tell
+            with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        if self._fit or now - self._counted_at > LESS_PATIENCE:  # nobody has asked for a while
+        # nobody has asked for a while
+        if self._fit or now - self._counted_at > LESS_PATIENCE:
             self._alone_since = now
         self._check_hope(now)
         self._counted_at = time.monotonic()
@@ -160,25 +221,47 @@ class DaskExecutor(WorkerExecutor):
 
     def _look(self) -> None:
         client = self._client
-        there = frozenset(client.sync(client.scheduler.ncores, callback_timeout=RESTART))
+        there = frozenset(
+            client.sync(client.scheduler.ncores, callback_timeout=RESTART)
+        )
         self.stats.lost += len(self._fit - there)
-        self._refused = {address: reason for address, reason in self._refused.items() if address in there}
+        self._refused = {
+            address: reason
+            for address, reason in self._refused.items()
+            if address in there
+        }
         fit = self._fit & there
         new = there - fit - set(self._refused)
-        versions = client.sync(self._versions, sorted(new), callback_timeout=RESTART) if new else {}
+        versions = (
+            client.sync(self._versions, sorted(new), callback_timeout=RESTART)
+            if new
+            else {}
+        )
         for address, its_version in versions.items():
             if its_version == version():
                 fit |= {address}
             elif isinstance(its_version, str):
-                self._refuse(address, f"it has advsearch {its_version}, and {version()} asks; install the same on both")
+                self._refuse(
+                    address,
+                    f"it has advsearch {its_version}, and "
+                    f"{version()} asks; install the same on both",
+                )
             elif isinstance(its_version, (ImportError, AttributeError)):
-                self._refuse(address, f"it cannot begin ({its_version}); install the same advsearch there")
+                self._refuse(
+                    address,
+                    f"it cannot begin ({its_version}); install the "
+                    "same advsearch there",
+                )
             # or else it is going, or does not answer yet: the next look will tell
         self._fit = fit - set(self._refused)
 
     async def _versions(self, workers: list[str]) -> dict[str, Any]:
-        """Return the version of advsearch that workers have, or the error of those that do not say it."""
-        found: dict[str, Any] = await self._client.run(version, workers=workers, on_error="return")
+        """Return the version of advsearch that workers have, or the error of those that
+        do not say it.
+        """
+        found: dict[str, Any] = await self._client.run(
+            version, workers=workers, on_error="return"
+        )
         return found
 
     def _refuse(self, address: str, reason: str) -> None:
@@ -189,18 +272,24 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError where there has been no worker that can do it for too long."""
+        """Raise ClusterError where there has been no worker that can do it for too
+        long.
+        """
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refused.values()))
             raise ClusterError(
                 f"{self.where}: there was no worker that can do it for {patience:.0f} s"
-                f"{f' ({reasons})' if reasons else ''}; what was stored is kept, so that the run can go on with "
+                f"{f' ({reasons})' if reasons else ''}; what was stored is kept, so "
+                "that the run can go on with "
                 "advsearch resume"
             )
 
     def _reconnect(self) -> None:
-        self._tell(f"{self.where}: the scheduler has gone; what was under way will be done again")
+        self._tell(
+            f"{self.where}: the scheduler has gone; what was under way will be "
+            "done again"
+        )
         self.shutdown()
         self._fit = frozenset()
         self._refused = {}
@@ -208,9 +297,12 @@ class DaskExecutor(WorkerExecutor):
         self._open(RECONNECT)
         self._alone_since = time.monotonic()
 
-    # ---- calls ------------------------------------------------------------------------------------------------------
+    # ---- calls
+    # ------------------------------------------------------------------------------------------------------
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(
+        self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> Future[Any]:
         """See `Executor.submit`; for functions of modules and positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
@@ -220,12 +312,16 @@ class DaskExecutor(WorkerExecutor):
         future.add_done_callback(self._calls.discard)
         return future
 
-    async def _call(self, client: Any, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        """Have a worker call a function, again where its result was lost on the way, or where the worker is not fit.
+    async def _call(
+        self, client: Any, function: Callable[..., Any], args: tuple[Any, ...]
+    ) -> Any:
+        """Have a worker call a function, again where its result was lost on the way, or
+        where the worker is not fit.
 
-        No type of an error tells the work from the way to it, but Dask's state does: a call that ended with an error
-        has the state "error", by word of the scheduler. Whatever else is raised comes from fetching the result, or from
-        a future that was let go when a connection was lost.
+        No type of an error tells the work from the way to it, but Dask's state does: a
+        call that ended with an error has the state "error", by word of the scheduler.
+        Whatever else is raised comes from fetching the result, or from a future that
+        was let go when a connection was lost.
         """
         # comes with the extra `dask`
         from distributed import KilledWorker
@@ -234,24 +330,35 @@ class DaskExecutor(WorkerExecutor):
         while client.status == "running":
             workers = sorted(self._fit)
             future = client.submit(
-                call_there, function, *args, workers=workers, allow_other_workers=False, pure=False, retries=0
+                call_there,
+                function,
+                *args,
+                workers=workers,
+                allow_other_workers=False,
+                pure=False,
+                retries=0,
             )
             try:
                 result = await self._wait(future, workers)
                 if result is not None and not await self._is_refused(client, *result):
                     return result[1]
             except asyncio.CancelledError:
-                if future.status != "cancelled":  # it is this call that nobody wants any more
+                # it is this call that nobody wants any more
+                if future.status != "cancelled":
                     raise
             except KilledWorker:
-                raise WorkerDiedError(f"no answer: {DEATHS} workers died of it") from None
+                raise WorkerDiedError(
+                    f"no answer: {DEATHS} workers died of it"
+                ) from None
             except Exception as error:
                 # nothing of ours raises, so the worker could not even begin
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
                     tries += 1
                     if tries == TRIES:
                         text = f"{type(error).__name__}: {error}"
-                        raise ClusterError(f"{self.where}: a worker cannot begin ({text})") from error
+                        raise ClusterError(
+                            f"{self.where}: a worker cannot begin ({text})"
+                        ) from error
             finally:
                 if client.status == "running":
                     future.release()
@@ -260,7 +367,9 @@ class DaskExecutor(WorkerExecutor):
         raise BrokenExecutor(f"{self.where}: the scheduler has gone")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
-        """Return what a future ends with; None where none of the workers that may do it is left."""
+        """Return what a future ends with; None where none of the workers that may do it
+        is left.
+        """
 
         async def fetch() -> tuple[str, Any]:
             result: tuple[str, Any] = await future
@@ -276,13 +385,20 @@ class DaskExecutor(WorkerExecutor):
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether another worker has to do it, or this one after it was sent files."""
+        """Return whether another worker has to do it, or this one after it was sent
+        files.
+        """
         failure = value.failure if isinstance(value, Reply) else None
-        if failure is Failure.MISSING_FILES and (self._sending is None or not self._sending.done()):
+        if failure is Failure.MISSING_FILES and (
+            self._sending is None or not self._sending.done()
+        ):
             if self._sending is None:
-                sending = client.register_plugin(make_file_plugin(self._contents), name=self._plugin_name)
+                sending = client.register_plugin(
+                    make_file_plugin(self._contents), name=self._plugin_name
+                )
                 self._sending = asyncio.ensure_future(sending)
-            with suppress(Exception):  # a worker that cannot write says so with its next call
+            # a worker that cannot write says so with its next call
+            with suppress(Exception):
                 await asyncio.shield(self._sending)
             return True
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
@@ -297,8 +413,13 @@ class DaskExecutor(WorkerExecutor):
         """Let the workers go, those that were started for this executor for ever."""
         for call in list(self._calls):
             call.cancel()
-        client, cluster = self._client, self._cluster
-        if client is not None and client.status == "running" and self._sending is not None:
+        client = self._client
+        cluster = self._cluster
+        if (
+            client is not None
+            and client.status == "running"
+            and self._sending is not None
+        ):
             with suppress(Exception):
                 client.sync(self._forget_files, client, callback_timeout=RESTART)
         self._client = self._cluster = None
@@ -310,69 +431,132 @@ class DaskExecutor(WorkerExecutor):
 
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 
-JOBS = ("SLURMCluster", "PBSCluster", "LSFCluster", "SGECluster", "MoabCluster", "OARCluster", "HTCondorCluster")
-CLASSES = {**dict.fromkeys(JOBS, "dask_jobqueue"), "KubeCluster": "dask_kubernetes.operator"}
-"""Classes of clusters that a file may name, and where each is; anything else would be code that the file runs."""
+JOBS = (
+    "SLURMCluster",
+    "PBSCluster",
+    "LSFCluster",
+    "SGECluster",
+    "MoabCluster",
+    "OARCluster",
+    "HTCondorCluster",
+)
+CLASSES = {
+    **dict.fromkeys(JOBS, "dask_jobqueue"),
+    "KubeCluster": "dask_kubernetes.operator",
+}
+"""Classes of clusters that a file may name, and where each is; anything else would be
+code that the file runs.
+"""
 
 
 def open_dask(
     task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
 ) -> tuple[DaskExecutor, WorkerTask]:
-    """Return an executor on a cluster, given by its scheduler's address or a YAML file, and the task with what tells
-    its files from others."""
+    """Return an executor on a cluster, given by its scheduler's address or a YAML file,
+    and the task with what tells its files from others.
+    """
     site = site_of(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
-        raise InputError("cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out")
+        raise InputError(
+            "cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out"
+        )
     contents = read_files(task)
-    return DaskExecutor(site, contents, tell), replace(task, digests=file_digests(contents))
+    return DaskExecutor(site, contents, tell), replace(
+        task, digests=file_digests(contents)
+    )
 
 
 def site_of(workers: int | None, cluster: str) -> Site:
-    """Return where workers are, of a scheduler's address or a YAML file, and how many of them are wanted."""
+    """Return where workers are, of a scheduler's address or a YAML file, and how many
+    of them are wanted.
+    """
     if cluster.startswith(SCHEMES):
         site = Site(cluster, address=cluster)
     elif cluster.endswith((".yaml", ".yml")):
         site = _from_file(Path(cluster), workers)
     else:
         raise InputError(
-            f"cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, local, or a .yaml file, got "
+            "cluster: expected the address of a scheduler such as "
+            "tcp://10.0.0.1:8786, local, or a .yaml file, got "
             f"{cluster!r}"
         )
     if site.address and workers is not None:
-        raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        raise InputError(
+            "workers: the scheduler of `cluster` says how many there are; "
+            "leave one of the two out"
+        )
     return site
 
 
 def _from_file(path: Path, workers: int | None) -> Site:
     said: dict[str, Any] = read_yaml(path)
-    unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
+    unknown = sorted(
+        set(said) - {"address", "class", "arguments", "workers", "security"}
+    )
     if unknown or ("address" in said) == ("class" in said):
-        got = f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
-        expected = "expected either address, or class with arguments and workers; beside it security"
+        got = (
+            f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
+        )
+        expected = (
+            "expected either address, or class with arguments and workers; "
+            "beside it security"
+        )
         raise FileFormatError(f"{path}: {expected}; {got}")
     for name in ("security", "arguments"):
         given = said.get(name) or {}
-        if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
-            raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
-    security, arguments = {**(said.get("security") or {})}, said.get("arguments") or {}
-    for name in ("tls_ca_file", "tls_client_cert", "tls_client_key", "tls_scheduler_cert", "tls_scheduler_key"):
+        if not isinstance(given, dict) or not all(
+            isinstance(key, str) for key in given
+        ):
+            raise FileFormatError(
+                f"{path}: {name}: expected names and values, got {given!r}"
+            )
+    security = {**(said.get("security") or {})}
+    arguments = said.get("arguments") or {}
+    for name in (
+        "tls_ca_file",
+        "tls_client_cert",
+        "tls_client_key",
+        "tls_scheduler_cert",
+        "tls_scheduler_key",
+    ):
         if isinstance(security.get(name), str):
             security[name] = str(path.parent / security[name])
     count = said.get("workers") if workers is None else workers
-    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
-        raise FileFormatError(f"{path}: workers: expected a whole number of at least 1, got {count!r}")
+    if count is not None and (
+        isinstance(count, bool) or not isinstance(count, int) or count < 1
+    ):
+        raise FileFormatError(
+            f"{path}: workers: expected a whole number of at least 1, got {count!r}"
+        )
     if "address" in said:
         if not str(said["address"]).startswith(SCHEMES):
-            raise FileFormatError(f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT")
+            raise FileFormatError(
+                f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
+            )
         if "workers" in said:
-            raise FileFormatError(f"{path}: workers: the scheduler says how many there are; leave it out")
-        return Site(str(said["address"]), address=str(said["address"]), security=security or None)
+            raise FileFormatError(
+                f"{path}: workers: the scheduler says how many there are; leave it out"
+            )
+        return Site(
+            str(said["address"]),
+            address=str(said["address"]),
+            security=security or None,
+        )
     name = str(said["class"])
     if name not in CLASSES:
-        raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
+        raise FileFormatError(
+            f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}"
+        )
     try:
         start = getattr(importlib.import_module(CLASSES[name]), name)
     except ImportError:
         package = CLASSES[name].partition(".")[0].replace("_", "-")
-        raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
-    return Site(name, start=partial(start, **arguments), security=security or None, count=count or 1)
+        raise InputError(
+            f"cluster: {name} needs {package}; pip install {package}"
+        ) from None
+    return Site(
+        name,
+        start=partial(start, **arguments),
+        security=security or None,
+        count=count or 1,
+    )

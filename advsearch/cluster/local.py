@@ -1,10 +1,13 @@
 """An executor on processes of this machine.
 
-Why not `ProcessPoolExecutor`: a process that `spawn` starts imports the caller's script again, and modules of the
-standard library (pickle, runpy) from the current folder, where somebody else's file may stand for them; one process
-that dies ends all others with what they are at and have loaded; and processes stay when their parent is killed. These
-here begin with the parent's path, answer over a pipe, listen nowhere, and end when the parent does. Ctrl-C, which a
-terminal sends to its own session, does not reach them."""
+Why not `ProcessPoolExecutor`: a process that `spawn` starts imports the caller's script
+again, and modules of the standard library (pickle, runpy) from the current folder,
+where somebody else's file may stand for them; one process that dies ends all others
+with what they are at and have loaded; and processes stay when their parent is killed.
+These here begin with the parent's path, answer over a pipe, listen nowhere, and end
+when the parent does. Ctrl-C, which a terminal sends to its own session, does not reach
+them.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,10 @@ from advsearch.cluster import DEATHS, WorkerDiedError, WorkerExecutor, WorkerSta
 from advsearch.cluster.worker import SERVING
 from advsearch.errors import InputError
 
-BEGIN = "import sys; sys.path[:] = sys.argv[1:]; from advsearch.cluster.worker import serve; serve()"
+BEGIN = (
+    "import sys; sys.path[:] = sys.argv[1:]; from advsearch.cluster.worker import "
+    "serve; serve()"
+)
 """The path first, or a file in the current folder could stand for a module."""
 
 
@@ -33,18 +39,29 @@ class WorkerProcess:
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVING: "1"}
         command = [sys.executable, "-c", BEGIN, *sys.path]
         self._popen = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environ, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environ,
+            start_new_session=True,
         )
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Have it call a function of a module, and wait for the answer. Raises WorkerDiedError."""
+        """Have it call a function of a module, and wait for the answer. Raises
+        WorkerDiedError.
+        """
         assert self._popen.stdin is not None and self._popen.stdout is not None
         request = pickle.dumps((function, args))
         try:
             self._popen.stdin.write(request)
             self._popen.stdin.flush()
             return pickle.load(self._popen.stdout)
-        except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:  # the other end has gone
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            pickle.UnpicklingError,
+        ) as error:  # the other end has gone
             raise WorkerDiedError from error
 
     def kill(self) -> None:
@@ -59,18 +76,22 @@ class WorkerProcess:
 
 
 class LocalExecutor(WorkerExecutor):
-    """An executor of so many processes, each started when it is needed, and replaced when it died."""
+    """An executor of so many processes, each started when it is needed, and replaced
+    when it died.
+    """
 
     def __init__(self, count: int) -> None:
         if SERVING in os.environ:
             raise InputError(
-                "workers: a module that a worker imports asks for workers itself; put what it asks under "
+                "workers: a module that a worker imports asks for workers itself; put "
+                "what it asks under "
                 '`if __name__ == "__main__":`'
             )
         self.where = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
-        self._threads = ThreadPoolExecutor(count, "worker")  # one waits for the answers of each process
+        # one waits for the answers of each process
+        self._threads = ThreadPoolExecutor(count, "worker")
         self._lock = Lock()
         self._idle: list[WorkerProcess] = []
         self._busy: set[WorkerProcess] = set()
@@ -79,7 +100,9 @@ class LocalExecutor(WorkerExecutor):
     def count_workers(self) -> int:
         return self._count
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(
+        self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> Future[Any]:
         """See `Executor.submit`; for functions of modules and positional arguments."""
         if kwargs:
             raise TypeError("a worker takes positional arguments only")
@@ -115,7 +138,9 @@ class LocalExecutor(WorkerExecutor):
             self.stats.retried += 1
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, also in the middle of a call: what they have under way comes to nothing."""
+        """End the processes, also in the middle of a call: what they have under way
+        comes to nothing.
+        """
         with self._lock:
             self._closed = True
             for process in self._busy:

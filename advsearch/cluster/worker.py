@@ -1,6 +1,8 @@
-"""What runs on a worker: it loads a task with its first batch. Errors go back as values, as they may not survive being
-pickled. Files that a task needs are sent to workers that lack them; with a mesh goes its folder, files in it and below
-of the kinds that a scene consists of."""
+"""What runs on a worker: it loads a task with its first batch. Errors go back as
+values, as they may not survive being pickled. Files that a task needs are sent to
+workers that lack them; with a mesh goes its folder, files in it and below of the kinds
+that a scene consists of.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,12 @@ from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, WorkerTask
-from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
+from advsearch.errors import (
+    AdvsearchError,
+    EnvironmentSetupError,
+    InputError,
+    StorageError,
+)
 from advsearch.files import split_paths
 from advsearch.registry import imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
@@ -44,7 +51,11 @@ MachineInfo = dict[str, str]
 @cache
 def this_machine() -> MachineInfo:
     llvm = ".".join(map(str, ensure_llvm().version))
-    return {"processor": threads.read_processor_name(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
+    return {
+        "processor": threads.read_processor_name(),
+        "LLVM": llvm,
+        **{name: _version(name) for name in PACKAGES},
+    }
 
 
 def machine_name(machine: MachineInfo) -> str:
@@ -53,11 +64,15 @@ def machine_name(machine: MachineInfo) -> str:
 
 @cache
 def version() -> str:
-    """Return the version of advsearch, with a few digits of what its files say, which no version number tells."""
+    """Return the version of advsearch, with a few digits of what its files say, which
+    no version number tells.
+    """
     digest = hashlib.sha256()
     folder = Path(__file__).resolve().parents[1]
     for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(
+            path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes()
+        )
     return f"{_version('advsearch')}+{digest.hexdigest()[:8]}"
 
 
@@ -84,27 +99,42 @@ LARGEST = 1 << 30
 
 
 class MissingFilesError(Exception):
-    """A file is neither where the settings say nor among those that were sent before."""
+    """A file is neither where the settings say nor among those that were sent
+    before.
+    """
 
 
 def read_files(task: WorkerTask) -> dict[str, bytes]:
-    """Read the files that a task's settings name, and those beside them, by their paths."""
+    """Read the files that a task's settings name, and those beside them, by their
+    paths.
+    """
     contents: dict[str, bytes] = {}
     for name in task.files:
         value = task.settings.get(name)
         for part in _split(value) if isinstance(value, str) else ():
             path = Path(part)
             if path.is_absolute() and path.is_file():
-                is_place = name == "environment" and path.suffix.lower() in (".yaml", ".yml")
-                kinds = OF_A_PLACE if is_place else WITH_OTHERS.get(path.suffix.lower(), ())
+                is_place = name == "environment" and path.suffix.lower() in (
+                    ".yaml",
+                    ".yml",
+                )
+                kinds = (
+                    OF_A_PLACE if is_place else WITH_OTHERS.get(path.suffix.lower(), ())
+                )
                 others = sorted(path.parent.rglob("*")) if kinds else []
-                beside = [file for file in others if file.suffix.lower() in (*kinds, *PICTURES) and file.is_file()]
-                inside = [file for file in beside if is_inside(file, path.parent)]  # no link leads elsewhere
+                beside = [
+                    file
+                    for file in others
+                    if file.suffix.lower() in (*kinds, *PICTURES) and file.is_file()
+                ]
+                # no link leads elsewhere
+                inside = [file for file in beside if is_inside(file, path.parent)]
                 contents |= {str(file): file.read_bytes() for file in (path, *inside)}
     size = sum(map(len, contents.values()))
     if size > LARGEST:
         raise InputError(
-            f"cluster: the files of the scene and the model have {size >> 20} MiB, and {LARGEST >> 20} can be "
+            f"cluster: the files of the scene and the model have {size >> 20} MiB, and "
+            f"{LARGEST >> 20} can be "
             "sent; put them in a folder that all workers see, each under the same path"
         )
     return contents
@@ -115,9 +145,14 @@ def file_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
-    """Return where files that are sent stand below a folder, by their paths; each set of files has its own."""
+    """Return where files that are sent stand below a folder, by their paths; each set
+    of files has its own.
+    """
     name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
-    return {path: folder / name / Path(path).relative_to(Path(path).anchor) for path in digests}
+    return {
+        path: folder / name / Path(path).relative_to(Path(path).anchor)
+        for path in digests
+    }
 
 
 def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
@@ -131,8 +166,9 @@ def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
 
 
 def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
-    """Return the task with paths that hold here: its own where all its files are here, or else those below a folder to
-    which they were sent. Raises MissingFilesError."""
+    """Return the task with paths that hold here: its own where all its files are here,
+    or else those below a folder to which they were sent. Raises MissingFilesError.
+    """
     if all(_is(Path(path), digest) for path, digest in task.digests.items()):
         return task
     here = sent_paths(task.digests, folder)
@@ -143,7 +179,9 @@ def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
     for name in task.files:
         value = settings.get(name)
         if isinstance(value, str):
-            settings[name] = "".join(str(here.get(part, part)) for part in _split(value))
+            settings[name] = "".join(
+                str(here.get(part, part)) for part in _split(value)
+            )
     return replace(task, settings=settings)
 
 
@@ -152,7 +190,9 @@ def _is(path: Path, digest: str) -> bool:
 
 
 def _split(value: str) -> Iterator[str]:
-    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and what stands between them."""
+    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and
+    what stands between them.
+    """
     for part in re.split("(,)", value):
         path, mark, inner = part.strip().partition("#")
         first, *second = split_paths(path)
@@ -160,9 +200,13 @@ def _split(value: str) -> Iterator[str]:
         yield from ("+", *second) if second else (mark + inner,)
 
 
-MAX_LOADED = 2  # tasks that a worker keeps loaded; the one that was not used for longest goes
-LOAD_DEADLINE = 900.0  # seconds that loading may take, and a batch before there is a median
-KERNELS, INPUTS = "kernels", "inputs"  # folders below the machine's own: Dr.Jit's kernels, and files that were sent
+# tasks that a worker keeps loaded; the one that was not used for longest goes
+MAX_LOADED = 2
+# seconds that loading may take, and a batch before there is a median
+LOAD_DEADLINE = 900.0
+# folders below the machine's own: Dr.Jit's kernels, and files that were sent
+KERNELS = "kernels"
+INPUTS = "inputs"
 
 _loaded: OrderedDict[str, Call] = OrderedDict()
 _one_at_a_time = threading.Lock()
@@ -193,8 +237,9 @@ class Reply:
 def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
     """Do a batch of a task, which is loaded before unless it is already.
 
-    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, whatever native code it hangs in, and
-    writes to its error output where that was."""
+    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, whatever
+    native code it hangs in, and writes to its error output where that was.
+    """
     worker = f"{platform.node()}, process {os.getpid()}"
     try:
         with _one_at_a_time:
@@ -207,13 +252,19 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
             seconds = time.perf_counter() - start - loading
         return Reply(value, seconds, loading, this_machine(), worker)
     except MissingFilesError as error:
-        return Reply(worker=worker, failure=Failure.MISSING_FILES, error=f"it lacks {error}")
+        return Reply(
+            worker=worker, failure=Failure.MISSING_FILES, error=f"it lacks {error}"
+        )
     except (EnvironmentSetupError, StorageError) as error:
         return Reply(worker=worker, failure=Failure.UNFIT, error=str(error))
     except AdvsearchError as error:
         return Reply(worker=worker, failure=Failure.INPUT, error=str(error))
     except (OSError, ImportError) as error:
-        return Reply(worker=worker, failure=Failure.UNFIT, error=f"{type(error).__name__}: {error}")
+        return Reply(
+            worker=worker,
+            failure=Failure.UNFIT,
+            error=f"{type(error).__name__}: {error}",
+        )
     except Exception:
         return Reply(worker=worker, failure=Failure.BUG, error=traceback.format_exc())
 
@@ -251,16 +302,28 @@ def load_task(task: WorkerTask) -> Call:
 
 def task_key(task: WorkerTask) -> str:
     """Return what tells a task from others."""
-    described = [task.function, task.settings, task.threads, task.code, sorted(task.digests.items())]
+    described = [
+        task.function,
+        task.settings,
+        task.threads,
+        task.code,
+        sorted(task.digests.items()),
+    ]
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
 
 
 def own_folder() -> Path:
-    """Return a folder on this machine's disk that only this user can write to; it outlives the worker."""
+    """Return a folder on this machine's disk that only this user can write to; it
+    outlives the worker.
+    """
     folder = Path(tempfile.gettempdir()) / f"advsearch-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     facts = folder.lstat()
-    mine = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o022
+    mine = (
+        stat.S_ISDIR(facts.st_mode)
+        and facts.st_uid == os.getuid()
+        and not facts.st_mode & 0o022
+    )
     return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
@@ -268,9 +331,11 @@ SERVING = "ADVSEARCH_WORKER"  # environment variable of a process that `serve`s
 
 
 def serve() -> None:
-    """Answer the calls that the process writes which has started this one, a pickled pair (function, arguments) each,
-    until it goes."""
-    calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    """Answer the calls that the process writes which has started this one, a pickled
+    pair (function, arguments) each, until it goes.
+    """
+    calls = os.fdopen(os.dup(0), "rb")
+    answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)  # what code of others prints is no answer
     asked: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()

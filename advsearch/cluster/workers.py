@@ -1,5 +1,7 @@
-"""Batches done by workers: as many calls under way as there are workers, and what is lost is asked for again, at last
-item by item, so that an item that kills its workers is known."""
+"""Batches done by workers: as many calls under way as there are workers, and what is
+lost is asked for again, at last item by item, so that an item that kills its workers is
+known.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,23 @@ from itertools import islice
 from typing import Any
 
 from advsearch import threads
-from advsearch.cluster import BatchResult, WorkerDiedError, WorkerExecutor, Workers, WorkerStats, WorkerTask
+from advsearch.cluster import (
+    BatchResult,
+    WorkerDiedError,
+    WorkerExecutor,
+    Workers,
+    WorkerStats,
+    WorkerTask,
+)
 from advsearch.cluster.local import LocalExecutor
-from advsearch.cluster.worker import LOAD_DEADLINE, Failure, Reply, machine_name, run_batch, this_machine
+from advsearch.cluster.worker import (
+    LOAD_DEADLINE,
+    Failure,
+    Reply,
+    machine_name,
+    run_batch,
+    this_machine,
+)
 from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.registry import imported
@@ -28,7 +44,8 @@ MIN_DEADLINE = 60.0  # seconds that it may take at least
 MEDIAN_OF = 101  # batches, the last ones, of which the median is taken
 MIN_BATCHES = 5  # that a median takes
 
-MAX_DEAD_STARTS = 5  # batches that may kill all their workers before a first one is done
+# batches that may kill all their workers before a first one is done
+MAX_DEAD_STARTS = 5
 POLL = 0.5  # seconds between two looks at who is there
 
 
@@ -68,7 +85,9 @@ class PoolWorkers:
                 while len(running) < n_workers and self._take_next(waiting, source):
                     items = waiting.popleft()
                     deadline = self._deadline(len(items), item_seconds)
-                    future = self._executor.submit(run_batch, self._task, items, deadline)
+                    future = self._executor.submit(
+                        run_batch, self._task, items, deadline
+                    )
                     running[future] = items
                     future.add_done_callback(ended.put)
                 self.facts.most = max(self.facts.most, len(running))
@@ -78,7 +97,11 @@ class PoolWorkers:
                 if ended_future is None:
                     continue
                 items = running.pop(ended_future)
-                error = BrokenExecutor() if ended_future.cancelled() else ended_future.exception()
+                error = (
+                    BrokenExecutor()
+                    if ended_future.cancelled()
+                    else ended_future.exception()
+                )
                 if error is None:
                     reply = ended_future.result()
                     item_seconds.append(reply.seconds / max(1, len(items)))
@@ -90,7 +113,10 @@ class PoolWorkers:
                     raise error
                 elif len(items) > 1:
                     self._count_dead_start()
-                    waiting.extendleft(items[index : index + 1] for index in reversed(range(len(items))))
+                    waiting.extendleft(
+                        items[index : index + 1]
+                        for index in reversed(range(len(items)))
+                    )
                 else:
                     self._count_dead_start()
                     yield BatchResult(items, None, lost=str(error))
@@ -106,18 +132,25 @@ class PoolWorkers:
             return None
 
     @staticmethod
-    def _take_next(waiting: deque[Sequence[Any]], source: Iterator[Sequence[Any]]) -> bool:
+    def _take_next(
+        waiting: deque[Sequence[Any]], source: Iterator[Sequence[Any]]
+    ) -> bool:
         """Have a batch wait, unless one does. Return whether there is one."""
         if not waiting:
             waiting.extend(islice(source, 1))
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return the seconds after which a worker counts as hanging, and ends itself."""
+        """Return the seconds after which a worker counts as hanging, and ends
+        itself.
+        """
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
         else:
-            deadline = max(MIN_DEADLINE, DEADLINE_FACTOR * n_items * statistics.median(item_seconds))
+            deadline = max(
+                MIN_DEADLINE,
+                DEADLINE_FACTOR * n_items * statistics.median(item_seconds),
+            )
         return max(deadline, self._task.seconds or 0.0)
 
     def _result(self, items: Sequence[Any], reply: Reply) -> BatchResult:
@@ -134,26 +167,41 @@ class PoolWorkers:
             machine = None
         elif machine is not None and machine not in self.facts.machines:
             self.facts.machines = {**self.facts.machines, machine: reply.machine}
-            described = ", ".join(f"{key} {text}" for key, text in reply.machine.items())
-            self._tell(f"{reply.worker} is another machine than this ({described}): last bits of rows may differ")
+            described = ", ".join(
+                f"{key} {text}" for key, text in reply.machine.items()
+            )
+            self._tell(
+                f"{reply.worker} is another machine than this ({described}): "
+                "last bits of rows may differ"
+            )
         return BatchResult(items, reply.value, reply.worker, machine)
 
     def _count_dead_start(self) -> None:
-        """Raise ClusterError where workers die of whatever they are given, for example while they load."""
+        """Raise ClusterError where workers die of whatever they are given, for example
+        while they load.
+        """
         self._dead_starts += 1
         if self._dead_starts >= MAX_DEAD_STARTS and not self.facts.batches:
             raise ClusterError(
-                f"{self._executor.where}: workers died of the first {self._dead_starts} batches, and none was done; "
-                "try it with workers=null, or see whether a worker has enough memory for the scene and the model"
+                f"{self._executor.where}: workers died of the first "
+                f"{self._dead_starts} batches, and none was done; "
+                "try it with workers=null, or see whether a worker has enough memory "
+                "for the scene and the model"
             )
 
 
 @contextmanager
 def open_workers(
-    task: WorkerTask, *, workers: int | None, cluster: str | None, tell: Callable[[str], None]
+    task: WorkerTask,
+    *,
+    workers: int | None,
+    cluster: str | None,
+    tell: Callable[[str], None],
 ) -> Iterator[Workers | None]:
-    """Open workers for a task: processes of this machine, by default one a core, or those of a cluster, given by its
-    scheduler's address or a YAML file. None where everything is done in this process."""
+    """Open workers for a task: processes of this machine, by default one a core, or
+    those of a cluster, given by its scheduler's address or a YAML file. None where
+    everything is done in this process.
+    """
     if workers is None and cluster is None:
         yield None
         return

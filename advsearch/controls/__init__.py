@@ -10,7 +10,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from advsearch.catalog import list_built_ins
-from advsearch.controls.base import Budget, Choice, Control, Group, Moved, NumberControl, Parameter, check_prepared
+from advsearch.controls.base import (
+    Budget,
+    Choice,
+    Control,
+    Group,
+    Moved,
+    NumberControl,
+    Parameter,
+    check_prepared,
+)
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
@@ -21,34 +30,47 @@ CONTROLS: Registry[type[Control]] = Registry(
     "advsearch.controls",
     list_built_ins("control"),
     "a subclass of Control whose kind is the name of the entry point",
-    lambda name, entry: isinstance(entry, type) and issubclass(entry, Control) and entry.kind == name != "",
+    lambda name, entry: (
+        isinstance(entry, type)
+        and issubclass(entry, Control)
+        and entry.kind == name != ""
+    ),
     imports=True,
 )
-"""Every control by its word on the command line, imported when it is asked for; and any by "package.module:Class"."""
+"""Every control by its word on the command line, imported when it is asked for; and any
+by "package.module:Class".
+"""
 
 
 def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Control:
     """Return a control from its name and settings.
 
     Args:
-        asked: "kind"; "kind:mesh" for what is about one mesh, and that another than the object (pose:chair); else
-            "kind:name" for an instance with a name of its own (light:key); or "kind.parameter" to search one parameter
-            only, over its default range. With "kind" among the settings, this is the instance's name.
-            A kind is a word, or "package.module:Class" where the class has a capital and the module is no control.
-        settings: values for its parameters and choices; None or missing keeps the default.
+        asked: "kind"; "kind:mesh" for what is about one mesh, and that another than the
+            object (pose:chair); else "kind:name" for an instance with a name of its own
+            (light:key); or "kind.parameter" to search one parameter only, over its
+            default range. With "kind" among the settings, this is the instance's name.
+            A kind is a word, or "package.module:Class" where the class has a capital
+            and the module is no control.
+        settings: values for its parameters and choices; None or missing keeps the
+            default.
 
     Raises:
         UnknownNameError: no such control, or no such setting.
         InputError: a setting is out of range.
     """
-    options: dict[str, Any] = {name: value for name, value in (settings or {}).items() if value is not None}
+    options: dict[str, Any] = {
+        name: value for name, value in (settings or {}).items() if value is not None
+    }
     kind, name, parameter = _read_name(asked, options)
     if kind not in CONTROLS:
         raise unknown_control(kind)
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _default_range(control, parameter))
-    known = [choice.name for choice in control.choices] + [known.name for known in control.declared(options)]
+    known = [choice.name for choice in control.choices] + [
+        known.name for known in control.declared(options)
+    ]
     for setting in options:  # "name" is none that can be given
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
@@ -57,21 +79,37 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     return control(**options)
 
 
-def unknown_control(kind: str, hint: str = "", instances: Iterable[str] = ()) -> UnknownNameError:
-    """Return the error for a control that there is not; it says of which it is a parameter, or else the hint."""
+def unknown_control(
+    kind: str, hint: str = "", instances: Iterable[str] = ()
+) -> UnknownNameError:
+    """Return the error for a control that there is not; it says of which it is a
+    parameter, or else the hint.
+    """
     usable = CONTROLS.list_usable().items()
-    owners = [name for name, control in usable if any(one.name == kind for one in control.parameters)]
-    of = f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}." if owners else hint
+    owners = [
+        name
+        for name, control in usable
+        if any(one.name == kind for one in control.parameters)
+    ]
+    of = (
+        f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}."
+        if owners
+        else hint
+    )
     return UnknownNameError("control", kind, {*CONTROLS, *instances}, of)
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
-    """Return the kind and the name of the instance that `make_control` makes of a name and settings."""
+    """Return the kind and the name of the instance that `make_control` makes of a name
+    and settings.
+    """
     return _read_name(asked, dict(given))[:2]
 
 
 def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
-    """Return kind, instance name and single parameter; takes "kind" out of the settings."""
+    """Return kind, instance name and single parameter; takes "kind" out of the
+    settings.
+    """
     kind, colon, name = asked.partition(":")
     kind, dot, parameter = kind.partition(".")
     kind_given = given.pop("kind", None)
@@ -84,8 +122,9 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
 
 
 def instance_of(kind: str, name: str) -> str:
-    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh; the
-    name is empty where there is no colon."""
+    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where
+    the name is that of a mesh; the name is empty where there is no colon.
+    """
     of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
     if not name or (of_a_mesh and name == OBJECT):
         return kind
@@ -93,31 +132,45 @@ def instance_of(kind: str, name: str) -> str:
 
 
 def check_instance(where: str, name: str, colon: str = ":") -> None:
-    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where it has other characters than
-    letters, digits, dashes and underscores, or is empty."""
+    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where
+    it has other characters than letters, digits, dashes and underscores, or is empty.
+    """
     if colon and not re.fullmatch(r"[\w-]+", name):
-        raise InputError(f"{where}: expected a name of letters, digits, - and _ after the colon, got {name!r}")
+        raise InputError(
+            f"{where}: expected a name of letters, digits, - and _ after "
+            f"the colon, got {name!r}"
+        )
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
     if not control.parameters:
         raise InputError(
-            f"`controls` {control.kind}.{parameter}: expected a range, as in {control.kind}:{parameter}=[0.2, 0.8]"
+            f"`controls` {control.kind}.{parameter}: expected a range, as in "
+            f"{control.kind}:{parameter}=[0.2, 0.8]"
         )
     declared = {one.name: one for one in control.declared((parameter,))}
     if parameter not in declared:
-        raise UnknownNameError(f"parameter of control {control.kind}", parameter, declared)
+        raise UnknownNameError(
+            f"parameter of control {control.kind}", parameter, declared
+        )
     named = declared[parameter]
-    return {"choices": list(named.options)} if named.options else list(named.search or (named.low, named.high))
+    return (
+        {"choices": list(named.options)}
+        if named.options
+        else list(named.search or (named.low, named.high))
+    )
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError: one has
-    something else than settings."""
+    """Return the settings of each control, with ranges of Mitsuba's names under one.
+    Raises InputError: one has something else than settings.
+    """
     by_name: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
-            raise InputError(f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}")
+            raise InputError(
+                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}"
+            )
         by_name[name] = given or {}
     return by_name
 
@@ -128,7 +181,8 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
     `camera.azimuth` and `camera.elevation` become one control that searches both.
 
     Args:
-        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
+        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or
+            "kind:name.parameter".
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, given in settings_by_name(asked).items():
@@ -144,43 +198,57 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
-    InputError: no control, two of one name, one that the scene cannot take, or nothing that varies."""
+    """Let controls prepare a scene, bind them to it and compose them into something
+    that can be searched. Raises InputError: no control, two of one name, one that the
+    scene cannot take, or nothing that varies.
+    """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
     if not len(space.start):
-        first, names = space.controls[0], ", ".join(control.name for control in controls)
+        first = space.controls[0]
+        names = ", ".join(control.name for control in controls)
         example = f"{first.name}:KEY=[0.2, 0.8]"
         if first.parameters:
-            one = next((one for one in first.own if one.search is not None), first.own[0])
+            one = next(
+                (one for one in first.own if one.search is not None), first.own[0]
+            )
             low, high = one.search or (one.low, one.high)
             example = f"{first.name}={{{one.name}: [{low:g}, {high:g}]}}"
         raise InputError(
-            f"`controls` {names}: every parameter is fixed, so there is nothing to search; give one a range, "
+            f"`controls` {names}: every parameter is fixed, so there is nothing to "
+            "search; give one a range, "
             f"such as {example}"
         )
     return space
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do. Raises
-    InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
-    asked to have."""
+    """Let controls prepare a scene, bind them to it and compose them; none, or only
+    fixed ones, will do. Raises InputError: two controls of one name, one that the scene
+    cannot take, or one that leaves out what the scene was asked to have.
+    """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(
-            f"controls: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
+            "controls: every instance needs a name of its own, got "
+            f"{', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )
     for control in controls:
         if control.name != control.kind and control.name in scene.around:
-            able = ", ".join(kind for kind, usable in CONTROLS.list_usable().items() if usable.of_a_mesh)
+            able = ", ".join(
+                kind
+                for kind, usable in CONTROLS.list_usable().items()
+                if usable.of_a_mesh
+            )
             raise InputError(
-                f"`controls` {control.kind}:{control.name}: {control.kind} can't be given to another mesh than the "
+                f"`controls` {control.kind}:{control.name}: {control.kind} can't be "
+                "given to another mesh than the "
                 f"object; {able} can, as in pose:{control.name}"
             )
-    described, moved = scene, list[Moved]()
+    described = scene
+    moved = list[Moved]()
     for control in controls:
         prepared = control.prepare(scene)
         moved += check_prepared(control.name, scene, prepared)
@@ -190,15 +258,22 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             control.mesh_in(scene)
     bound = tuple(control.bind(scene) for control in controls)
     moved = sorted(
-        [*moved, *(one for control in bound for one in control.moved)], key=lambda one: names.index(one.control)
+        [*moved, *(one for control in bound for one in control.moved)],
+        key=lambda one: names.index(one.control),
     )
     lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
-    lit_by += [scene.environment_spec] if scene.environment_spec != described.environment_spec else []
+    lit_by += (
+        [scene.environment_spec]
+        if scene.environment_spec != described.environment_spec
+        else []
+    )
     return Space(bound, scene, tuple(moved), lit_by[0] if lit_by else None)
 
 
 def __getattr__(name: str) -> Any:
-    """Import the class of a control when it is asked for by name: TextureControl, or Texture for short."""
+    """Import the class of a control when it is asked for by name: TextureControl, or
+    Texture for short.
+    """
     return get_class("control", name if name.endswith("Control") else f"{name}Control")
 
 

@@ -1,9 +1,11 @@
-"""The `background` control: a plain colour behind the object, in place of what the camera sees of the environment.
+"""The `background` control: a plain colour behind the object, in place of what the
+camera sees of the environment.
 
     sRGB = hsv(hue, saturation, value);   backdrop = linear(sRGB)
 
-The environment keeps lighting the object (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and
-value are the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values.
+The environment keeps lighting the object (Xiao et al. 2020, Noise or signal, arXiv
+2006.09994). Hue, saturation and value are the hexcone model of Smith (Color gamut
+transform pairs, SIGGRAPH 1978), in display-referred values.
 """
 
 from __future__ import annotations
@@ -15,7 +17,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, Fixed, InputError, Parameter, SceneDescription, Value, Values, color
+from advsearch.extend import (
+    Choice,
+    Control,
+    Fixed,
+    InputError,
+    Parameter,
+    SceneDescription,
+    Value,
+    Values,
+    color,
+)
 
 COLOR = "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1]
 WHAT = ("colour", "environment")
@@ -30,21 +42,47 @@ class BackgroundControl(Control):
     kind = "background"
     amount = "what"
     parameters = (
-        Parameter.named("what", WHAT, "colour", "What is behind the object: the colour, or the environment as ever."),
-        _image("hue", "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", (0.0, 360.0), periodic=True),
+        Parameter.named(
+            "what",
+            WHAT,
+            "colour",
+            "What is behind the object: the colour, or the environment as ever.",
+        ),
+        _image(
+            "hue",
+            "degrees",
+            0.0,
+            360.0,
+            0.0,
+            "Hue: 0 is red, 120 green, 240 blue.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
         _image("saturation", "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", (0.0, 1.0)),
-        _image("value", "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", (0.0, 1.0)),
+        _image(
+            "value",
+            "sRGB",
+            0.0,
+            1.0,
+            0.5,
+            "The largest of red, green and blue: 0 is black.",
+            (0.0, 1.0),
+        ),
     )
-    choices = (Choice("ground", "hide", "Whether the ground plane stays in the picture: keep or hide.",
+    choices = (Choice("ground", "hide", "Whether the ground plane stays in the "
+                                        "picture: keep or hide.",
                       options=("keep", "hide")),)  # fmt: skip
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
         # a list for `what` alone leaves the colour to be searched
-        self.asked = any(not isinstance(self.specs.get(name, Fixed(0.0)), Fixed) for name in NUMBERS)
+        self.asked = any(
+            not isinstance(self.specs.get(name, Fixed(0.0)), Fixed) for name in NUMBERS
+        )
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(
-                f"{self.name}.what: environment alone leaves nothing to search; use what=[colour, environment], or "
+                f"{self.name}.what: environment alone leaves nothing to search; use "
+                "what=[colour, environment], or "
                 f"leave the control out"
             )
 
@@ -59,21 +97,31 @@ class BackgroundControl(Control):
         scene = replace(scene, backdrop=True)
         return scene.without_ground() if self.chosen["ground"] == "hide" else scene
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":
             return {}
-        return {COLOR: color.srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))}
+        return {
+            COLOR: color.srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))
+        }
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         levels = hsv_to_rgb(*(values[name] for name in NUMBERS))
         channels = zip(color.CHANNELS, levels, strict=True)
-        return {name: Value(value=float(level), unit="sRGB") for name, level in channels}
+        return {
+            name: Value(value=float(level), unit="sRGB") for name, level in channels
+        }
 
 
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
-    """Return the (3,) colour of a hue in degrees and a saturation and a value in [0, 1]; all display-referred.
+    """Return the (3,) colour of a hue in degrees and a saturation and a value in [0,
+    1]; all display-referred.
 
-    Piecewise linear in each argument, so differentiable almost everywhere; a grey has no derivative by hue but zero.
+    Piecewise linear in each argument, so differentiable almost everywhere; a grey has
+    no derivative by hue but zero.
     """
     sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
     ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)

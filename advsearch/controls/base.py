@@ -1,13 +1,14 @@
-"""What a control is: a named family of scene parameters that may vary, and their map from the unit box.
+"""What a control is: a named family of scene parameters that may vary, and their map
+from the unit box.
 
-A control declares its parameters as data. Bound to a scene it has a slice of u and the map from it to scene inputs, in
-torch. Most are a handful of named numbers, each fixed, a range, or a list: they declare the parameters, and say in
-`scene_inputs` what they do to the scene (docs/controls/writing.md):
+A control declares its parameters as data. Bound to a scene it has a slice of u and the
+map from it to scene inputs, in torch. Most are a handful of named numbers, each fixed,
+a range, or a list: they declare the parameters, and say in `scene_inputs` what they do
+to the scene (docs/controls/writing.md):
 
-    class Exposure(Control):
-        kind = "exposure"
-        summary = "How bright the picture is."
-        parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered exposure.", search=(-2, 2)),)
+    class Exposure(Control): kind = "exposure" summary = "How bright the picture is."
+        parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered
+        exposure.", search=(-2, 2)),)
 
         def scene_inputs(self, values, so_far):
             return {"camera.exposure": values["stops"]}
@@ -25,13 +26,29 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, plain, read, same, shown
+from advsearch.controls.ranges import (
+    Fixed,
+    Number,
+    OneOf,
+    Range,
+    Slot,
+    Spec,
+    plain,
+    read,
+    same,
+    shown,
+)
 from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
 from advsearch.options import rounded
-from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription, check_one_environment
+from advsearch.scene.description import (
+    ENVIRONMENT,
+    OBJECT,
+    SceneDescription,
+    check_one_environment,
+)
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients import Budget as Budget
 from advsearch.scene.gradients import Group as Group
@@ -42,18 +59,21 @@ from advsearch.scene.settings import Parameter as Parameter
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
+# no distance from where a control starts is larger, in whichever norm
+LARGEST_EPSILON = 1e6
 
-# Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
-# refused. Where it leaves out only a default, the clean scene has the nearest value that the control allows, and that
-# is said: a `Moved`.
+# Where a control leaves out a value of the clean scene that was asked for, the two
+# contradict each other, and that is refused. Where it leaves out only a default, the
+# clean scene has the nearest value that the control allows, and that is said: a
+# `Moved`.
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A value of the clean scene that a control leaves out, although nobody asked for it: that of a parameter
-    (``pose.yaw``, ``ground.size``, ``environment``), in a unit ("name" of names), as the scene described it, and the
-    one that is used instead."""
+    """A value of the clean scene that a control leaves out, although nobody asked for
+    it: that of a parameter (``pose.yaw``, ``ground.size``, ``environment``), in a unit
+    ("name" of names), as the scene described it, and the one that is used instead.
+    """
 
     control: str
     parameter: str
@@ -66,36 +86,57 @@ def sentences(moved: Sequence[Moved]) -> list[str]:
     """Return what is said of the values that had to move: one sentence a control."""
 
     def instead(value: Moved) -> str:
-        unit = "" if value.unit in ("1", "name") or isinstance(value.used, str) else f" {value.unit}"
-        short = [end if isinstance(end, str) else rounded(end) for end in (value.used, value.scene)]
-        used, scene = short if short[0] != short[1] else (shown(value.used), shown(value.scene))
+        unit = (
+            ""
+            if value.unit in ("1", "name") or isinstance(value.used, str)
+            else f" {value.unit}"
+        )
+        short = [
+            end if isinstance(end, str) else rounded(end)
+            for end in (value.used, value.scene)
+        ]
+        used, scene = (
+            short if short[0] != short[1] else (shown(value.used), shown(value.scene))
+        )
         return f"{value.parameter} {used}{unit} instead of {scene}"
 
     return [
-        f"The clean scene has {' and '.join(map(instead, several))}, which the control {control} leaves out."
+        f"The clean scene has {' and '.join(map(instead, several))}, which the control "
+        f"{control} leaves out."
         for control, several in groupby(moved, key=lambda value: value.control)
     ]
 
 
-def check_prepared(control: str, before: SceneDescription, after: SceneDescription) -> Iterator[Moved]:
-    """Yield what a control has replaced in a scene by what it needs there, and nobody has described. Raises InputError
-    where it was asked for."""
+def check_prepared(
+    control: str, before: SceneDescription, after: SceneDescription
+) -> Iterator[Moved]:
+    """Yield what a control has replaced in a scene by what it needs there, and nobody
+    has described. Raises InputError where it was asked for.
+    """
     if after.environment is not None and after.environment is not before.environment:
         check_one_environment(after.parts, f"`controls` {control}")
         if ENVIRONMENT in before.given:
             raise InputError(
-                f"`environment={before.environment_spec}` and `controls` {control} contradict each other: the control "
+                f"`environment={before.environment_spec}` and `controls` {control} "
+                "contradict each other: the control "
                 f"puts {after.environment.name} in its place; leave one of the two out"
             )
         if after.environment_spec == before.environment_spec:
-            yield Moved(control, ENVIRONMENT, "name", before.environment_spec, after.environment.name)
+            yield Moved(
+                control,
+                ENVIRONMENT,
+                "name",
+                before.environment_spec,
+                after.environment.name,
+            )
     for name, value in after.values.items():
         scene = before.values[name]
         if value is None or scene is None or same(value, scene):
             continue
         if name in before.given:
             raise InputError(
-                f"`set` {name}={shown(scene)} and `controls` {control} contradict each other: the control makes it "
+                f"`set` {name}={shown(scene)} and `controls` {control} contradict each "
+                "other: the control makes it "
                 f"{rounded(value)}; change one of the two, or leave one out"
             )
         yield Moved(control, name, SETTINGS[name].unit, scene, value)
@@ -105,7 +146,9 @@ HANDED = (
     "prepare", "bind", "inputs", "picture", "describe", "artifacts", "printed", "numbers", "files", "scene_inputs",
     "on_picture", "measured", "kept_pictures", "kept_files",
 )  # fmt: skip
-"""Methods of controls to which those of another package are handed copies of tensors."""
+"""Methods of controls to which those of another package are handed copies of
+tensors.
+"""
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
@@ -118,11 +161,13 @@ class Choice:
         name: short name.
         default: what it is when nothing is said.
         description: one sentence.
-        run_setting: the setting of a whole run that says it for all controls ("epsilon"), unless the control itself
-            says something else; empty if there is none.
-        bounds: the parameter that it says something about; empty if it counts always. Where that parameter is not
-            searched, the control does not take the setting.
-        fixes: the parameter that is not searched where this is chosen; empty if there is none.
+        run_setting: the setting of a whole run that says it for all controls
+            ("epsilon"), unless the control itself says something else; empty if there
+            is none.
+        bounds: the parameter that it says something about; empty if it counts always.
+            Where that parameter is not searched, the control does not take the setting.
+        fixes: the parameter that is not searched where this is chosen; empty if there
+            is none.
         options: the names that can be chosen; empty for anything else.
         whole: the smallest and the largest whole number that can be chosen, or None.
         most: the largest number that can be chosen, all over 0; None for anything else.
@@ -141,37 +186,48 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError:
-        it cannot be chosen."""
-        allowed, fits = "", True
+        """Check what was chosen in an instance of a control; None is fine where it is
+        the default. Raises InputError: it cannot be chosen.
+        """
+        allowed = ""
+        fits = True
         if self.options:
-            allowed, fits = f"one of {', '.join(self.options)}", given in self.options
+            allowed = f"one of {', '.join(self.options)}"
+            fits = given in self.options
         elif self.whole is not None:
             low, high = self.whole
             allowed = f"a whole number from {low} to {high}"
-            fits = Parameter.is_number(given) and low <= given <= high and given == int(given)
+            fits = (
+                Parameter.is_number(given)
+                and low <= given <= high
+                and given == int(given)
+            )
         elif self.most is not None and self.signed:
             allowed = f"a number from {-self.most:g} to {self.most:g}"
             fits = Parameter.is_number(given) and abs(given) <= self.most
         elif self.most is not None:
-            allowed, fits = (
-                f"a number over 0 and up to {self.most:g}",
-                Parameter.is_number(given) and 0.0 < given <= self.most,
-            )
+            allowed = f"a number over 0 and up to {self.most:g}"
+            fits = Parameter.is_number(given) and 0.0 < given <= self.most
         if not fits and not (given is None and self.default is None):
-            raise InputError(f"{control}.{self.name}: expected {allowed}, got {given!r}")
+            raise InputError(
+                f"{control}.{self.name}: expected {allowed}, got {given!r}"
+            )
 
 
 Values = Mapping[str, Tensor]
-"""A configuration: parameter name to a float32 tensor of the parameter's shape; of a discrete choice, its number."""
+"""A configuration: parameter name to a float32 tensor of the parameter's shape; of a
+discrete choice, its number.
+"""
 
 
 class Control:
-    """A family of scene parameters. `bind` returns a copy with a scene, which has a slice of u and maps it to inputs.
+    """A family of scene parameters. `bind` returns a copy with a scene, which has a
+    slice of u and maps it to inputs.
 
-    It is made of named numbers and choices. Once one parameter is given a range or a list, only those given so are
-    searched; otherwise each parameter is searched over its own `search` range, if it has one. Of a picture among the
-    parameters, the numbers are not said one by one.
+    It is made of named numbers and choices. Once one parameter is given a range or a
+    list, only those given so are searched; otherwise each parameter is searched over
+    its own `search` range, if it has one. Of a picture among the parameters, the
+    numbers are not said one by one.
 
     Args:
         name: the instance's name; the kind unless given.
@@ -182,35 +238,44 @@ class Control:
         summary: one sentence; of a class that says none, the first of its docstring.
         parameters: what may vary.
         choices: what may be chosen.
-        of_a_mesh: it is about one mesh, and may be about another than the object: the name of that is then `KIND:MESH`.
-        amount: the parameter whose value in the scene as it was described means that the rest of the control does not
-            show: the power of a lamp, say. None where the scene has all parameters of itself.
+        of_a_mesh: it is about one mesh, and may be about another than the object: the
+            name of that is then `KIND:MESH`.
+        amount: the parameter whose value in the scene as it was described means that
+            the rest of the control does not show: the power of a lamp, say. None where
+            the scene has all parameters of itself.
         own: the parameters of this instance: `declared` of its settings.
         chosen: what is chosen, by name; the default where nothing was said.
         specs: what parameters were set to, of those that were given.
         asked: whether a parameter was given a range or a list.
         scene: once bound, the scene that all controls of the space have prepared.
-        start: once bound, (d,) float32 in [0, 1], the value that leaves the scene as it is.
-        groups: once bound, the coordinates of the slice in order; their sizes add up to d.
-        slots: once bound, each parameter with what it is set to, in the order of its coordinates; none where its
-            coordinates are no parameters one by one.
-        moved: once bound, values of the clean scene that the start has not, because the control leaves them out.
-        refines: the scene inputs that it takes from the controls before it, and may change (a patch on a texture).
-        on_top: what it refines lies over what all other controls make of it, whatever the order in which they were
-            asked for (a patch on any material).
-        exposure: seconds that the shutter is open, and that the rows of a picture are read in, below 0 from the bottom;
-            see `advsearch.scene.formation`.
+        start: once bound, (d,) float32 in [0, 1], the value that leaves the scene as it
+            is.
+        groups: once bound, the coordinates of the slice in order; their sizes add up to
+            d.
+        slots: once bound, each parameter with what it is set to, in the order of its
+            coordinates; none where its coordinates are no parameters one by one.
+        moved: once bound, values of the clean scene that the start has not, because the
+            control leaves them out.
+        refines: the scene inputs that it takes from the controls before it, and may
+            change (a patch on a texture).
+        on_top: what it refines lies over what all other controls make of it, whatever
+            the order in which they were asked for (a patch on any material).
+        exposure: seconds that the shutter is open, and that the rows of a picture are
+            read in, below 0 from the bottom; see `advsearch.scene.formation`.
         flashes: how often a second it changes its light at most.
-        travels: whether it moves something along a path; it has `seconds` and `distances()` then, and its parameter
-            `WAY` says which path is taken where there are several.
-        competes_with_ambient: whether it throws light that ambient light weakens, see `ambient`.
+        travels: whether it moves something along a path; it has `seconds` and
+            `distances()` then, and its parameter `WAY` says which path is taken where
+            there are several.
+        competes_with_ambient: whether it throws light that ambient light weakens, see
+            `ambient`.
 
     Raises:
         UnknownNameError: no such parameter or choice.
         InputError: a value is out of range.
     """
 
-    WAY: ClassVar[str] = "way"  # the parameter that says which of several paths is taken
+    # the parameter that says which of several paths is taken
+    WAY: ClassVar[str] = "way"
     kind: ClassVar[str]
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -239,18 +304,31 @@ class Control:
         self.name = name or self.kind
         settings = {setting: as_setting(value) for setting, value in settings.items()}
         self.own = self.declared(settings)
-        known = [parameter.name for parameter in self.own] + [choice.name for choice in self.choices]
+        known = [parameter.name for parameter in self.own] + [
+            choice.name for choice in self.choices
+        ]
         for setting in settings:
             if setting not in known:
-                raise UnknownNameError(f"setting of control {self.kind}", setting, known)
-        given = {setting: plain(value) for setting, value in settings.items() if value is not None}
+                raise UnknownNameError(
+                    f"setting of control {self.kind}", setting, known
+                )
+        given = {
+            setting: plain(value)
+            for setting, value in settings.items()
+            if value is not None
+        }
         self._given: dict[str, Any] = given
-        self.chosen: dict[str, Any] = {choice.name: given.get(choice.name, choice.default) for choice in self.choices}
+        self.chosen: dict[str, Any] = {
+            choice.name: given.get(choice.name, choice.default)
+            for choice in self.choices
+        }
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
         self.specs = {
-            parameter.name: read(f"{self.name}.{parameter.name}", parameter, given[parameter.name])
+            parameter.name: read(
+                f"{self.name}.{parameter.name}", parameter, given[parameter.name]
+            )
             for parameter in self.own
             if parameter.name in given
         }
@@ -258,21 +336,32 @@ class Control:
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings, by name, perhaps with the values: those of
-        the class, unless the scene or the settings name them."""
+        """Return the parameters of an instance that is given some settings, by name,
+        perhaps with the values: those of the class, unless the scene or the settings
+        name them.
+        """
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing. Raises InputError:
-        a choice is out of range."""
+        """Check what the choices' own declarations do not say of `self.chosen`; by
+        default nothing. Raises InputError: a choice is out of range.
+        """
 
     def settings(self) -> dict[str, object]:
-        """Return what `make_control` needs to make an equal instance, as JSON values."""
-        return {"kind": self.kind, **self._given} if self.name != self.kind else dict(self._given)
+        """Return what `make_control` needs to make an equal instance, as JSON
+        values.
+        """
+        return (
+            {"kind": self.kind, **self._given}
+            if self.name != self.kind
+            else dict(self._given)
+        )
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh that it is about: the one behind the colon of its name, or else the object."""
+        """Name of the mesh that it is about: the one behind the colon of its name, or
+        else the object.
+        """
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     @property
@@ -281,38 +370,57 @@ class Control:
         return file_name(self.name)
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene. Raises UnknownNameError: there is none of that name."""
+        """Return that mesh in a scene. Raises UnknownNameError: there is none of that
+        name.
+        """
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
-        if any(part.name == mesh for part in scene.parts if isinstance(part, PluginPart)):
+        if any(
+            part.name == mesh for part in scene.parts if isinstance(part, PluginPart)
+        ):
             raise InputError(
-                f"`controls` {self.name}: {mesh} is around the object in a Mitsuba scene, and stays as it is; "
-                f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{mesh}.KEY=[low, high]"
+                f"`controls` {self.name}: {mesh} is around the object in a Mitsuba "
+                "scene, and stays as it is; "
+                "make it the object, or vary its numbers by Mitsuba's names, "
+                f"mitsuba:{mesh}.KEY=[low, high]"
             )
-        raise UnknownNameError("mesh of the scene", mesh, scene.meshes, f"It stands in `controls` {self.name}.")
+        raise UnknownNameError(
+            "mesh of the scene",
+            mesh,
+            scene.meshes,
+            f"It stands in `controls` {self.name}.",
+        )
 
     def setting(self, parameter: Parameter) -> str:
-        """Return the name of the scene's setting that says the same as a parameter, whether or not there is one."""
+        """Return the name of the scene's setting that says the same as a parameter,
+        whether or not there is one.
+        """
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def chosen_form(self, forms: Sequence[str]) -> str:
-        """Return which form of itself a control takes, where each of its parameters stands for one, and the choice
-        `form` for any.
+        """Return which form of itself a control takes, where each of its parameters
+        stands for one, and the choice `form` for any.
 
         Args:
             forms: the forms, in the order of the parameters; the first is the default.
 
         Raises:
-            InputError: two forms are asked for, or a parameter was given a range of its own.
+            InputError: two forms are asked for, or a parameter was given a range of its
+                own.
             UnknownNameError: there is no such form.
         """
         asked = []
         for parameter, form in zip(self.parameters, forms, strict=True):
             chosen = self._given.get(parameter.name)
-            if chosen not in (None, [parameter.low, parameter.high], (parameter.low, parameter.high)):
+            if chosen not in (
+                None,
+                [parameter.low, parameter.high],
+                (parameter.low, parameter.high),
+            ):
                 raise InputError(
-                    f"{self.name}.{parameter.name}: expected no value but [{parameter.low:g}, {parameter.high:g}], got "
+                    f"{self.name}.{parameter.name}: expected no value but "
+                    f"[{parameter.low:g}, {parameter.high:g}], got "
                     f"{chosen!r}; set how far it may go with {self.name}.epsilon"
                 )
             asked += [] if chosen is None else [form]
@@ -321,23 +429,41 @@ class Control:
             if asked[-1] not in forms:
                 raise UnknownNameError(f"{self.name}.form", asked[-1], forms)
         if len(set(asked)) > 1:
-            raise InputError(f"{self.name}.form: expected one form, got {', '.join(asked)}")
+            raise InputError(
+                f"{self.name}.form: expected one form, got {', '.join(asked)}"
+            )
         return asked[0] if asked else forms[0]
 
     def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
-        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
+        """Return the values, one by one, that a parameter was set to; others where
+        nothing was said of it.
+        """
         spec = self.specs.get(parameter)
-        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
+        return (
+            spec.values
+            if isinstance(spec, OneOf)
+            else (spec.value,)
+            if isinstance(spec, Fixed)
+            else otherwise
+        )
 
     def searches(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is searched."""
-        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
+        """Return whether a parameter with a range of its own is among what is
+        searched.
+        """
+        return (
+            not isinstance(self.specs[parameter], Fixed)
+            if parameter in self.specs
+            else not self.asked
+        )
 
-    # ---- in a scene -------------------------------------------------------------------------------------------------
+    # ---- in a scene
+    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-        Raises InputError: the scene cannot take it."""
+        """Return the scene with whatever this control needs to be in it (a light, a
+        medium); by default unchanged. Raises InputError: the scene cannot take it.
+        """
         return scene
 
     def within(self, scene: SceneDescription) -> Self:
@@ -347,42 +473,61 @@ class Control:
         return there
 
     def bind(self, scene: SceneDescription) -> Self:
-        """Return a copy that is fit to a scene that all controls of the space have prepared. Raises InputError: a
-        setting of the control is impossible in this scene."""
+        """Return a copy that is fit to a scene that all controls of the space have
+        prepared. Raises InputError: a setting of the control is impossible in this
+        scene.
+        """
         bound = self.within(scene)
         bound.fit()
         return bound
 
     def fit(self) -> None:
-        """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`. Raises InputError: a
-        setting of the control is impossible in this scene."""
-        slots, begin = list[Slot](), 0
+        """Set `start` and `groups`, and `moved` where there is something to say, for
+        `self.scene`. Raises InputError: a setting of the control is impossible in this
+        scene.
+        """
+        slots = list[Slot]()
+        begin = 0
         for parameter, spec in self.laid_out():
             slot = Slot(parameter, spec, begin)
             slots.append(slot)
             begin += slot.width
         self.slots = tuple(slots)
         self.moved = tuple(self._list_moved())
-        self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
+        self.start = torch.tensor(
+            [share for slot in slots for share in slot.start()], dtype=torch.float32
+        )
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
-        ranges = [slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0) for slot in slots]
-        ends = torch.tensor([(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64).reshape(-1, 2)
+        ranges = [
+            slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
+            for slot in slots
+        ]
+        ends = torch.tensor(
+            [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
+        ).reshape(-1, 2)
         widths = torch.tensor([slot.width for slot in slots], dtype=torch.long)
         self._low, self._span = ends.T.repeat_interleave(widths, dim=1)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as this scene has it: with its value in the unchanged scene as the default, the range that
-        is searched when nothing is said about it, and the unit, the shape and the estimators that it has there."""
+        """Return a parameter as this scene has it: with its value in the unchanged
+        scene as the default, the range that is searched when nothing is said about it,
+        and the unit, the shape and the estimators that it has there.
+        """
         value = self.scene.values.get(self.setting(parameter))
         return parameter if value is None else replace(parameter, default=value)
 
     def resting(self, name: str) -> Number:
         """Return the value of a parameter in the unchanged scene."""
-        return next(self.in_scene(parameter).default for parameter in self.own if parameter.name == name)
+        return next(
+            self.in_scene(parameter).default
+            for parameter in self.own
+            if parameter.name == name
+        )
 
     def unchanged(self, parameter: Parameter) -> Number:
-        """Return what a parameter, as `in_scene` has it, is in the scene as it was described: its default, unless that
-        changes the scene."""
+        """Return what a parameter, as `in_scene` has it, is in the scene as it was
+        described: its default, unless that changes the scene.
+        """
         return parameter.default
 
     def spec(self, parameter: Parameter) -> Spec:
@@ -391,59 +536,101 @@ class Control:
             return self.specs[parameter.name]
         if self.asked or parameter.search is None:
             return Fixed(parameter.default)
-        return OneOf(parameter.options) if parameter.options else Range(*parameter.search)
+        return (
+            OneOf(parameter.options) if parameter.options else Range(*parameter.search)
+        )
 
     def budget_of(self, parameter: Parameter) -> Budget:
         """Return how far a searched parameter may go: by default its whole range."""
         return WHOLE_RANGE
 
     def laid_out(self) -> Iterator[tuple[Parameter, Spec]]:
-        """Yield the parameters in the order of their coordinates, each with what it is set to."""
+        """Yield the parameters in the order of their coordinates, each with what it is
+        set to.
+        """
         for parameter in map(self.in_scene, self.own):
             yield parameter, self.spec(parameter)
 
     def is_compared(self, parameter: Parameter, spec: Spec) -> bool:
-        """Return whether the start has to have the clean scene's value of a parameter; by default always."""
+        """Return whether the start has to have the clean scene's value of a parameter;
+        by default always.
+        """
         return True
 
     def note_moved(self, parameter: Parameter, scene: Number, used: Number) -> None:
         """Note that the start has another value of a parameter than the clean scene."""
-        self.moved = (*self.moved, Moved(self.name, f"{self.name}.{parameter.name}", parameter.unit, scene, used))
+        self.moved = (
+            *self.moved,
+            Moved(
+                self.name, f"{self.name}.{parameter.name}", parameter.unit, scene, used
+            ),
+        )
 
     def _list_moved(self) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not. Raises InputError: one of them was asked for."""
+        """Yield the values of the clean scene that the start has not. Raises
+        InputError: one of them was asked for.
+        """
         for slot in self.slots:
             if not self.is_compared(slot.parameter, slot.spec):
                 continue
-            parameter, wanted, used = slot.parameter, self.unchanged(slot.parameter), slot.start_value()
-            if self.amount not in (None, parameter.name) or same(used, wanted, turns=slot.turns):
+            parameter = slot.parameter
+            wanted = self.unchanged(slot.parameter)
+            used = slot.start_value()
+            if self.amount not in (None, parameter.name) or same(
+                used, wanted, turns=slot.turns
+            ):
                 continue
-            setting, where = self.setting(parameter), f"{self.name}.{parameter.name}"
+            setting = self.setting(parameter)
+            where = f"{self.name}.{parameter.name}"
             if setting in self.scene.given:
                 asked = f"`environment={self.scene.environment_spec}`"
                 if setting != ENVIRONMENT:
                     asked = f"`set` {setting}={shown(self.scene.number(setting))}"
                 raise InputError(
-                    f"{asked} and `controls` {self.name} contradict each other: {where} is {slot.spec}, "
-                    f"which leaves {shown(wanted)} out; change one of the two, or leave one out"
+                    f"{asked} and `controls` {self.name} contradict each other: "
+                    f"{where} is {slot.spec}, "
+                    f"which leaves {shown(wanted)} out; change one of the two, or "
+                    "leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
                 unit = "name" if parameter.options else parameter.unit
-                yield Moved(self.name, setting if setting == ENVIRONMENT else where, unit, wanted, used)
+                yield Moved(
+                    self.name,
+                    setting if setting == ENVIRONMENT else where,
+                    unit,
+                    wanted,
+                    used,
+                )
 
     def _group(self, slot: Slot) -> Group:
-        parameter, spec, setting = slot.parameter, slot.spec, self.setting(slot.parameter)
+        parameter = slot.parameter
+        spec = slot.spec
+        setting = self.setting(slot.parameter)
         if isinstance(spec, OneOf):
-            return Group(parameter.name, slot.width, (), options=len(spec.values), setting=setting)
+            return Group(
+                parameter.name,
+                slot.width,
+                (),
+                options=len(spec.values),
+                setting=setting,
+            )
         budget = self.budget_of(parameter)
         if type(spec) is not Range and budget != WHOLE_RANGE:
-            raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
-        name, valid = parameter.name, parameter.estimators
-        return Group(name, slot.width, valid, budget, periodic=slot.periodic, setting=setting)
+            raise InputError(
+                f"{self.name}.{parameter.name}: it has a ball and no "
+                "distribution; give it a range"
+            )
+        name = parameter.name
+        valid = parameter.estimators
+        return Group(
+            name, slot.width, valid, budget, periodic=slot.periodic, setting=setting
+        )
 
     @property
     def ambient(self) -> float | None:
-        """Lux of ambient light beside the light that it throws; None where there is none or where that is searched."""
+        """Lux of ambient light beside the light that it throws; None where there is
+        none or where that is searched.
+        """
         return None
 
     def in_light(self, times: float) -> Self:
@@ -451,52 +638,76 @@ class Control:
         return self
 
     def later(self, seconds: float) -> Control:
-        """Return the bound control as it is so many seconds later, where it knows a time; else itself."""
+        """Return the bound control as it is so many seconds later, where it knows a
+        time; else itself.
+        """
         return self
 
     @property
     def budget(self) -> Budget:
         """The budget of the whole slice: that of its largest group."""
-        return max(self.groups, key=lambda group: group.size).budget if self.groups else WHOLE_RANGE
+        return (
+            max(self.groups, key=lambda group: group.size).budget
+            if self.groups
+            else WHOLE_RANGE
+        )
 
     @property
     def refines(self) -> frozenset[str]:
         """See the class; a plain attribute will do."""
         return frozenset()
 
-    # ---- at a configuration ------------------------------------------------------------------------------------------
+    # ---- at a configuration
+    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        """Return every parameter's value at a slice of u: float32 of the parameter's shape, or the number of an option.
-        Fixed ones are there too.
+        """Return every parameter's value at a slice of u: float32 of the parameter's
+        shape, or the number of an option. Fixed ones are there too.
         """
         values: dict[str, Tensor] = {}
         if not self.slots:
             return values
-        every = self._low.to(u) + self._span.to(u) * u  # at once, but for what is searched on a logarithmic scale
+        # at once, but for what is searched on a logarithmic scale
+        every = self._low.to(u) + self._span.to(u) * u
         for slot in self.slots:
-            parameter, spec, place = slot.parameter, slot.spec, slice(slot.begin, slot.begin + slot.size)
+            parameter = slot.parameter
+            spec = slot.spec
+            place = slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
                 mapped = parameter.log or type(spec) is not Range
                 value = spec.at(u[place], log=parameter.log) if mapped else every[place]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
             chosen = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
-            shape = (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
-            number = parameter.options.index(chosen) if isinstance(chosen, str) else chosen
-            values[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
+            shape = (
+                (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
+            )
+            number = (
+                parameter.options.index(chosen) if isinstance(chosen, str) else chosen
+            )
+            values[parameter.name] = torch.full(
+                shape, float(number), dtype=torch.float32, device=u.device
+            )
         return values
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the values do to the scene, by differentiable torch operations; see `inputs`."""
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Return what the values do to the scene, by differentiable torch operations;
+        see `inputs`.
+        """
         return {}
 
-    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        """Map a slice (d,) of u to named scene inputs, by differentiable torch operations, on the device of u.
+    def inputs(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Tensor]:
+        """Map a slice (d,) of u to named scene inputs, by differentiable torch
+        operations, on the device of u.
 
         Args:
             u: (d,) in [0, 1].
-            so_far: inputs of the controls before this one; only names in `refines` may be returned again.
+            so_far: inputs of the controls before this one; only names in `refines` may
+                be returned again.
         """
         return self.scene_inputs(self.values(u), so_far)
 
@@ -505,60 +716,103 @@ class Control:
         return image
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1]; differentiable in both arguments."""
+        """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1];
+        differentiable in both arguments.
+        """
         # many do nothing to the picture: their values are not worked out again
-        return image if type(self).on_picture is Control.on_picture else self.on_picture(self.values(u), image)
+        return (
+            image
+            if type(self).on_picture is Control.on_picture
+            else self.on_picture(self.values(u), image)
+        )
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        """Return further values worth storing with a configuration, by name without the instance's."""
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
+        """Return further values worth storing with a configuration, by name without the
+        instance's.
+        """
         return {}
 
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        """Say a configuration in a few named values with units, small enough for one row of a table.
+    def describe(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Value]:
+        """Say a configuration in a few named values with units, small enough for one
+        row of a table.
 
         It is a function of its arguments alone; arguments as for `inputs`.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}
         for slot in self.slots:
-            parameter, value, name = slot.parameter, values[slot.parameter.name], f"{self.name}.{slot.parameter.name}"
+            parameter = slot.parameter
+            value = values[slot.parameter.name]
+            name = f"{self.name}.{slot.parameter.name}"
             if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
                 continue
             if parameter.options:
-                described[name] = {"value": parameter.options[int(value)], "unit": "name"}
+                described[name] = {
+                    "value": parameter.options[int(value)],
+                    "unit": "name",
+                }
             elif value.ndim == 0:
                 described[name] = measure(value, parameter.unit)
             else:
-                described |= {f"{name}.{k}": measure(number, parameter.unit) for k, number in enumerate(value)}
-        return described | {f"{self.name}.{name}": value for name, value in self.measured(values, so_far).items()}
+                described |= {
+                    f"{name}.{k}": measure(number, parameter.unit)
+                    for k, number in enumerate(value)
+                }
+        return described | {
+            f"{self.name}.{name}": value
+            for name, value in self.measured(values, so_far).items()
+        }
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the numbers of the configuration by parameter, in its unit, (k,) or without dimensions, as
-        differentiable functions of u; names have none."""
-        values, declared = self.values(u), [slot.parameter for slot in self.slots]
-        named = [parameter.name for parameter in declared if not parameter.options and len(parameter.shape) < 2]
+        """Return the numbers of the configuration by parameter, in its unit, (k,) or
+        without dimensions, as differentiable functions of u; names have none.
+        """
+        values = self.values(u)
+        declared = [slot.parameter for slot in self.slots]
+        named = [
+            parameter.name
+            for parameter in declared
+            if not parameter.options and len(parameter.shape) < 2
+        ]
         return {name: values[name] for name in named}
 
     def printed(self, u: Tensor) -> Tensor | None:
-        """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a
-        differentiable function of u; where only some are searched (h, w, 4), with 1 for these and 0 for others; None
-        without."""
+        """Return the searched colours that a printer would print, (h, w, 3)
+        display-referred sRGB in [0, 1], as a differentiable function of u; where only
+        some are searched (h, w, 4), with 1 for these and 0 for others; None without.
+        """
         return None
 
-    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         """Return pictures worth keeping; see `artifacts`."""
         return {}
 
-    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]; see `describe`."""
+    def artifacts(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Tensor]:
+        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB
+        in [0, 1]; see `describe`.
+        """
         return self.kept_pictures(self.values(u.detach()), so_far)
 
-    def kept_files(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, bytes]:
+    def kept_files(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, bytes]:
         """Return other files worth keeping; see `files`."""
         return {}
 
-    def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
-        """Return other files worth keeping, by name with ending: a mesh as PLY, say; see `describe`."""
+    def files(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, bytes]:
+        """Return other files worth keeping, by name with ending: a mesh as PLY, say;
+        see `describe`.
+        """
         return self.kept_files(self.values(u.detach()), so_far)
 
 
@@ -571,11 +825,18 @@ def measure(value: Tensor | float, unit: str) -> Value:
 
 
 def changed(name: str, change: Tensor) -> dict[str, Value]:
-    """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
+    """Say a change of searched colours, display-referred: the largest, and the root of
+    the mean square.
+    """
     root_mean_square = change.square().mean().sqrt()
-    return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}
+    return {
+        f"{name}.linf": measure(change.abs().max(), "sRGB"),
+        f"{name}.rms": measure(root_mean_square, "sRGB"),
+    }
 
 
 def file_name(name: str) -> str:
-    """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
+    """Return a control's name as it stands in names of files: texture@chair of
+    texture:chair.
+    """
     return name.replace(":", "@")

@@ -1,4 +1,6 @@
-"""The `body` control: how a mesh with joints stands or moves, and what a person is like, by the rig of the mesh."""
+"""The `body` control: how a mesh with joints stands or moves, and what a person is
+like, by the rig of the mesh.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +9,45 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, InputError, Parameter, Value, Values, assets, errors, geometry
+from advsearch.extend import (
+    Choice,
+    Control,
+    InputError,
+    Parameter,
+    Value,
+    Values,
+    assets,
+    errors,
+    geometry,
+)
 
 
 class BodyControl(Control):
-    """What a person is like, how they stand or walk, and how a rigged file of your own moves."""
+    """What a person is like, how they stand or walk, and how a rigged file of your own
+    moves.
+    """
 
     kind = "body"
     of_a_mesh = True
     parameters = (*geometry.PERSON, geometry.TIME)
-    choices = (Choice("clip", None, "Name or number of the animation that `time` is of; by itself the first."),)
+    choices = (
+        Choice(
+            "clip",
+            None,
+            "Name or number of the animation that `time` is of; by itself the first.",
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         known = {parameter.name for parameter in cls.parameters}
-        declared = (geometry.part_of_a_rig(name) for name in settings if name not in known)
-        return (*cls.parameters, *(parameter for parameter in declared if parameter is not None))
+        declared = (
+            geometry.part_of_a_rig(name) for name in settings if name not in known
+        )
+        return (
+            *cls.parameters,
+            *(parameter for parameter in declared if parameter is not None),
+        )
 
     @property
     def rig(self) -> assets.MeshRig:
@@ -30,7 +55,8 @@ class BodyControl(Control):
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:
             raise InputError(
-                f"`controls` {self.name}: {mesh.name} has no joints; take `object=person`, or a rigged file (.glb, "
+                f"`controls` {self.name}: {mesh.name} has no joints; take "
+                "`object=person`, or a rigged file (.glb, "
                 ".gltf, .vrm)"
             )
         return mesh.mesh.rig
@@ -38,13 +64,18 @@ class BodyControl(Control):
     @property
     def clip(self) -> str | None:
         """The name of the animation that is played; None for none."""
-        clips, asked = self.rig.clips, self.chosen["clip"]
+        clips = self.rig.clips
+        asked = self.chosen["clip"]
         if asked is None:
             timed = geometry.TIME.name in self.specs or not self._given
             return clips[0] if clips and timed else None
-        number = int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
+        number = (
+            int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
+        )
         if asked not in clips and not 0 <= number < len(clips):
-            raise errors.UnknownNameError(f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}.")
+            raise errors.UnknownNameError(
+                f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}."
+            )
         return str(asked) if asked in clips else clips[number]
 
     def fit(self) -> None:
@@ -52,11 +83,16 @@ class BodyControl(Control):
         for name in self.specs:
             if name not in known:
                 where = f"It stands in `controls` {self.name}."
-                raise errors.UnknownNameError(f"parameter of {self.mesh}", name, known, where)
-        if not self._given and not any(self.in_scene(parameter).search for parameter in self.parameters):
+                raise errors.UnknownNameError(
+                    f"parameter of {self.mesh}", name, known, where
+                )
+        if not self._given and not any(
+            self.in_scene(parameter).search for parameter in self.parameters
+        ):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
-                f"`controls` {self.name}: {self.mesh} has no animation to play; give ranges, as in "
+                f"`controls` {self.name}: {self.mesh} has no animation to play; give "
+                "ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
         self.own = tuple(parameter for parameter in self.own if parameter.name in known)
@@ -69,8 +105,12 @@ class BodyControl(Control):
             return replace(super().in_scene(parameter), search=None)
         return replace(parameter, default=default)
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         return dict(self.rig.measured(values, self.clip))

@@ -1,9 +1,11 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
-The camera looks at the middle of the object in its default pose. Its lens bends as a calibrated one does where a
-coefficient is asked for, or a camera file has one: see `advsearch.scene.camera_model`. While the distance is not
-searched or set, it follows the field of view so that the object keeps its place in the picture (a dolly zoom), down to
-where the camera would enter the sphere around the object: see `advsearch.scene.geometry`.
+The camera looks at the middle of the object in its default pose. Its lens bends as a
+calibrated one does where a coefficient is asked for, or a camera file has one: see
+`advsearch.scene.camera_model`. While the distance is not searched or set, it follows
+the field of view so that the object keeps its place in the picture (a dolly zoom), down
+to where the camera would enter the sphere around the object: see
+`advsearch.scene.geometry`.
 """
 
 from __future__ import annotations
@@ -22,15 +24,30 @@ from advsearch.controls.ranges import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.assets import on_roads
 from advsearch.scene.camera_entries import PRESETS
-from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
+from advsearch.scene.camera_model import (
+    COEFFICIENTS,
+    NUMBERS,
+    OF_KIND,
+    CameraModel,
+    pinhole,
+)
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_distance, middle
+from advsearch.scene.geometry import (
+    STEEPEST,
+    affine,
+    camera_to_world,
+    framing_distance,
+    middle,
+)
 from advsearch.scene.grounds import is_against_traffic, traffic_remark
 from advsearch.scene.settings import CAMERA, ORBIT_CAMERA, Parameter
 
-ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
+# metres above the road from which vehicles are seen: from a bumper to the roof of a
+# lorry
+ROAD_USERS = (0.5, 4.0)
 DISTORTION = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
-SENSOR_WIDTH = 36.0  # width in millimetres of the full-frame sensor that a focal length refers to
+# width in millimetres of the full-frame sensor that a focal length refers to
+SENSOR_WIDTH = 36.0
 
 
 SAME = (("fov", "focal_length"), ("elevation", "height"), ("distance", "sizes"))
@@ -45,14 +62,66 @@ class CameraControl(Control):
     kind = "camera"
     parameters = (
         *CAMERA[:-1],
-        _moving("focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
-        _moving("sizes", "object sizes", 1e-4, 1e5, "as distance", "The same as `distance`.", log=True),
-        _moving("shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
-        _moving("shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
-        _number("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        _number("focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
+        _moving(
+            "focal_length",
+            "mm",
+            1.5,
+            2100.0,
+            "as fov",
+            "The same for a sensor 36 mm wide.",
+            log=True,
+        ),
+        _moving(
+            "sizes",
+            "object sizes",
+            1e-4,
+            1e5,
+            "as distance",
+            "The same as `distance`.",
+            log=True,
+        ),
+        _moving(
+            "shift_x",
+            "picture widths",
+            -2.0,
+            2.0,
+            0.0,
+            "Shift of the picture to the right.",
+        ),
+        _moving(
+            "shift_y",
+            "picture heights",
+            -2.0,
+            2.0,
+            0.0,
+            "Shift of the picture downwards.",
+        ),
+        _number(
+            "aperture",
+            "object sizes",
+            0.0,
+            10.0,
+            0.0,
+            "Radius of the lens; 0 is a pinhole.",
+        ),
+        _number(
+            "focus",
+            "metres",
+            1e-4,
+            1e5,
+            "the object's middle",
+            "Distance in focus.",
+            log=True,
+        ),
         *(
-            _moving(name, "1", -100.0, 100.0, 0.0, f"{DISTORTION[name[0]]} distortion, as OpenCV has it.")
+            _moving(
+                name,
+                "1",
+                -100.0,
+                100.0,
+                0.0,
+                f"{DISTORTION[name[0]]} distortion, as OpenCV has it.",
+            )
             for name in COEFFICIENTS
         ),
         CAMERA[-1],
@@ -61,44 +130,67 @@ class CameraControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
-                f"`controls` {self.name}: moves along an orbit around the object, and the scene is seen by its camera "
-                f"{scene.camera!r}; leave the control out, or have it seen by {ORBIT_CAMERA!r}"
+                f"`controls` {self.name}: moves along an orbit around the object, and "
+                "the scene is seen by its camera "
+                f"{scene.camera!r}; leave the control out, or have it seen by "
+                f"{ORBIT_CAMERA!r}"
             )
         for first, second in SAME:
             if first in self.specs and second in self.specs:
                 raise InputError(
-                    f"`controls` {self.name}: {first} and {second} say the same thing; leave one of them out"
+                    f"`controls` {self.name}: {first} and {second} say the same thing; "
+                    "leave one of them out"
                 )
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
             scene = replace(scene, remarks=(*scene.remarks, traffic_remark(scene)))
         wanted = "aperture" in self.specs or "focus" in self.specs
         if wanted and self._shifted:
             raise InputError(
-                f"`controls` {self.name}: a shifted picture together with an aperture is not supported; leave one out"
+                f"`controls` {self.name}: a shifted picture together with an aperture "
+                "is not supported; leave one out"
             )
         bent = [name for name in COEFFICIENTS if name in self.specs]
         if bent and scene.camera_model is None:
-            scene = replace(scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect))
+            scene = replace(
+                scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect)
+            )
         model = scene.camera_model
         if model is None:
             return replace(scene, thin_lens=True) if wanted else scene
         for name in bent:
             if name not in OF_KIND[model.kind]:
                 has = ", ".join(OF_KIND[model.kind]) or "none"
-                raise InputError(f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {name}")
+                raise InputError(
+                    f"`controls` {self.name}: a {model.kind} lens has the "
+                    f"coefficients {has}, not {name}"
+                )
         own = ("fov", "focal_length") if model.name else ()
         shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
         for name in (*own, *shift, "aperture", "focus"):
             if name in self.specs:
-                whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion, or raindrops"
-                raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
+                whose = (
+                    f"the lens of `camera={model.name}`"
+                    if model.name
+                    else "a lens with distortion, or raindrops"
+                )
+                raise InputError(
+                    f"`controls` {self.name}: {name} is not supported "
+                    f"with {whose}; leave one of them out"
+                )
         return scene
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
-        """Whether the camera does so at the begin, the middle and the end of all its ranges."""
+        """Whether the camera does so at the begin, the middle and the end of all its
+        ranges.
+        """
         control = self.bind(scene)
-        configurations = (torch.full_like(control.start, value) for value in (0.0, 0.5, 1.0))
-        poses = [control.inputs(u)["camera.to_world"].detach().double().numpy() for u in configurations]
+        configurations = (
+            torch.full_like(control.start, value) for value in (0.0, 0.5, 1.0)
+        )
+        poses = [
+            control.inputs(u)["camera.to_world"].detach().double().numpy()
+            for u in configurations
+        ]
         return all(is_against_traffic(scene, pose) for pose in poses)
 
     @property
@@ -106,22 +198,37 @@ class CameraControl(Control):
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        parameter, scene = measured_in(super().in_scene(parameter), self.scene.object.metres is not None), self.scene
-        name, default, search = parameter.name, parameter.default, parameter.search
+        parameter = measured_in(
+            super().in_scene(parameter), self.scene.object.metres is not None
+        )
+        scene = self.scene
+        name = parameter.name
+        default = parameter.default
+        search = parameter.search
         if name in COEFFICIENTS and scene.camera_model is not None:
             default = scene.camera_model.values[name]
         elif name in ("distance", "focus", "sizes"):
             described = self._described()
-            away = float(np.linalg.norm(camera_to_world(described)[:3, 3] - middle(described)))
+            away = float(
+                np.linalg.norm(camera_to_world(described)[:3, 3] - middle(described))
+            )
             default = away * (1.0 if name == "sizes" else scene.metres)
         elif name == "height":
             default = float(camera_to_world(self._described())[2, 3]) * scene.metres
         elif name == "focal_length":
-            default = SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+            default = (
+                SENSOR_WIDTH
+                / 2.0
+                / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+            )
         preset = PRESETS.get(scene.preset)
         if preset is not None:
             own = scene.number("camera.azimuth")
-            around = (0.0, 360.0) if preset.aside >= 180.0 else (own - preset.aside, own + preset.aside)
+            around = (
+                (0.0, 360.0)
+                if preset.aside >= 180.0
+                else (own - preset.aside, own + preset.aside)
+            )
             search = around if name == "azimuth" else preset.search.get(name)
         elif on_roads(scene.object) and name == "elevation":
             search = None
@@ -135,13 +242,20 @@ class CameraControl(Control):
         same = {"focal_length": "camera.fov", "sizes": "camera.distance"}
         return same.get(parameter.name, super().setting(parameter))
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        scene, fov = self.scene, values["fov"]
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        scene = self.scene
+        fov = values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
         if "sizes" in self.specs:
             distance = values["sizes"]
-        elif "distance" in self.specs or not self.asked or scene.values.get("camera.distance") is not None:
+        elif (
+            "distance" in self.specs
+            or not self.asked
+            or scene.values.get("camera.distance") is not None
+        ):
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
@@ -152,55 +266,92 @@ class CameraControl(Control):
             inputs["camera.fov"] = fov.reshape(1)
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = values["focus"] / scene.metres if "focus" in self.specs else distance
+            focus = (
+                values["focus"] / scene.metres if "focus" in self.specs else distance
+            )
             inputs["camera.focus"] = focus.reshape(1)
         if scene.camera_model is None and self._shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
-            inputs["camera.exposure"] = values["exposure"] - scene.number("camera.exposure")
+            inputs["camera.exposure"] = values["exposure"] - scene.number(
+                "camera.exposure"
+            )
         return inputs
 
     def _numbers(self, model: CameraModel, values: Values, fov: Tensor) -> Tensor:
         """The numbers (17,) of the camera's model."""
         numbers = {name: torch.tensor(value) for name, value in model.values.items()}
         if not model.name:
-            aspect, focal = self.scene.aspect, 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
-            numbers |= {"fx": focal * max(1.0, 1.0 / aspect), "fy": focal * max(1.0, aspect)}
+            aspect = self.scene.aspect
+            focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
+            numbers |= {
+                "fx": focal * max(1.0, 1.0 / aspect),
+                "fy": focal * max(1.0, aspect),
+            }
         numbers |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
-        numbers |= {"cx": numbers["cx"] + values["shift_x"], "cy": numbers["cy"] + values["shift_y"]}
+        numbers |= {
+            "cx": numbers["cx"] + values["shift_x"],
+            "cy": numbers["cy"] + values["shift_y"],
+        }
         return torch.stack([numbers[name].to(fov) for name in NUMBERS])
 
     def _described(self) -> SceneDescription:
-        """The scene with a fixed lens, for which the distance is worked out as for the same setting."""
-        fov, focal_length = self.specs.get("fov"), self.specs.get("focal_length")
+        """The scene with a fixed lens, for which the distance is worked out as for the
+        same setting.
+        """
+        fov = self.specs.get("fov")
+        focal_length = self.specs.get("focal_length")
         if isinstance(fov, Fixed):
             return self.scene.with_values(camera__fov=float(fov.value))
         if isinstance(focal_length, Fixed):
-            return self.scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
+            return self.scene.with_values(
+                camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item()
+            )
         return self.scene
 
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
-        elevation, roll = torch.deg2rad(values["elevation"]), torch.deg2rad(values["roll"])
-        keeps_height = "height" in self.specs  # above the ground, so that the elevation follows
+        elevation = torch.deg2rad(values["elevation"])
+        roll = torch.deg2rad(values["roll"])
+        # above the ground, so that the elevation follows
+        keeps_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():
-            searched = any(slot.width for slot in self.slots if slot.parameter.name == "height")
-            keeps_height = self.scene.values.get("camera.height") is not None or searched
+            searched = any(
+                slot.width for slot in self.slots if slot.parameter.name == "height"
+            )
+            keeps_height = (
+                self.scene.values.get("camera.height") is not None or searched
+            )
         if keeps_height:
             above = values["height"] / self.scene.metres - float(middle(self.scene)[2])
             elevation = torch.asin((above / distance).clamp(-STEEPEST, STEEPEST))
         zero = torch.zeros_like(azimuth)
-        outwards = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
+        outwards = torch.stack(
+            [
+                elevation.cos() * azimuth.cos(),
+                elevation.cos() * azimuth.sin(),
+                elevation.sin(),
+            ]
+        )
         left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         up = torch.linalg.cross(-outwards, left)
-        left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
+        left, up = (
+            roll.cos() * left + roll.sin() * up,
+            roll.cos() * up - roll.sin() * left,
+        )
         place = torch.from_numpy(middle(self.scene)).to(distance) + distance * outwards
         return affine(torch.stack([left, up, -outwards], dim=1), place)
 
 
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
-    """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
-    return replace(parameter, unit="object sizes") if parameter.unit == "metres" and not metres else parameter
+    """Return a parameter of the camera as it is around an object that has a size in
+    metres, or has none.
+    """
+    return (
+        replace(parameter, unit="object sizes")
+        if parameter.unit == "metres" and not metres
+        else parameter
+    )
 
 
 def _fov_of(focal_length: Tensor) -> Tensor:

@@ -1,11 +1,14 @@
-"""The `environment` control: which map lights the scene, how it is turned, how bright it is, and its colour.
+"""The `environment` control: which map lights the scene, how it is turned, how bright
+it is, and its colour.
 
-Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the map is resampled by torch:
+Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the
+map is resampled by torch:
 
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
 
-`harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001, section 3), 9 coefficients
-for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
+`harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
+2001, section 3), 9 coefficients for each colour channel as multiples of the map's mean
+radiance, inside an L2 ball.
 """
 
 from __future__ import annotations
@@ -31,26 +34,33 @@ from advsearch.scene.library import import_environment
 from advsearch.scene.settings import CHANNELS, Parameter
 
 COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
-MAPS = tuple(sorted({*library.list_environments()} - {*library.list_environments("place")}))
+MAPS = tuple(
+    sorted({*library.list_environments()} - {*library.list_environments("place")})
+)
 """The bundled environments that are a map; the others are a place around the object."""
 _lit = partial(Parameter.number, Parameter.LIT)
 
 
 class EnvironmentControl(Control):
-    """Which environment lights the scene, how it is turned, how bright it is, and its colour."""
+    """Which environment lights the scene, how it is turned, how bright it is, and its
+    colour.
+    """
 
     kind = "environment"
     parameters = (
         Parameter.named("which", (OWN_MAP, *MAPS), OWN_MAP,
-                        "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr "
+                        "Another environment instead of the scene's own, metered "
+                        "afresh: bundled, or a .hdr or .exr "
                         "file."),
         *settings.ENVIRONMENT,
         *(_lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
         Parameter("harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
-                  "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the "
+                  "Low-order light that is added: spherical-harmonic coefficients, 9 "
+                  "for each channel, inside the "
                   "ball.", estimators=Parameter.LIT),
     )  # fmt: skip
-    choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon",
+    choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of "
+                                      "all coefficients.", "epsilon",
                       "harmonics", most=100.0),)  # fmt: skip
 
     @classmethod
@@ -59,30 +69,55 @@ class EnvironmentControl(Control):
         which, *others = cls.parameters
         given = settings.get("which") if isinstance(settings, Mapping) else None
         given = given.get("choices") if isinstance(given, Mapping) else given
-        named = [given] if isinstance(given, str) or not isinstance(given, Sequence) else given
-        files = [one for one in named if isinstance(one, str) and one not in which.options and is_path(one)]
-        return (replace(which, options=tuple(dict.fromkeys((*which.options, *files)))), *others)
+        named = (
+            [given]
+            if isinstance(given, str) or not isinstance(given, Sequence)
+            else given
+        )
+        files = [
+            one
+            for one in named
+            if isinstance(one, str) and one not in which.options and is_path(one)
+        ]
+        return (
+            replace(which, options=tuple(dict.fromkeys((*which.options, *files)))),
+            *others,
+        )
 
     def check_choices(self) -> None:
         given = self.chosen["epsilon"]
         if "epsilon" in self._given and "harmonics" not in self._given:
             raise InputError(
-                f"{self.name}.epsilon: the radius of the ball of harmonics, which are not there; leave it out, or give "
-                f"harmonics a range too, as in {self.name}={{harmonics: [-1, 1], epsilon: {given}}}"
+                f"{self.name}.epsilon: the radius of the ball of harmonics, which are "
+                "not there; leave it out, or give "
+                f"harmonics a range too, as in {self.name}={{harmonics: [-1, 1], "
+                f"epsilon: {given}}}"
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """An environment that is fixed is the scene's; so is the first of several where these are files, and the
-        scene's own is none of them."""
-        spec, allowed = self.specs.get("which"), self.allowed("which", OWN_MAP)
+        """An environment that is fixed is the scene's; so is the first of several where
+        these are files, and the scene's own is none of them.
+        """
+        spec = self.specs.get("which")
+        allowed = self.allowed("which", OWN_MAP)
         maps = {str(name): _loaded(str(name)) for name in allowed if _is_file(name)}
         notes = [note for asset in maps.values() for note in asset.warnings]
-        if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or maps):
+        if (
+            OWN_MAP in allowed
+            or self._own_name(scene) is not None
+            or not (isinstance(spec, Fixed) or maps)
+        ):
             lit = scene.environment_for(f"`controls` {self.name}")
-            if maps and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
+            if (
+                maps
+                and scene.photograph is None
+                and not lit.photographed
+                and scene.number("ground.size") > 0.0
+            ):
                 names = ", ".join(Path(name).name for name in maps)
                 notes.append(
-                    f"{names}: the object stands on the scene's table there, too; ground.kind=photograph shows the "
+                    f"{names}: the object stands on the scene's table there, too; "
+                    "ground.kind=photograph shows the "
                     "floor of each picture instead"
                 )
         else:
@@ -91,10 +126,16 @@ class EnvironmentControl(Control):
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Of `which`, the scene's own environment, by its name where only that is allowed."""
+        """Of `which`, the scene's own environment, by its name where only that is
+        allowed.
+        """
         if parameter.name != "which":
             return super().in_scene(parameter)
-        own = None if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(self.scene)
+        own = (
+            None
+            if OWN_MAP in self.allowed("which", OWN_MAP)
+            else self._own_name(self.scene)
+        )
         return replace(parameter, default=own or OWN_MAP)
 
     def setting(self, parameter: Parameter) -> str:
@@ -106,8 +147,13 @@ class EnvironmentControl(Control):
         return self._own_name(self.scene) or self.scene.environment_spec
 
     def _own_name(self, scene: SceneDescription) -> str | None:
-        """What the scene's own environment is called among those that can be chosen; None if it is none of them."""
-        return next((str(one) for one in self.allowed("which", OWN_MAP) if _is_own(one, scene)), None)
+        """What the scene's own environment is called among those that can be chosen;
+        None if it is none of them.
+        """
+        return next(
+            (str(one) for one in self.allowed("which", OWN_MAP) if _is_own(one, scene)),
+            None,
+        )
 
     def budget_of(self, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":
@@ -116,11 +162,16 @@ class EnvironmentControl(Control):
         width = spec.high - spec.low if isinstance(spec, Range) else 2.0
         return Budget("l2", float(self.chosen["epsilon"]) / width)
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        name, device = self.own[0].options[int(values["which"])], values["rotation"].device
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        name = self.own[0].options[int(values["which"])]
+        device = values["rotation"].device
         own = name == OWN_MAP or _is_own(name, self.scene)
         base = _map(None if own else _loaded(name), self.scene).to(device)
-        turned = turn(base, values["rotation"] - self.scene.number("environment.rotation"))
+        turned = turn(
+            base, values["rotation"] - self.scene.number("environment.rotation")
+        )
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - self.scene.number("environment.exposure")
         lit = turned * tint * torch.exp2(stops)
@@ -130,19 +181,29 @@ class EnvironmentControl(Control):
 
 
 def _is_file(name: Number) -> bool:
-    return isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
+    return (
+        isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
+    )
 
 
 def _is_own(name: Number, scene: SceneDescription) -> bool:
     """Whether an environment is the scene's own."""
     own = scene.environment
     if own is None or not _is_file(name):
-        return own is not None and own.source == library.BUNDLED_ENVIRONMENT and own.name == name
-    return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(own.source)
+        return (
+            own is not None
+            and own.source == library.BUNDLED_ENVIRONMENT
+            and own.name == name
+        )
+    return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(
+        own.source
+    )
 
 
 def _loaded(name: str) -> EnvironmentAsset:
-    """An environment by its name, or from a file, which is read again when it has changed."""
+    """An environment by its name, or from a file, which is read again when it has
+    changed.
+    """
     if not _is_file(name):
         return library.load_environment(name)
     try:
@@ -159,8 +220,9 @@ def _read(place: str, name: str, *version: int) -> EnvironmentAsset:
 
 @lru_cache(maxsize=64)
 def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """The scene's own map, or another in its own size, as bright as keeps the picture's exposure; the ground stays of
-    the same kind."""
+    """The scene's own map, or another in its own size, as bright as keeps the picture's
+    exposure; the ground stays of the same kind.
+    """
     own = scene.environment_for("the environment")
     if asset is None:
         return torch.from_numpy(own.radiance.copy())
@@ -170,7 +232,8 @@ def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
 
 
 def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Turn a map (H, W, 3) about the vertical as `environment.rotation` does, by linear resampling of its columns.
+    """Turn a map (H, W, 3) about the vertical as `environment.rotation` does, by linear
+    resampling of its columns.
 
     Periodic and differentiable in both arguments; exact at whole columns.
     """
@@ -180,12 +243,15 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
         return radiance
     whole = int(shift.detach().floor())
     share = shift - whole
-    near, far = radiance.roll(-whole, dims=1), radiance.roll(-whole - 1, dims=1)
+    near = radiance.roll(-whole, dims=1)
+    far = radiance.roll(-whole - 1, dims=1)
     return near + share * (far - near)
 
 
 def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
-    """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the map `like` (H, W, 3)."""
+    """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the
+    map `like` (H, W, 3).
+    """
     height, width = like.shape[:2]
     basis = real_harmonics(height, width).to(coefficients.device)
     mean = like.detach().mean(dim=(0, 1))

@@ -1,8 +1,11 @@
-"""The `haze` control: a uniform haze around camera and object, by how dense it is and of which colour.
+"""The `haze` control: a uniform haze around camera and object, by how dense it is and
+of which colour.
 
-A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer and Lambert), and scattered light
-comes in: `advsearch.scene.mitsuba_backend.own_plugins` has the equation. Colour is the share that is scattered and not
-absorbed, per channel: white haze takes nothing away, dark haze is smoke. Haze fills a ball; the environment is outside.
+A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer
+and Lambert), and scattered light comes in:
+`advsearch.scene.mitsuba_backend.own_plugins` has the equation. Colour is the share that
+is scattered and not absorbed, per channel: white haze takes nothing away, dark haze is
+smoke. Haze fills a ball; the environment is outside.
 """
 
 from __future__ import annotations
@@ -13,9 +16,19 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from advsearch.extend import Control, Parameter, Range, SceneDescription, Values, color, geometry, parts
+from advsearch.extend import (
+    Control,
+    Parameter,
+    Range,
+    SceneDescription,
+    Values,
+    color,
+    geometry,
+    parts,
+)
 
-LEAST_RADIUS = 4.0  # the haze reaches at least this far from the scene's middle, object sizes
+# the haze reaches at least this far from the scene's middle, object sizes
+LEAST_RADIUS = 4.0
 BEHIND_CAMERA = 1.5  # it reaches at least so many times as far as the camera is away
 THIN_HAZE = 0.1  # density where it is not searched and was not given
 
@@ -27,40 +40,66 @@ class HazeControl(Control):
     amount = "density"
     parameters = (
         Parameter.number(Parameter.LIT, "density", "per object size", 0.0, 2.0, 0.0,
-                         "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", (0.0, 0.3)),
+                         "Extinction: over 1 / density the haze takes 63 % of the "
+                         "light out of a ray.", (0.0, 0.3)),
         *Parameter.colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
     )  # fmt: skip
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        own, default = _haze_of(self.scene), parameter.default
+        own = _haze_of(self.scene)
+        default = parameter.default
         if parameter.name != "density":
             if own is None:
                 return parameter
             albedo = color.linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist()
-            return replace(parameter, default=albedo[color.CHANNELS.index(parameter.name)])
+            return replace(
+                parameter, default=albedo[color.CHANNELS.index(parameter.name)]
+            )
         if own is not None:
             default = own.density
         elif self.asked and not self.searches("density"):
             default = THIN_HAZE
         spec = self.specs.get("density")
         adjoint = isinstance(spec, Range) and spec.low > 0.0
-        return replace(parameter, default=default, estimators=Parameter.LIT if adjoint else ("differences",))
+        return replace(
+            parameter,
+            default=default,
+            estimators=Parameter.LIT if adjoint else ("differences",),
+        )
 
     def unchanged(self, parameter: Parameter) -> float | str:
-        return 0.0 if _haze_of(self.scene) is None else parameter.default  # of the density; see `amount`
+        # of the density; see `amount`
+        return 0.0 if _haze_of(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if (own := _haze_of(scene)) is not None:
             renamed = replace(own, name=self.name)
-            return replace(scene, parts=tuple(renamed if part is own else part for part in scene.parts))
+            return replace(
+                scene,
+                parts=tuple(renamed if part is own else part for part in scene.parts),
+            )
         away = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
-        return scene.with_part(parts.HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
+        return scene.with_part(
+            parts.HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away))
+        )
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         albedo = color.combine_channels(values)
-        return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}
+        return {
+            f"{self.name}.density": values["density"].reshape(1),
+            f"{self.name}.albedo": albedo,
+        }
 
 
 def _haze_of(scene: SceneDescription) -> parts.HazePart | None:
     """The haze that a scene comes with."""
-    return next((part for part in scene.parts if isinstance(part, parts.HazePart) and part.density), None)
+    return next(
+        (
+            part
+            for part in scene.parts
+            if isinstance(part, parts.HazePart) and part.density
+        ),
+        None,
+    )

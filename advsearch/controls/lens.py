@@ -1,10 +1,12 @@
-"""The `lens` control: translucent dots on the front of the camera's lens, as an adversarial sticker has them.
+"""The `lens` control: translucent dots on the front of the camera's lens, as an
+adversarial sticker has them.
 
     opacity_k(p) = opacity_k * exp(-(|p - centre_k|^2 / radius_k^2) ^ falloff)
     light(p)    <- (1 - opacity_k(p)) light(p) + opacity_k(p) color_k,     for each dot k in turn
 
-The dots are those of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3), who
-mix display values; here linear light is mixed. They are put on the finished picture, and nothing is rendered anew.
+The dots are those of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019,
+arXiv 1904.00759, section 3), who mix display values; here linear light is mixed. They
+are put on the finished picture, and nothing is rendered anew.
 """
 
 from __future__ import annotations
@@ -20,19 +22,35 @@ from advsearch.extend import Choice, Control, OneOf, Parameter, Values, color
 DOTS = 4  # how many dots there are when nothing is said
 MOST_DOTS = 64
 PLACES = ("x", "y")
-STICKER_SIDE = 256  # side in pixels of the picture of the sticker that is kept with a run
-_FAR = 40.0  # past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power overflows
+# side in pixels of the picture of the sticker that is kept with a run
+STICKER_SIDE = 256
+# past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power
+# overflows
+_FAR = 40.0
 
 
 def _per_dot(
     name: str, unit: str, default: float, text: str, search: tuple[float, float] = (0.0, 1.0), low: float = 0.0,
     *, log: bool = False,
 ) -> Parameter:  # fmt: skip
-    return Parameter(name, (None,), unit, low, 1.0, default, text, search=search, log=log, estimators=("image",))
+    return Parameter(
+        name,
+        (None,),
+        unit,
+        low,
+        1.0,
+        default,
+        text,
+        search=search,
+        log=log,
+        estimators=("image",),
+    )
 
 
 class LensControl(Control):
-    """Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."""
+    """Translucent, blurred dots on the camera's lens: their places, sizes, colours,
+    opacities.
+    """
 
     kind = "lens"
     amount = "opacity"
@@ -40,14 +58,23 @@ class LensControl(Control):
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
         _per_dot("radius", "picture sizes", 0.12,
-                 "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
+                 "Distance at which a dot has lost 63 % of its opacity, as a share of "
+                 "the picture's smaller side.",
                  (0.03, 0.25), 0.01, log=True),
         *(_per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.") for name in color.CHANNELS),
         _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
         Parameter.number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
-                         "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."),
+                         "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a "
+                         "disc."),
     )  # fmt: skip
-    choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
+    choices = (
+        Choice(
+            "dots",
+            DOTS,
+            f"How many dots there are, 1 to {MOST_DOTS}.",
+            whole=(1, MOST_DOTS),
+        ),
+    )
 
     @property
     def dots(self) -> int:
@@ -60,20 +87,31 @@ class LensControl(Control):
     def fit(self) -> None:
         super().fit()
         for slot in self.slots:
-            name, width = slot.parameter.name, slot.width
+            name = slot.parameter.name
+            width = slot.width
             if name in PLACES and width and not isinstance(slot.spec, OneOf):
-                self.start[slot.begin : slot.begin + width] = spread(self.dots)[PLACES.index(name)]
+                self.start[slot.begin : slot.begin + width] = spread(self.dots)[
+                    PLACES.index(name)
+                ]
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return with_dots(image, self._placed(values))
 
-    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
         dark = (square[:, None] + square[None, :]) % 2
-        return {self.name: with_dots((0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values))}
+        return {
+            self.name: with_dots(
+                (0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values)
+            )
+        }
 
     def _placed(self, values: Values) -> dict[str, Tensor]:
-        """The values, with the dots spread over the picture along an axis about which nothing was said."""
+        """The values, with the dots spread over the picture along an axis about which
+        nothing was said.
+        """
         placed = dict(values)
         for axis, name in enumerate(PLACES):
             if self.asked and name not in self.specs:
@@ -82,11 +120,12 @@ class LensControl(Control):
 
 
 def spread(count: int) -> Tensor:
-    """Return `count` places spread evenly over the middle 80 % of the picture, the first in its centre.
+    """Return `count` places spread evenly over the middle 80 % of the picture, the
+    first in its centre.
 
-    The places are a lattice with the two irrational steps of the plastic number, a two-dimensional golden ratio
-    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2). They are (2, count) float32: x and y in
-    [0.1, 0.9].
+    The places are a lattice with the two irrational steps of the plastic number, a
+    two-dimensional golden ratio (Roberts 2018, The unreasonable effectiveness of
+    quasirandom sequences, R2). They are (2, count) float32: x and y in [0.1, 0.9].
     """
     plastic = 1.324717957244746
     steps = torch.tensor([[1.0 / plastic], [1.0 / plastic**2]], dtype=torch.float64)
@@ -99,8 +138,8 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
-        values: `x`, `y`, `radius`, `red`, `green`, `blue`, `opacity` of shape (dots,) and `falloff` of shape (), as
-            in `LensControl.parameters`.
+        values: `x`, `y`, `radius`, `red`, `green`, `blue`, `opacity` of shape (dots,)
+            and `falloff` of shape (), as in `LensControl.parameters`.
 
     Returns:
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
@@ -108,14 +147,23 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     levels = torch.stack([values[channel] for channel in color.CHANNELS], dim=-1)
     shades = color.srgb_to_linear(levels).to(image.device)
     height, width = image.shape[:2]
-    side, device, falloff = min(height, width), values["x"].device, values["falloff"]
-    across = (torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width) / side
-    down = (torch.arange(height, device=device) + 0.5 - values["y"][:, None] * height) / side
+    side = min(height, width)
+    device = values["x"].device
+    falloff = values["falloff"]
+    across = (
+        torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width
+    ) / side
+    down = (
+        torch.arange(height, device=device) + 0.5 - values["y"][:, None] * height
+    ) / side
     squared = down[:, :, None] ** 2 + across[:, None, :] ** 2
     distance = squared / values["radius"][:, None, None] ** 2
     reach = float(_FAR ** (1.0 / falloff.detach()))
-    covers = values["opacity"][:, None, None] * torch.exp(-(distance.clamp(1e-12, reach) ** falloff))
-    covers, light = covers.to(image.device), color.srgb_to_linear(image)
+    covers = values["opacity"][:, None, None] * torch.exp(
+        -(distance.clamp(1e-12, reach) ** falloff)
+    )
+    covers = covers.to(image.device)
+    light = color.srgb_to_linear(image)
     for cover, shade in zip(covers, shades, strict=True):
         light = light + cover[..., None] * (shade - light)
     return color.linear_to_srgb(light)

@@ -1,12 +1,15 @@
-"""The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a size.
+"""The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a
+size.
 
-Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8) gets the display value
-`LIT_WHITE`. A lamp of power p and linear colour c puts `p c E / d^2` on a surface that faces it at distance d:
+Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8)
+gets the display value `LIT_WHITE`. A lamp of power p and linear colour c puts `p c E /
+d^2` on a surface that faces it at distance d:
 
     point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
 
-The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image Synthesis,
-section 2.4), so that size changes how soft the shadows are and not how bright the lamp is.
+The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity
+and Realistic Image Synthesis, section 2.4), so that size changes how soft the shadows
+are and not how bright the lamp is.
 """
 
 from __future__ import annotations
@@ -28,19 +31,34 @@ from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
 from advsearch.scene.settings import Parameter
 
-LIT_WHITE = 0.9  # linear display value of a white surface that faces a lamp of power 1 at distance 1
+# linear display value of a white surface that faces a lamp of power 1 at distance 1
+LIT_WHITE = 0.9
 LIT_POWER = 6.0
-"""Power of a lamp whose power is not searched and was not given: at its default place about as bright as the
-environment."""
+"""Power of a lamp whose power is not searched and was not given: at its default place
+about as bright as the environment.
+"""
 
 
 def metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's metered gain, in scene units."""
+    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's
+    metered gain, in scene units.
+    """
     return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
 
 
-def _place(name: str, low: float, high: float, default: float, description: str) -> Parameter:
-    return Parameter.moving(("differences",), name, "object sizes", -1000.0, 1000.0, default, description, (low, high))
+def _place(
+    name: str, low: float, high: float, default: float, description: str
+) -> Parameter:
+    return Parameter.moving(
+        ("differences",),
+        name,
+        "object sizes",
+        -1000.0,
+        1000.0,
+        default,
+        description,
+        (low, high),
+    )
 
 
 class LightControl(Control):
@@ -54,20 +72,23 @@ class LightControl(Control):
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
         *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
         Parameter.number(Parameter.LIT, "power", "1", 0.0, 1000.0, 0.0,
-                         "Irradiance at distance 1, in multiples of the one that shows a white surface just below "
+                         "Irradiance at distance 1, in multiples of the one that shows "
+                         "a white surface just below "
                          "white.",
                          (0.0, 12.0)),
         Parameter.moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
                          "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
     )  # fmt: skip
     choices = (Choice("type", "area",
-                      "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
+                      "area (a ball that glows: soft shadows, visible) or point (sharp "
+                      "shadows, invisible).",
                       options=("area", "point")),)  # fmt: skip
 
     def check_choices(self) -> None:
         if self.chosen["type"] == "point" and "size" in self._given:
             raise InputError(
-                f"{self.name}.size: expected none for a point light, got {self._given['size']!r}; leave it out, or set "
+                f"{self.name}.size: expected none for a point light, got "
+                f"{self._given['size']!r}; leave it out, or set "
                 f"{self.name}.type to area"
             )
 
@@ -84,15 +105,26 @@ class LightControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         lamp = PointLamp if self.chosen["type"] == "point" else BallLamp
         power = self.specs.get("power")
-        return scene.with_part(lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0))
+        return scene.with_part(
+            lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0)
+        )
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
-        intensity = color.combine_channels(values) * values["power"] * metered_irradiance(self.scene)
+        intensity = (
+            color.combine_channels(values)
+            * values["power"]
+            * metered_irradiance(self.scene)
+        )
         if self.chosen["type"] == "point":
             return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
         radius = values["size"] / 2.0
-        return {f"{self.name}.ball": ball(place, radius), f"{self.name}.radiance": intensity / (math.pi * radius**2)}
+        return {
+            f"{self.name}.ball": ball(place, radius),
+            f"{self.name}.radiance": intensity / (math.pi * radius**2),
+        }
 
 
 def ball(place: Tensor, radius: Tensor) -> Tensor:

@@ -1,9 +1,11 @@
-"""The `material` control: how the object's surface reflects, its tint, and which named material it is made of.
+"""The `material` control: how the object's surface reflects, its tint, and which named
+material it is made of.
 
     base_color = linear(tint) * (the object's texture, or the named material's pattern)
 
-The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
-A named material has a seamless pattern and numbers of its own, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
+The numbers are those of the principled BSDF (Burley, *Physically based shading at
+Disney*, SIGGRAPH 2012 course notes). A named material has a seamless pattern and
+numbers of its own, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
 """
 
 from __future__ import annotations
@@ -29,23 +31,30 @@ from advsearch.scene.raster import looked_up, rasterised
 from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Named materials made by procedure: seamless patterns with a surface of their own, and how they cover an object.
+# Named materials made by procedure: seamless patterns with a surface of their own, and
+# how they cover an object.
 #
-# Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4),
-# made of periodic gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering (Turing 1952;
-# Young 1984).
+# Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021,
+# arXiv 2106.03805, section 4), made of periodic gradient noise (Perlin 1985), cells
+# (Worley 1996), and iterated band-pass filtering (Turing 1952; Young 1984).
 
 Grid = tuple[Doubles, Doubles]
-"""Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0, 1)."""
+"""Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0,
+1).
+"""
 
 SIDE = 512  # side of a tile in texels
-BLEND = 20.0  # power of the normal's components that weighs the three projections of a tile: how sharply they meet
+# power of the normal's components that weighs the three projections of a tile: how
+# sharply they meet
+BLEND = 20.0
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile at
-    texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
+    """A named material: the side of a tile in object sizes, the surface beside its
+    colour, and what draws the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred
+    sRGB, any overshoot clipped later.
+    """
 
     name: str
     size: float
@@ -56,26 +65,39 @@ class Pattern:
 PATTERNS: dict[str, Pattern] = {}  # every named material by its name
 
 
-def pattern(size: float, **surface: float) -> Callable[[Callable[[Grid], Doubles]], None]:
+def pattern(
+    size: float, **surface: float
+) -> Callable[[Callable[[Grid], Doubles]], None]:
     """Make a named material of the function below; see `Pattern`."""
 
     def register(paint: Callable[[Grid], Doubles]) -> None:
-        PATTERNS[paint.__name__] = Pattern(paint.__name__, size, Material(**surface), paint)
+        PATTERNS[paint.__name__] = Pattern(
+            paint.__name__, size, Material(**surface), paint
+        )
 
     return register
 
 
-# ---- ingredients: everything repeats after 1 in x and y --------------------------------------------------------------
+# ---- ingredients: everything repeats after 1 in x and y
+# --------------------------------------------------------------
 
 
 def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
-    """Gradient noise with a whole number of lattice cells across the tile; about -1 to 1, mean 0."""
+    """Gradient noise with a whole number of lattice cells across the tile; about -1 to
+    1, mean 0.
+    """
     across, down = cells
-    angle = np.random.Generator(np.random.PCG64(seed)).uniform(0.0, 2.0 * np.pi, (down, across))
-    x, y = at[0] * across, at[1] * down
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = x - left, y - top
-    column, row = left.astype(np.int64), top.astype(np.int64)
+    angle = np.random.Generator(np.random.PCG64(seed)).uniform(
+        0.0, 2.0 * np.pi, (down, across)
+    )
+    x = at[0] * across
+    y = at[1] * down
+    left = np.floor(x)
+    top = np.floor(y)
+    fx = x - left
+    fy = y - top
+    column = left.astype(np.int64)
+    row = top.astype(np.int64)
 
     def corner(right: int, below: int) -> Doubles:
         turn = angle[(row + below) % down, (column + right) % across]
@@ -91,7 +113,9 @@ def _clouds(at: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Double
     """Octaves of noise, each twice as fine and half as strong; about -1 to 1."""
     total = np.zeros_like(at[0])
     for octave in range(octaves):
-        total += 0.5**octave * _noise(at, (cells[0] << octave, cells[1] << octave), seed + 101 * octave)
+        total += 0.5**octave * _noise(
+            at, (cells[0] << octave, cells[1] << octave), seed + 101 * octave
+        )
     return total / (2.0 - 0.5 ** (octaves - 1))
 
 
@@ -103,31 +127,47 @@ def _warped(at: Grid, cells: int, amount: float, seed: int) -> Grid:
 
 
 def _scattered(count: int, seed: int) -> Doubles:
-    """Points of a torus about as far from each other as they can be, irregular: (count, 2) in [0, 1). Best candidate
-    sampling (Mitchell 1991): each point is the farthest from those before it of a few random ones."""
+    """Points of a torus about as far from each other as they can be, irregular: (count,
+    2) in [0, 1). Best candidate sampling (Mitchell 1991): each point is the farthest
+    from those before it of a few random ones.
+    """
     generator = np.random.Generator(np.random.PCG64(seed))
     points = generator.random((1, 2))
     while len(points) < count:
         candidates = generator.random((16, 2))
         gap = np.abs(candidates[:, None] - points[None])
         gap = np.minimum(gap, 1.0 - gap)
-        points = np.concatenate([points, candidates[[np.argmax((gap**2).sum(-1).min(1))]]])
+        points = np.concatenate(
+            [points, candidates[[np.argmax((gap**2).sum(-1).min(1))]]]
+        )
     return np.asarray(points)
 
 
-def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDArray[np.int64]]:
-    """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first, and which points they are."""
+def _cells(
+    at: Grid, points: Doubles, count: int = 2
+) -> tuple[Doubles, npt.NDArray[np.int64]]:
+    """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first,
+    and which points they are.
+    """
     place = np.stack([at[0] % 1.0, at[1] % 1.0], axis=-1)
-    distance, index = cKDTree(points, boxsize=1.0).query(np.minimum(place, np.nextafter(1.0, 0.0)), k=count)
+    distance, index = cKDTree(points, boxsize=1.0).query(
+        np.minimum(place, np.nextafter(1.0, 0.0)), k=count
+    )
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
 
 
-def _turing(wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12) -> Doubles:
-    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again; after about ten rounds the
-    pattern has settled. Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter.
-    The bias is added before saturation: stripes break up into spots away from 0."""
+def _turing(
+    wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
+) -> Doubles:
+    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and
+    again; after about ten rounds the pattern has settled. Wavelengths are in tiles,
+    along x and along y; unequal ones make stripes across the shorter. The bias is added
+    before saturation: stripes break up into spots away from 0.
+    """
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
-    radius = np.hypot(frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1])
+    radius = np.hypot(
+        frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1]
+    )
     band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
     field = np.random.Generator(np.random.PCG64(seed)).standard_normal((SIDE, SIDE))
     for _ in range(rounds):
@@ -147,7 +187,9 @@ def _color(code: str) -> Doubles:
 
 
 def _mix(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """From the first colour to the second; colours (3,) or (SIDE, SIDE, 3), shares (SIDE, SIDE)."""
+    """From the first colour to the second; colours (3,) or (SIDE, SIDE, 3), shares
+    (SIDE, SIDE).
+    """
     return np.asarray(first + (second - first) * share[..., None])
 
 
@@ -155,10 +197,13 @@ def _ramp(value: Doubles, *codes: str) -> Doubles:
     """Colours evenly spaced over values from 0 to 1."""
     colors = np.stack([_color(code) for code in codes])
     stops = np.linspace(0.0, 1.0, len(codes))
-    return np.stack([np.interp(value, stops, colors[:, channel]) for channel in range(3)], axis=-1)
+    return np.stack(
+        [np.interp(value, stops, colors[:, channel]) for channel in range(3)], axis=-1
+    )
 
 
-# ---- the patterns ----------------------------------------------------------------------------------------------------
+# ---- the patterns
+# ----------------------------------------------------------------------------------------------------
 
 
 @pattern(1.0, roughness=0.5)
@@ -172,11 +217,18 @@ def wood(at: Grid) -> Doubles:
     bend = 0.16 * _clouds(at, (2, 1), 2, 11) + 0.012 * _noise(at, (8, 3), 12)
     rings = 9.0 * (x + bend) + 0.25 * _noise(at, (5, 2), 17)
     phase = rings % 1.0
-    late = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))  # slow darkening, sudden end of a year
-    fibre = _noise((x + 0.6 * bend, y), (120, 3), 13) + 0.6 * _noise((x + 0.6 * bend, y), (240, 5), 18)
+    # slow darkening, sudden end of a year
+    late = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))
+    fibre = _noise((x + 0.6 * bend, y), (120, 3), 13) + 0.6 * _noise(
+        (x + 0.6 * bend, y), (240, 5), 18
+    )
     pores = _step(_noise((x + 0.6 * bend, y), (170, 12), 14), 0.5, 0.2)
     tone = 0.30 + 0.42 * late + 0.13 * fibre + 0.16 * _noise(at, (3, 1), 15)
-    return _mix(_ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"), _color("5a3519"), 0.4 * pores)
+    return _mix(
+        _ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"),
+        _color("5a3519"),
+        0.4 * pores,
+    )
 
 
 @pattern(0.9, roughness=0.15)
@@ -186,10 +238,22 @@ def marble(at: Grid) -> Doubles:
     x, y = far
     clouds = 0.5 + 0.5 * _clouds(near, (3, 3), 4, 25)
     veins = np.zeros((SIDE, SIDE))
-    for across, down, width, depth, seed in ((1, 1, 0.05, 0.75, 23), (2, 1, 0.02, 0.45, 24), (1, 3, 0.012, 0.3, 26)):
-        wave = np.abs(np.sin(np.pi * (across * x + down * y + 0.5 * _clouds(far, (2, 2), 4, seed))))
+    for across, down, width, depth, seed in (
+        (1, 1, 0.05, 0.75, 23),
+        (2, 1, 0.02, 0.45, 24),
+        (1, 3, 0.012, 0.3, 26),
+    ):
+        wave = np.abs(
+            np.sin(
+                np.pi * (across * x + down * y + 0.5 * _clouds(far, (2, 2), 4, seed))
+            )
+        )
         strength = 0.25 + 0.75 * _step(_clouds(near, (3, 3), 2, seed + 50), 0.0, 0.8)
-        veins += depth * strength * (np.exp(-((wave / width) ** 2)) + 0.3 * np.exp(-(wave / (4.0 * width))))
+        veins += (
+            depth
+            * strength
+            * (np.exp(-((wave / width) ** 2)) + 0.3 * np.exp(-(wave / (4.0 * width))))
+        )
     base = _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8))
     return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
 
@@ -197,19 +261,26 @@ def marble(at: Grid) -> Doubles:
 @pattern(0.6, roughness=0.9, specular=0.2)
 def brick(at: Grid) -> Doubles:
     x, y = _warped(at, 12, 0.0035, 31)
-    rows, columns = 8, 4
+    rows = 8
+    columns = 4
     row = np.floor(y * rows)
     across = x * columns + 0.5 * (row % 2.0)
     column = np.floor(across) % columns
     # distance to the edge of the brick, in heights of a course
     edge_x = 2.0 * (0.5 - np.abs(across % 1.0 - 0.5))
     edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
-    solid = _step(np.minimum(edge_x, edge_y) + 0.02 * _noise(at, (60, 60), 32), 0.075, 0.05)
+    solid = _step(
+        np.minimum(edge_x, edge_y) + 0.02 * _noise(at, (60, 60), 32), 0.075, 0.05
+    )
     tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
     chosen = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
     grain = _clouds(at, (40, 40), 3, 34)
-    brick = _ramp(chosen + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c")
-    brick = _mix(brick, _color("4f211a"), 0.5 * _step(_clouds(at, (70, 70), 2, 35), 0.35, 0.2))
+    brick = _ramp(
+        chosen + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
+    )
+    brick = _mix(
+        brick, _color("4f211a"), 0.5 * _step(_clouds(at, (70, 70), 2, 35), 0.35, 0.2)
+    )
     mortar = _color("c3bbac") + 0.10 * _clouds(at, (80, 80), 2, 36)[..., None]
     return _mix(mortar, brick, solid)
 
@@ -218,17 +289,28 @@ def brick(at: Grid) -> Doubles:
 def fabric(at: Grid) -> Doubles:
     x, y = _warped(at, 6, 0.004, 41)
     count = 16
-    across, down = x * count, y * count
-    round_x, round_y = np.sin(np.pi * (across % 1.0)), np.sin(np.pi * (down % 1.0))
-    over = (np.floor(across) + np.floor(down)) % 2.0  # 1: the warp (upright thread) lies on top
-    height = np.where(over > 0.5, round_x * (0.55 + 0.45 * round_y), round_y * (0.55 + 0.45 * round_x))
+    across = x * count
+    down = y * count
+    round_x = np.sin(np.pi * (across % 1.0))
+    round_y = np.sin(np.pi * (down % 1.0))
+    # 1: the warp (upright thread) lies on top
+    over = (np.floor(across) + np.floor(down)) % 2.0
+    height = np.where(
+        over > 0.5, round_x * (0.55 + 0.45 * round_y), round_y * (0.55 + 0.45 * round_x)
+    )
     fibres_up = _noise((x, y), (count * 8, count), 42)
     fibres_flat = _noise((x, y), (count, count * 8), 43)
     fibres = np.where(over > 0.5, fibres_up, fibres_flat)
     generator = np.random.Generator(np.random.PCG64(44))
-    warp_tone, weft_tone = generator.uniform(0.8, 1.1, count), generator.uniform(0.8, 1.1, count)
-    warp = _color("b9a77f") * warp_tone[np.floor(across).astype(np.int64) % count][..., None]
-    weft = _color("3f5f86") * weft_tone[np.floor(down).astype(np.int64) % count][..., None]
+    warp_tone = generator.uniform(0.8, 1.1, count)
+    weft_tone = generator.uniform(0.8, 1.1, count)
+    warp = (
+        _color("b9a77f")
+        * warp_tone[np.floor(across).astype(np.int64) % count][..., None]
+    )
+    weft = (
+        _color("3f5f86") * weft_tone[np.floor(down).astype(np.int64) % count][..., None]
+    )
     thread = np.where(over[..., None] > 0.5, warp, weft)
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
 
@@ -245,11 +327,17 @@ def leopard(at: Grid) -> Doubles:
     offset_y = (place[1] - points[index[..., 0], 1] + 0.5) % 1.0 - 0.5
     angle = np.arctan2(offset_y, offset_x)
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index[..., 0]]
-    broken = _step(np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn), -0.75, 0.5)
-    ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, 0.056 + 0.004 * np.cos(angle + turn), 0.008))
+    broken = _step(
+        np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn), -0.75, 0.5
+    )
+    ring = _step(radius, 0.031, 0.008) * (
+        1.0 - _step(radius, 0.056 + 0.004 * np.cos(angle + turn), 0.008)
+    )
     core = 1.0 - _step(radius, 0.042, 0.02)
     fur = _clouds(at, (24, 90), 2, 55)
-    coat = _mix(_color("d8a861"), _color("e7c58c"), 0.5 + 0.5 * _clouds(at, (3, 3), 2, 56))
+    coat = _mix(
+        _color("d8a861"), _color("e7c58c"), 0.5 + 0.5 * _clouds(at, (3, 3), 2, 56)
+    )
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
     small, _ = _cells(place, _scattered(150, 57), 1)
     between = _step(distance[..., 0], 0.07, 0.012)
@@ -281,18 +369,27 @@ def rust(at: Grid) -> Doubles:
     tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
     oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
     paint = _color("5d6668") + 0.05 * _clouds(at, (20, 20), 2, 74)[..., None]
-    left = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05)  # paint that has not come off yet
-    rim = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10) - left
-    surface = _mix(_mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)), paint, 0.85 * left)
+    # paint that has not come off yet
+    left = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05)
+    rim = (
+        _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10) - left
+    )
+    surface = _mix(
+        _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)), paint, 0.85 * left
+    )
     pits = _step(_noise(at, (70, 70), 77), 0.5, 0.15)
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
 @pattern(0.5, roughness=0.9, specular=0.1)
 def grass(at: Grid) -> Doubles:
-    """Blades drawn one over the other, bent and lighter towards the tip; later ones lie on top."""
+    """Blades drawn one over the other, bent and lighter towards the tip; later ones lie
+    on top.
+    """
     generator = np.random.Generator(np.random.PCG64(81))
-    count, samples, broad = 2600, 64, 5
+    count = 2600
+    samples = 64
+    broad = 5
     root = generator.random((count, 1, 1, 2))
     lean = generator.normal(-np.pi / 2, 0.55, (count, 1, 1))
     bend = generator.normal(0.0, 0.9, (count, 1, 1))
@@ -300,11 +397,21 @@ def grass(at: Grid) -> Doubles:
     along = np.linspace(0.0, 1.0, samples)[None, :, None]
     side = (np.linspace(-1.0, 1.0, broad))[None, None, :] * 0.0042 * (1.0 - along**2)
     heading = lean + bend * along
-    x = root[..., 0] + length * along * np.cos(lean + 0.5 * bend * along) - side * np.sin(heading)
-    y = root[..., 1] + length * along * np.sin(lean + 0.5 * bend * along) + side * np.cos(heading)
+    x = (
+        root[..., 0]
+        + length * along * np.cos(lean + 0.5 * bend * along)
+        - side * np.sin(heading)
+    )
+    y = (
+        root[..., 1]
+        + length * along * np.sin(lean + 0.5 * bend * along)
+        + side * np.cos(heading)
+    )
     lit = 0.30 + 0.70 * along + 0.12 * np.linspace(-1.0, 1.0, broad)[None, None, :]
     hue = generator.random((count, 1, 1, 1)) ** 1.5
-    blade = (_color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue) * lit[..., None]
+    blade = (_color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue) * lit[
+        ..., None
+    ]
     column = np.floor(x * SIDE).astype(np.int64) % SIDE
     row = np.floor(y * SIDE).astype(np.int64) % SIDE
     texels = np.broadcast_to(_color("14240b"), (SIDE * SIDE, 3)).copy()
@@ -327,21 +434,31 @@ def elephant(at: Grid) -> Doubles:
         folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
     long = np.abs(_clouds(_warped(at, 5, 0.04, 95), (3, 14), 3, 96))
     folds += 0.55 * np.exp(-((long / 0.035) ** 2))
-    tone = 0.55 + 0.25 * _clouds(place, (3, 3), 3, 97) + 0.16 * _clouds(at, (60, 60), 2, 98)
+    tone = (
+        0.55
+        + 0.25 * _clouds(place, (3, 3), 3, 97)
+        + 0.16 * _clouds(at, (60, 60), 2, 98)
+    )
     hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 
 
 @pattern(0.5, roughness=0.32, metallic=1.0)
 def steel(at: Grid) -> Doubles:
-    scratches = _noise(at, (3, 240), 101) + 0.6 * _noise(at, (7, 120), 102) + 0.4 * _noise(at, (2, 256), 103)
+    scratches = (
+        _noise(at, (3, 240), 101)
+        + 0.6 * _noise(at, (7, 120), 102)
+        + 0.4 * _noise(at, (2, 256), 103)
+    )
     tone = 0.72 + 0.09 * scratches + 0.03 * _noise(at, (2, 2), 104)
     return np.asarray(tone[..., None] * _color("fbfdff"))
 
 
 @cache
 def tile(name: str) -> Floats:
-    """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it."""
+    """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in
+    [0, 1]; do not change it.
+    """
     line = (np.arange(SIDE) + 0.5) / SIDE
     across, down = np.meshgrid(line, line)
     painted = np.clip(PATTERNS[name].paint((across, down)), 0.0, 1.0).astype(np.float32)
@@ -349,15 +466,19 @@ def tile(name: str) -> Floats:
     return painted
 
 
-# ---- on an object ----------------------------------------------------------------------------------------------------
+# ---- on an object
+# ----------------------------------------------------------------------------------------------------
 
 
 def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
-    """Return the texture that covers a mesh with a pattern at one scale all over, whatever its texture coordinates.
+    """Return the texture that covers a mesh with a pattern at one scale all over,
+    whatever its texture coordinates.
 
-    Every texel of the texture looks up the tile at its place on the object, seen along the three axes, weighted by the
-    normal ("triplanar" mapping; Geiss, GPU Gems 3, 2007, section 1.5). So charts meet without a seam, and the
-    pattern's scale does not depend on how the object was unwrapped. Rows of the tile stand upright on upright walls.
+    Every texel of the texture looks up the tile at its place on the object, seen along
+    the three axes, weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3,
+    2007, section 1.5). So charts meet without a seam, and the pattern's scale does not
+    depend on how the object was unwrapped. Rows of the tile stand upright on upright
+    walls.
 
     Args:
         mesh: one object size large, in its own coordinates.
@@ -373,7 +494,9 @@ def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
-        seen = looked_up(tile(name), positions[..., right] * scale, -positions[..., up] * scale)
+        seen = looked_up(
+            tile(name), positions[..., right] * scale, -positions[..., up] * scale
+        )
         texels += weights[..., axis : axis + 1] * seen
     return texels
 
@@ -395,7 +518,8 @@ class MaterialControl(Control):
     kind = "material"
     of_a_mesh = True
     parameters = (
-        Parameter.named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or a named material in its place.",
+        Parameter.named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or "
+                                                        "a named material in its place.",
                         estimators=("differences",)),
         *MATERIAL,
         *Parameter.colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
@@ -403,28 +527,39 @@ class MaterialControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         numbers = [name for name in NUMBERS if self._varies(name)]
-        if self.mesh_in(scene).surface is not None and (numbers or self._names != (OWN,)):
+        if self.mesh_in(scene).surface is not None and (
+            numbers or self._names != (OWN,)
+        ):
             raise InputError(
-                f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's own; search red, green or blue, "
-                f"or its numbers by Mitsuba's names, mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
+                f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's "
+                "own; search red, green or blue, "
+                "or its numbers by Mitsuba's names, "
+                f"mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
             )
         return scene
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         if parameter.name not in NUMBERS:
             return parameter
-        first = OWN if OWN in self._names else str(self._names[0])  # the fixed or first material
-        return replace(parameter, default=float(getattr(self._own(first), parameter.name)))
+        # the fixed or first material
+        first = OWN if OWN in self._names else str(self._names[0])
+        return replace(
+            parameter, default=float(getattr(self._own(first), parameter.name))
+        )
 
     def unchanged(self, parameter: Parameter) -> Number:
         given = self.setting(parameter) in self.scene.given
-        return self.scene.number(self.setting(parameter)) if given else parameter.default
+        return (
+            self.scene.number(self.setting(parameter)) if given else parameter.default
+        )
 
     @property
     def refines(self) -> frozenset[str]:
         return frozenset({self._base_color}) if self._colours() else frozenset()
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         which = (OWN, *PATTERNS)[int(values["which"])]
         material = self._own(which)
         inputs: dict[str, Tensor] = {}
@@ -432,10 +567,14 @@ class MaterialControl(Control):
             if self._varies(name):
                 inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
             elif self._names != (OWN,):
-                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(material, name))])
+                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor(
+                    [float(getattr(material, name))]
+                )
         if self._colours():
-            mesh, tint = self.mesh_in(self.scene), color.combine_channels(values)
-            base = so_far.get(self._base_color)  # what the controls before made of the texture
+            mesh = self.mesh_in(self.scene)
+            tint = color.combine_channels(values)
+            # what the controls before made of the texture
+            base = so_far.get(self._base_color)
             if which != OWN:
                 base = _linear_covering(mesh.mesh, which)
             elif base is None:
@@ -443,10 +582,16 @@ class MaterialControl(Control):
             inputs[self._base_color] = tint * base.to(tint.device)
         return inputs
 
-    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         if not self._colours():
             return {}
-        return {self.name: linear_to_srgb(self.scene_inputs(values, so_far)[self._base_color])}
+        return {
+            self.name: linear_to_srgb(
+                self.scene_inputs(values, so_far)[self._base_color]
+            )
+        }
 
     @property
     def _base_color(self) -> str:
@@ -457,14 +602,20 @@ class MaterialControl(Control):
         return self.allowed("which", OWN)
 
     def _varies(self, name: str) -> bool:
-        """Whether a parameter was set or is searched; otherwise it is the named material's own."""
+        """Whether a parameter was set or is searched; otherwise it is the named
+        material's own.
+        """
         return name in self.specs or not self.asked
 
     def _colours(self) -> bool:
         return self._names != (OWN,) or any(self._varies(name) for name in CHANNELS)
 
     def _own(self, which: str) -> Material:
-        return self.mesh_in(self.scene).material if which == OWN else PATTERNS[which].material
+        return (
+            self.mesh_in(self.scene).material
+            if which == OWN
+            else PATTERNS[which].material
+        )
 
 
 @lru_cache(maxsize=len(PATTERNS))

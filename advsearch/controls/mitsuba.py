@@ -1,7 +1,9 @@
-"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name, a key of `mitsuba.traverse`.
+"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name, a key
+of `mitsuba.traverse`.
 
-The object under test is called `object` there. Of a colour, each channel is a number in the same range; `KEY.red` is
-one. Whether Mitsuba's derivative is right nobody knows beforehand: `advsearch check` compares it with differences.
+The object under test is called `object` there. Of a colour, each channel is a number in
+the same range; `KEY.red` is one. Whether Mitsuba's derivative is right nobody knows
+beforehand: `advsearch check` compares it with differences.
 """
 
 from __future__ import annotations
@@ -36,7 +38,10 @@ class MitsubaControl(Control):
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
         if not self._given:
-            raise InputError(f"`controls` {self.name}: expected Mitsuba's names, as in mitsuba:KEY=[low, high]")
+            raise InputError(
+                f"`controls` {self.name}: expected Mitsuba's names, as in "
+                "mitsuba:KEY=[low, high]"
+            )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
@@ -44,7 +49,10 @@ class MitsubaControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         return scene.with_part(
-            parts.PluginNumbers(self.name, mitsuba_data.plugin_numbers(scene, self.name, tuple(self._given)))
+            parts.PluginNumbers(
+                self.name,
+                mitsuba_data.plugin_numbers(scene, self.name, tuple(self._given)),
+            )
         )
 
     def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
@@ -52,16 +60,22 @@ class MitsubaControl(Control):
             whole = self.specs.get(number.key)
             if isinstance(whole, OneOf) and len(number.values) > 1:
                 raise InputError(
-                    f"`controls` {self.name}:{number.key}: expected a range, because it is a colour; values one by one "
-                    f"are for one channel, such as {self.name}:{number.key}.{color.CHANNELS[0]}"
+                    f"`controls` {self.name}:{number.key}: expected a range, because "
+                    "it is a colour; values one by one "
+                    "are for one channel, such as "
+                    f"{self.name}:{number.key}.{color.CHANNELS[0]}"
                 )
             for parameter, value in zip(_channels(number), number.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
                 yield replace(parameter, default=value), spec
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         return {
-            number.input: torch.stack([values[channel.name] for channel in _channels(number)])
+            number.input: torch.stack(
+                [values[channel.name] for channel in _channels(number)]
+            )
             for number in self._numbers()
         }
 
@@ -70,17 +84,30 @@ class MitsubaControl(Control):
 
     def _numbers(self) -> tuple[parts.PluginNumber, ...]:
         return next(
-            one.numbers for one in self.scene.parts if isinstance(one, parts.PluginNumbers) and one.name == self.name
+            one.numbers
+            for one in self.scene.parts
+            if isinstance(one, parts.PluginNumbers) and one.name == self.name
         )
 
 
 def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
     return Parameter(
-        key, (), "1", -Parameter.LARGEST, Parameter.LARGEST, "the scene's own", f"Mitsuba's {key}.", estimators=valid
+        key,
+        (),
+        "1",
+        -Parameter.LARGEST,
+        Parameter.LARGEST,
+        "the scene's own",
+        f"Mitsuba's {key}.",
+        estimators=valid,
     )
 
 
 def _channels(one: parts.PluginNumber) -> list[Parameter]:
     """A parameter for each number."""
-    names = [f"{one.key}.{channel}" for channel in color.CHANNELS] if len(one.values) > 1 else [one.key]
+    names = (
+        [f"{one.key}.{channel}" for channel in color.CHANNELS]
+        if len(one.values) > 1
+        else [one.key]
+    )
     return [_parameter(name, one.valid) for name in names]

@@ -1,9 +1,12 @@
-"""The `pose` control: where the object or another mesh stands, how it is turned, and how large it is.
+"""The `pose` control: where the object or another mesh stands, how it is turned, and
+how large it is.
 
-    world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on the ground and shifted
+    world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on
+    the ground and shifted
 
-A mesh around the object is put back on the height at which it stood, and shifted from there. `rotation` is a rotation
-vector (axis times angle) on top of the angles, which lock at a pitch of 90 degrees.
+A mesh around the object is put back on the height at which it stood, and shifted from
+there. `rotation` is a rotation vector (axis times angle) on top of the angles, which
+lock at a pitch of 90 degrees.
 """
 
 from __future__ import annotations
@@ -33,35 +36,54 @@ class PoseControl(Control):
         *POSE[3:],
     )  # fmt: skip
     choices = (
-        Choice("on_ground", "yes", "yes: the lowest point stays at height z however it turns; no: its middle stays."),
+        Choice(
+            "on_ground",
+            "yes",
+            "yes: the lowest point stays at height z however it "
+            "turns; no: its middle stays.",
+        ),
     )
 
     def check_choices(self) -> None:
         given = self.chosen["on_ground"]
         if given not in ("yes", "no", True, False):
-            raise InputError(f"{self.name}.on_ground: expected yes or no, got {given!r}")
+            raise InputError(
+                f"{self.name}.on_ground: expected yes or no, got {given!r}"
+            )
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         mesh = self.mesh_in(self.scene)
         base, vertices, floor = _standing(mesh, self.scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
-        turned = rotation_vector(values["rotation"]) @ euler(values["yaw"], values["pitch"], values["roll"])
+        turned = rotation_vector(values["rotation"]) @ euler(
+            values["yaw"], values["pitch"], values["roll"]
+        )
         linear = values["scale"] * turned
         if self.chosen["on_ground"] in ("yes", True):
             lowest = ((vertices - middle) @ linear[2]).amin()
         else:
             lowest = floor - middle[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
-        translation = shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
+        translation = (
+            shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
+        )
         return {f"{mesh.name}.to_world": affine(linear, translation) @ base}
 
 
 @lru_cache(maxsize=16)
 def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
-    """Where a mesh stands before it is posed: from its own coordinates (4, 4), its vertices (V, 3) there, their floor.
-    `placed` is a mesh around the object as it came; the object's own coordinates are those of the scene."""
+    """Where a mesh stands before it is posed: from its own coordinates (4, 4), its
+    vertices (V, 3) there, their floor. `placed` is a mesh around the object as it came;
+    the object's own coordinates are those of the scene.
+    """
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
     places = standing(placed)
-    return torch.from_numpy(placed.to_world).float(), torch.from_numpy(places).float(), float(places[:, 2].min())
+    return (
+        torch.from_numpy(placed.to_world).float(),
+        torch.from_numpy(places).float(),
+        float(places[:, 2].min()),
+    )

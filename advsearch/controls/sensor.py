@@ -1,4 +1,5 @@
-"""The `sensor` control: what a camera's sensor and its processing do to the finished picture.
+"""The `sensor` control: what a camera's sensor and its processing do to the finished
+picture.
 
     vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
     light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
@@ -7,10 +8,11 @@
     balance    red and blue times 2^red, 2^blue
     file       the tone curve, then JPEG
 
-Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for
-single-image raw-data, section II. Pattern: Bayer 1976, US patent 3971065. Aberration: Kang 2007, Automatic removal of
-chromatic aberration from a single image, section 2. Vignetting: Kang and Weiss 2000, Can we calibrate a camera using an
-image of a flat, textureless Lambertian surface, section 2.
+Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise
+modeling and fitting for single-image raw-data, section II. Pattern: Bayer 1976, US
+patent 3971065. Aberration: Kang 2007, Automatic removal of chromatic aberration from a
+single image, section 2. Vignetting: Kang and Weiss 2000, Can we calibrate a camera
+using an image of a flat, textureless Lambertian surface, section 2.
 """
 
 from __future__ import annotations
@@ -31,30 +33,47 @@ _image = partial(Parameter.number, ("image",))
 
 
 class SensorControl(Control):
-    """What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."""
+    """What a camera adds: noise, mosaic, white balance, chromatic aberration,
+    vignetting, JPEG.
+    """
 
     kind = "sensor"
     parameters = (
-        _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing in the corners."),
+        _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing "
+                                                  "in the corners."),
         _image("aberration", "1", -0.02, 0.02, 0.0,
                "How much larger the red picture is than the green one; blue smaller.", (-0.005, 0.005)),
         _image("shot", "1", 0.0, 0.5, 0.0,
-               "Standard deviation of the noise in white that grows with the root of light.", (0.0, 0.1)),
-        _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is there in the dark.", (0.0, 0.02)),
+               "Standard deviation of the noise in white that grows with the root of "
+               "light.", (0.0, 0.1)),
+        _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is "
+                                           "there in the dark.", (0.0, 0.02)),
         _image("mosaic", "1", 0.0, 1.0, 0.0,
-               "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.", (0.0, 1.0)),
-        _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much brighter.", (-0.5, 0.5)),
-        _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much brighter.", (-0.5, 0.5)),
+               "Share of the picture that goes through a Bayer mosaic; 1 is a real "
+               "camera.", (0.0, 1.0)),
+        _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much "
+                                               "brighter.", (-0.5, 0.5)),
+        _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much "
+                                                "brighter.", (-0.5, 0.5)),
         Parameter.number((), "compression", "1", 0.0, 95.0, 0.0,
                          "0 is no file; above, a JPEG file of quality 100 less this.", (0.0, 60.0)),
     )  # fmt: skip
-    choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
+    choices = (
+        Choice(
+            "seed",
+            0,
+            "Which draw of the noise: a whole number from 0.",
+            whole=(0, 2**32 - 1),
+        ),
+    )
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return through_sensor(image, values, int(self.chosen["seed"]))
 
 
-def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:
+def through_sensor(
+    image: Tensor, values: Mapping[str, Tensor], seed: int = 0
+) -> Tensor:
     """Return a picture as a camera would have taken it.
 
     Args:
@@ -63,24 +82,32 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
         seed: chooses the noise.
 
     Returns:
-        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value but `compression`, past which the
-        derivative is that of the picture before it.
+        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value but
+        `compression`, past which the derivative is that of the picture before it.
     """
     height, width = image.shape[:2]
-    light = color.srgb_to_linear(image) * vignette(height, width, values["vignetting"]).to(image.device)
+    light = color.srgb_to_linear(image) * vignette(
+        height, width, values["vignetting"]
+    ).to(image.device)
     light = aberrated(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
     spread = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + spread * images.drawn(height, width, seed, "sensor").to(light)
     light = light + values["mosaic"] * (demosaiced(light) - light)
-    gains = torch.stack([2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]])
+    gains = torch.stack(
+        [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
+    )
     seen = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
-    return images.coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+    return (
+        images.coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+    )
 
 
 def vignette(height: int, width: int, amount: Tensor) -> Tensor:
-    """Return the share of the light (H, W, 1) that comes through a lens, with `amount` () missing in the corners."""
+    """Return the share of the light (H, W, 1) that comes through a lens, with `amount`
+    () missing in the corners.
+    """
     down, across = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
     corner = (height**2 + width**2) / 4.0
     square = (down[:, None] ** 2 + across[None, :] ** 2) / corner
@@ -88,26 +115,40 @@ def vignette(height: int, width: int, amount: Tensor) -> Tensor:
 
 
 def aberrated(image: Tensor, amount: Tensor) -> Tensor:
-    """Return (H, W, 3) whose red is larger by a factor 1 + amount about the middle, and whose blue is smaller."""
+    """Return (H, W, 3) whose red is larger by a factor 1 + amount about the middle, and
+    whose blue is smaller.
+    """
     height, width = image.shape[:2]
     down, across = torch.meshgrid(
-        torch.arange(height) + 0.5 - height / 2, torch.arange(width) + 0.5 - width / 2, indexing="ij"
+        torch.arange(height) + 0.5 - height / 2,
+        torch.arange(width) + 0.5 - width / 2,
+        indexing="ij",
     )
     outwards = torch.stack([across, down], dim=-1).to(image)
     red, blue = (
-        images.warped(image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0))
+        images.warped(
+            image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)
+        )
         for k, sign in ((0, 1), (2, -1))
     )
     return torch.cat([red, image[..., 1:2], blue], dim=-1)
 
 
 def demosaiced(light: Tensor) -> Tensor:
-    """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others from neighbours, bilinearly."""
+    """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others
+    from neighbours, bilinearly.
+    """
     height, width = light.shape[:2]
-    rows, columns = torch.arange(height)[:, None] % 2, torch.arange(width)[None, :] % 2
-    red, blue = (1 - rows) * (1 - columns), rows * columns
+    rows = torch.arange(height)[:, None] % 2
+    columns = torch.arange(width)[None, :] % 2
+    red = (1 - rows) * (1 - columns)
+    blue = rows * columns
     kept = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
-    kernel = light.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]).expand(3, 1, 3, 3)
+    kernel = light.new_tensor(
+        [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
+    ).expand(3, 1, 3, 3)
     total = F.conv2d(images.planes(light * kept), kernel, padding=1, groups=3)
     weight = F.conv2d(images.planes(kept), kernel, padding=1, groups=3)
-    return torch.where(kept > 0.0, light, images.picture(total / weight.clamp_min(1e-6)))
+    return torch.where(
+        kept > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
+    )

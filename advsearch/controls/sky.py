@@ -1,13 +1,17 @@
-"""The `sky` control: a clear sky with a sun instead of the environment; where the sun stands and how hazy the air is.
+"""The `sky` control: a clear sky with a sun instead of the environment; where the sun
+stands and how hazy the air is.
 
-The map is a differentiable function in torch: the dome of Hosek and Wilkie (2012, An Analytic Model for Full Spectral
-Sky-Dome Radiance, equation 8), their sun of 2013 (Adding a Solar Radiance Function to the Hosek Skylight Model), with
-the coefficients of Mitsuba's `sunsky` plugin. Unlike there, the sun is wider (`SUN_RADIUS`), so that a map can hold it,
-negative radiance is cut off, below is a diffuse ground, and a moving sun has a derivative. By default each is metered,
+The map is a differentiable function in torch: the dome of Hosek and Wilkie (2012, An
+Analytic Model for Full Spectral Sky-Dome Radiance, equation 8), their sun of 2013
+(Adding a Solar Radiance Function to the Hosek Skylight Model), with the coefficients of
+Mitsuba's `sunsky` plugin. Unlike there, the sun is wider (`SUN_RADIUS`), so that a map
+can hold it, negative radiance is cut off, below is a diffuse ground, and a moving sun
+has a derivative. By default each is metered,
 
     radiance = map(azimuth, elevation, turbidity) M / m(azimuth, elevation, turbidity),
 
-with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that of the start.
+with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that
+of the start.
 """
 
 from __future__ import annotations
@@ -21,109 +25,183 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, Parameter, SceneDescription, Values, assets, color, mitsuba_data
+from advsearch.extend import (
+    Choice,
+    Control,
+    Parameter,
+    SceneDescription,
+    Values,
+    assets,
+    color,
+    mitsuba_data,
+)
 
-ROWS, COLUMNS = 256, 512  # size of the map
-SUN_RADIUS = math.radians(1.5)  # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
-SUN_APERTURE = math.radians(0.5358 / 2.0)  # radius of the real sun, radians: the one that the coefficients are made for
+ROWS = 256  # size of the map
+COLUMNS = 512
+# radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
+SUN_RADIUS = math.radians(1.5)
+# radius of the real sun, radians: the one that the coefficients are made for
+SUN_APERTURE = math.radians(0.5358 / 2.0)
 SUN_OVER_SKY = 467.069280386
-"""Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's plugin."""
+"""Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's
+plugin.
+"""
 TURBIDITIES = (1.0, 10.0)  # what the coefficients cover
 NEARLY_NOTHING = 1e-12
 
 
 @cache
 def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the two models interpolate, see `sunsky_tables`; read once per process and device."""
+    """Return what the two models interpolate, see `sunsky_tables`; read once per
+    process and device.
+    """
     radiance, level, sun = mitsuba_data.sunsky_tables()
     return radiance.to(device), level.to(device), sun.to(device)
 
 
 def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
-    """Return the unit vector (3,) towards an azimuth and an elevation () in degrees; z is up, azimuth 0 is +x."""
-    phi, theta = torch.deg2rad(azimuth), torch.deg2rad(elevation)
-    return torch.stack([torch.cos(theta) * torch.cos(phi), torch.cos(theta) * torch.sin(phi), torch.sin(theta)])
+    """Return the unit vector (3,) towards an azimuth and an elevation () in degrees; z
+    is up, azimuth 0 is +x.
+    """
+    phi = torch.deg2rad(azimuth)
+    theta = torch.deg2rad(elevation)
+    return torch.stack(
+        [
+            torch.cos(theta) * torch.cos(phi),
+            torch.cos(theta) * torch.sin(phi),
+            torch.sin(theta),
+        ]
+    )
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) between whole turbidities by cubics with a continuous derivative. The slope at a
-    whole turbidity is that between its neighbours (Catmull and Rom 1974), one-sided at the ends. The authors
-    interpolate linearly, so that the derivative jumps at whole turbidities, the default of 3 among them."""
+    """Interpolate a table (10, ...) between whole turbidities by cubics with a
+    continuous derivative. The slope at a whole turbidity is that between its neighbours
+    (Catmull and Rom 1974), one-sided at the ends. The authors interpolate linearly, so
+    that the derivative jumps at whole turbidities, the default of 3 among them.
+    """
     below = min(8, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below
-    first, second = table[below], table[below + 1]
+    first = table[below]
+    second = table[below + 1]
     around = ((max(0, k - 1), min(9, k + 1)) for k in (below, below + 1))
-    slopes = [(table[after] - table[before]) / (after - before) for before, after in around]
+    slopes = [
+        (table[after] - table[before]) / (after - before) for before, after in around
+    ]
     rise = second - first
-    return torch.lerp(first, second, t) + t * (1.0 - t) * ((1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise))
+    return torch.lerp(first, second, t) + t * (1.0 - t) * (
+        (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
+    )
 
 
 def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
-    """Return the sun's irradiance (3,) on a surface that faces it, in the unit of the sky's radiance times steradian.
+    """Return the sun's irradiance (3,) on a surface that faces it, in the unit of the
+    sky's radiance times steradian.
 
-    A piece of the model is a cubic in the elevation above the piece's beginning. A term `cos(psi)^j` of the limb's
-    darkening has the mean `2 / (j + 2)` over the disk.
+    A piece of the model is a cubic in the elevation above the piece's beginning. A term
+    `cos(psi)^j` of the limb's darkening has the mean `2 / (j + 2)` over the disk.
     """
     radians = torch.deg2rad(elevation)
     share = float(radians.detach()) / (math.pi / 2.0)
     piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
     terms = _at_turbidity(tables(radians.device)[2], turbidity)[piece]
-    limb = torch.tensor([2.0 / (power + 2.0) for power in range(6)], device=radians.device)
+    limb = torch.tensor(
+        [2.0 / (power + 2.0) for power in range(6)], device=radians.device
+    )
     powers = torch.stack([above**power for power in range(4)])
     solid_angle = 2.0 * math.pi * (1.0 - math.cos(SUN_APERTURE))
-    return (torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_OVER_SKY).clamp_min(0.0)
+    return (
+        torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_OVER_SKY
+    ).clamp_min(0.0)
 
 
 class Sky:
-    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is the maps'."""
+    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is
+    the maps'.
+    """
 
     def __init__(self, ground: Tensor) -> None:
         self.ground = ground
         upper = ROWS // 2
-        elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (ROWS - 1)
-        azimuth = 90.0 - 360.0 * (torch.arange(COLUMNS, device=ground.device) + 0.5) / COLUMNS
+        elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
+            ROWS - 1
+        )
+        azimuth = (
+            90.0 - 360.0 * (torch.arange(COLUMNS, device=ground.device) + 0.5) / COLUMNS
+        )
         rows, columns = torch.meshgrid(elevation, azimuth, indexing="ij")
-        self.directions = direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
+        self.directions = (
+            direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
+        )
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
         texel = (math.pi / (ROWS - 1)) * (2.0 * math.pi / COLUMNS)
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
     def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk. The sun is a
-        unit vector (3,) towards it, its elevation () in degrees, over 0, and the turbidity () in `TURBIDITIES`."""
-        a, b, c, d, e, f, g, i, h = self._interpolated(tables(sun.device)[0], elevation, turbidity).unbind(-1)
+        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon
+        without the sun's disk. The sun is a unit vector (3,) towards it, its elevation
+        () in degrees, over 0, and the turbidity () in `TURBIDITIES`.
+        """
+        a, b, c, d, e, f, g, i, h = self._interpolated(
+            tables(sun.device)[0], elevation, turbidity
+        ).unbind(-1)
         level = self._interpolated(tables(sun.device)[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
         angle = angle_between(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
-        glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(1.5)
-        rest = c + d * torch.exp(e * angle) + f * cosine**2 + g * glow + i * self.cosines.sqrt()
+        glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(
+            1.5
+        )
+        rest = (
+            c
+            + d * torch.exp(e * angle)
+            + f * cosine**2
+            + g * glow
+            + i * self.cosines.sqrt()
+        )
         return (horizon * rest * level).clamp_min(0.0)
 
-    def _interpolated(self, table: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...): quintic Bezier in the elevation's cube root, linear in the others."""
+    def _interpolated(
+        self, table: Tensor, elevation: Tensor, turbidity: Tensor
+    ) -> Tensor:
+        """Interpolate a table (10, 2, 6, 3, ...): quintic Bezier in the elevation's
+        cube root, linear in the others.
+        """
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
-        weights = torch.stack([math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)])
-        curves = torch.einsum("k,akc...->ac...", weights, _at_turbidity(table, turbidity))
+        weights = torch.stack(
+            [math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)]
+        )
+        curves = torch.einsum(
+            "k,akc...->ac...", weights, _at_turbidity(table, turbidity)
+        )
         albedo = self.ground.reshape(3, *[1] * (curves.ndim - 2))
         return torch.lerp(curves[0], curves[1], albedo)
 
     def disk(self, sun: Tensor) -> Tensor:
-        """Return the sun's shape (ROWS / 2, COLUMNS, 1): a smooth bump whose integral over solid angle is 1.
+        """Return the sun's shape (ROWS / 2, COLUMNS, 1): a smooth bump whose integral
+        over solid angle is 1.
 
-        `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that an adjoint that samples by
-        radiance sees its whole motion.
+        `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that
+        an adjoint that samples by radiance sees its whole motion.
         """
-        distance = (self.directions - sun).square().sum(-1, keepdim=True) / SUN_RADIUS**2
+        distance = (self.directions - sun).square().sum(
+            -1, keepdim=True
+        ) / SUN_RADIUS**2
         bump = (1.0 - distance).clamp_min(0.0).square()
         return bump / (bump * self.solid_angles).sum().clamp_min(NEARLY_NOTHING)
 
-    def __call__(self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel () of the irradiance on a surface
-        that faces the sun, which stands at an azimuth () and an elevation (), over 0 and at most 90 degrees."""
+    def __call__(
+        self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel ()
+        of the irradiance on a surface that faces the sun, which stands at an azimuth ()
+        and an elevation (), over 0 and at most 90 degrees.
+        """
         sun = direction(azimuth, elevation)
-        upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(elevation, turbidity)
+        upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(
+            elevation, turbidity
+        )
         arriving = upper * self.solid_angles
         on_ground = (arriving * self.cosines).sum((0, 1))
         lower = (self.ground * on_ground / math.pi).expand(ROWS - ROWS // 2, COLUMNS, 3)
@@ -132,9 +210,13 @@ class Sky:
 
 
 def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
-    """Return the angle (...) in radians between unit vectors (..., 3) and (3,); differentiable at 0 and 180 degrees."""
+    """Return the angle (...) in radians between unit vectors (..., 3) and (3,);
+    differentiable at 0 and 180 degrees.
+    """
     half_sine = ((directions - towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
-    half_cosine = ((directions + towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
+    half_cosine = (
+        (directions + towards).square().sum(-1) / 4.0 + NEARLY_NOTHING
+    ).sqrt()
     return 2.0 * torch.atan2(half_sine, half_cosine)
 
 
@@ -144,7 +226,9 @@ _by_differences = partial(Parameter.number, ("differences",))
 
 
 class SkyControl(Control):
-    """A clear sky instead of the environment: where the sun stands, and how hazy the air is."""
+    """A clear sky instead of the environment: where the sun stands, and how hazy the
+    air is.
+    """
 
     kind = "sky"
     parameters = (
@@ -153,36 +237,54 @@ class SkyControl(Control):
         _by_differences("elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
                         (5.0, 85.0)),
         Parameter.number(Parameter.LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-                         "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0)),
+                         "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
+                         "and moist, 10 hazy.", (2.0, 8.0)),
     )  # fmt: skip
     choices = (Choice("exposure", "metered",
-                      "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
+                      "metered (each sky anew, as an automatic camera does) or fixed "
+                      "(at the start).",
                       options=("metered", "fixed")),)  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
         radiance = bound.radiance(bound.values(bound.start)).numpy().astype(np.float32)
         sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
-        return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
+        return replace(scene, environment=sky).with_values(
+            environment__rotation=0.0, environment__exposure=0.0
+        )
 
     def fit(self) -> None:
         super().fit()
         start = self.values(self.start)
-        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]  # the sun's azimuth does not matter
-        self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(*numbers)[1]
+        # the sun's azimuth does not matter
+        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]
+        self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(
+            *numbers
+        )[1]
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         return {"environment.data": self.radiance(values)}
 
     def radiance(self, values: Values) -> Tensor:
-        """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
+        """Return the map (H, W, 3) of linear radiance at some values;
+        differentiable.
+        """
         numbers = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(*numbers)
+        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(
+            *numbers
+        )
         fixed = self.chosen["exposure"] == "fixed"
-        return radiance * (METERED_IRRADIANCE / (self._metered.to(radiance.device) if fixed else metered))
+        return radiance * (
+            METERED_IRRADIANCE
+            / (self._metered.to(radiance.device) if fixed else metered)
+        )
 
 
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
-    """Return the sky over a ground of an sRGB colour: far away it is made of the same as the ground plane."""
+    """Return the sky over a ground of an sRGB colour: far away it is made of the same
+    as the ground plane.
+    """
     return Sky(color.srgb_to_linear(torch.tensor(ground)).to(device))

@@ -1,1 +1,3 @@
-"""What every question is answered with: problems, stages, replay, sweeps, plans and domains."""
+"""What every question is answered with: problems, stages, replay, sweeps, plans and
+domains.
+"""

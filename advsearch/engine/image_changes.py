@@ -1,4 +1,6 @@
-"""Changes of an image after which a prediction must change, or must not, as claims state it."""
+"""Changes of an image after which a prediction must change, or must not, as claims
+state it.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,13 @@ def _brighter(picture: Tensor) -> Tensor:
 
 def _compressed(picture: Tensor) -> Tensor:
     file = io.BytesIO()
-    Image.fromarray((picture * 255.0).round().byte().numpy()).save(file, "JPEG", quality=95)
-    return torch.from_numpy(np.array(Image.open(file, formats=["JPEG"]))).to(picture) / 255.0
+    Image.fromarray((picture * 255.0).round().byte().numpy()).save(
+        file, "JPEG", quality=95
+    )
+    return (
+        torch.from_numpy(np.array(Image.open(file, formats=["JPEG"]))).to(picture)
+        / 255.0
+    )
 
 
 CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
@@ -34,16 +41,24 @@ CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
 }
 """What makes the changed picture of one (H, W, 3), sRGB in [0, 1]."""
 AWAY = "away"  # what is rendered again, see `Assembly.away`
-ALIKE = 0.1  # how far the probability of one label may move, and nothing has changed for `must_change`
+# how far the probability of one label may move, and nothing has changed for
+# `must_change`
+ALIKE = 0.1
 
 
 def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
-    """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig those of all its cameras."""
-    return torch.cat([CHANGED[when](part) for part in picture.chunk(cameras, dim=1)], dim=1)
+    """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig
+    those of all its cameras.
+    """
+    return torch.cat(
+        [CHANGED[when](part) for part in picture.chunk(cameras, dim=1)], dim=1
+    )
 
 
 def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
-    """Return whether a change did what is claimed: that it `must_change` what the model says, or `must_not_change`."""
+    """Return whether a change did what is claimed: that it `must_change` what the model
+    says, or `must_not_change`.
+    """
     moved = abs((before.probability or 0.0) - (after.probability or 0.0))
     another = before.label != after.label
     return another or moved > ALIKE if claim == "must_change" else not another

@@ -1,4 +1,6 @@
-"""What is known of a run so far, and kept of it: findings and stages of an attack, judgements as rows, measurements."""
+"""What is known of a run so far, and kept of it: findings and stages of an attack,
+judgements as rows, measurements.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from typing import Any
 
 from torch import Tensor
 
-from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
+from advsearch.attacks import (
+    SampleCount,
+    SearchResult,
+    Trials,
+    Verification,
+    count_right,
+)
 from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
@@ -28,48 +36,69 @@ KEPT = 4  # pictures of each group of trials that are kept
 class Findings:
     """What is known so far; whatever is still None or empty was not reached."""
 
-    first_look: tuple[Judgement, ...] = ()  # renders of the clean configuration at the search's sample count
-    search: SearchResult | None = None  # what the policy claims; `verification` is what trials say of it
+    # renders of the clean configuration at the search's sample count
+    first_look: tuple[Judgement, ...] = ()
+    # what the policy claims; `verification` is what trials say of it
+    search: SearchResult | None = None
     baseline: SearchResult | None = None  # the same of the random search
     sample_count: SampleCount | None = None  # how that of the verification was chosen
     clean: tuple[Judgement, ...] = ()  # the control group's trials
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    unprinted: SearchResult | None = None  # of the policy without print terms, where the search has them
+    # of the policy without print terms, where the search has them
+    unprinted: SearchResult | None = None
     unprinted_verification: Verification | None = None
-    # of what the policy found, where the random search's is worse for the model and the run's adversarial scene instead
+    # of what the policy found, where the random search's is worse for the model and the
+    # run's adversarial scene instead
     beaten: Verification | None = None
-    failures: tuple[Verification, ...] = ()  # of the first of the different failures that the policy found
-    ambient: dict[float, Verification] = field(default_factory=dict)  # of a projector's picture in other light, by lux
-    average: tuple[Judgement, ...] = ()  # trials of configurations drawn from the whole space
+    # of the first of the different failures that the policy found
+    failures: tuple[Verification, ...] = ()
+    # of a projector's picture in other light, by lux
+    ambient: dict[float, Verification] = field(default_factory=dict)
+    # trials of configurations drawn from the whole space
+    average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
-    # of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on only its own
+    # of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of
+    # a run that goes on only its own
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    frames: list[Any] = field(default_factory=list)  # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
+    # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
+    frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
-    transport: PredictedSearch | None = None  # what predicted the pictures of the searches, if anything did
+    # what predicted the pictures of the searches, if anything did
+    transport: PredictedSearch | None = None
     rendered_because: Refusal | None = None  # why nothing did
-    surface_refused: Refusal | None = None  # why matrices did and not light on surfaces, where that was tried
-    verification_renders: int = 0  # renders spent on choosing the sample count and on trials
+    # why matrices did and not light on surfaces, where that was tried
+    surface_refused: Refusal | None = None
+    # renders spent on choosing the sample count and on trials
+    verification_renders: int = 0
     predicted_trials: int = 0
 
     @property
     def spp(self) -> int:
         if self.sample_count is None:
-            raise RuntimeError("the sample count of the verification has not been chosen yet")
+            raise RuntimeError(
+                "the sample count of the verification has not been chosen yet"
+            )
         return self.sample_count.spp
 
     @property
     def transport_summary(self) -> LinearTransport:
-        """What predicted the images of the searches, and how far it was off; or why nothing did."""
+        """What predicted the images of the searches, and how far it was off; or why
+        nothing did.
+        """
         if self.transport is None:
-            return LinearTransport(used=False, reason=str(self.rendered_because or "nothing was searched"))
+            return LinearTransport(
+                used=False, reason=str(self.rendered_because or "nothing was searched")
+            )
         predicted = self.transport.summary()
         surface_refused = str(self.surface_refused) if self.surface_refused else None
-        return predicted.model_copy(update={"reason": predicted.reason or surface_refused})
+        return predicted.model_copy(
+            update={"reason": predicted.reason or surface_refused}
+        )
 
 
-LOST = "(no answer)"  # the label of a picture that nobody could make; what the row keeps beside it says why
+# the label of a picture that nobody could make; what the row keeps beside it says why
+LOST = "(no answer)"
 
 
 def lost_remarks(lost: int) -> list[str]:
@@ -77,17 +106,31 @@ def lost_remarks(lost: int) -> list[str]:
     if not lost:
         return []
     has, it = ("has", "it") if lost == 1 else ("have", "them")
-    return [f"{count(lost, 'picture')} {has} no answer, which counts as not right: every worker that took {it} died."]
+    return [
+        f"{count(lost, 'picture')} {has} no answer, which counts as not right: "
+        f"every worker that took {it} died."
+    ]
 
 
 def trial_row(
     kind: str, number: int, seed: int | None, spp: int, trial: Judgement, values: Mapping[str, Value] | None = None, *,
     sought: bool = True,
 ) -> Row:  # fmt: skip
-    """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
-    where a search sought some prediction."""
-    objective, success = _number(trial.objective), trial.success if sought else None
-    row = Row(kind, number, seed=seed, spp=spp, objective=objective, success=success, values=values or {}, renders=1)
+    """Return what the store keeps of a trial; the seed is None of a picture that was
+    predicted. There is a success only where a search sought some prediction.
+    """
+    objective = _number(trial.objective)
+    success = trial.success if sought else None
+    row = Row(
+        kind,
+        number,
+        seed=seed,
+        spp=spp,
+        objective=objective,
+        success=success,
+        values=values or {},
+        renders=1,
+    )
     return judged(row, trial)
 
 
@@ -105,37 +148,68 @@ def _number(value: float | None) -> float | None:
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row: nothing where it has no label, for the output was not a number."""
-    score, margin = (math.nan if value is None else value for value in (row.score, row.margin))
+    """Return what was said of a trial from its row: nothing where it has no label, for
+    the output was not a number.
+    """
+    score, margin = (
+        math.nan if value is None else value for value in (row.score, row.margin)
+    )
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
-    return Judgement(score, margin, bool(row.correct), prediction, row.payload, row.objective, row.metrics or None)
+    return Judgement(
+        score,
+        margin,
+        bool(row.correct),
+        prediction,
+        row.payload,
+        row.objective,
+        row.metrics or None,
+    )
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:
-    """Return the rate of a success, with how often each such prediction was given and the mean score of the trials."""
+    """Return the rate of a success, with how often each such prediction was given and
+    the mean score of the trials.
+    """
     rated = rate_of(checked.adversarial, checked.counting, checked.successes)
     return rated.model_copy(update={"stopped": checked.stopped})
 
 
-def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
-    """Return a rate with the predictions of its successes and the mean score of those that are a number."""
+def rate_of(
+    rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
+) -> VerifiedRate:
+    """Return a rate with the predictions of its successes and the mean score of those
+    that are a number.
+    """
     labels = dict(Counter(trial.prediction.label for trial in successes).most_common())
-    margin, counted = 0.0 - mean_number(trial.score for trial in trials), _counted(rate, trials)
+    margin = 0.0 - mean_number(trial.score for trial in trials)
+    counted = _counted(rate, trials)
     outcomes = count_outcomes(trial.payload for trial in successes)
     return VerifiedRate(
-        successes=rate.successes, spp=rate.spp, labels=labels, outcomes=outcomes, margin=margin, **counted
+        successes=rate.successes,
+        spp=rate.spp,
+        labels=labels,
+        outcomes=outcomes,
+        margin=margin,
+        **counted,
     )
 
 
 def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     right = count_right(trials, spp)
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
-    return ControlGroup(correct=right.successes, outcomes=outcomes, **_counted(right, trials))
+    return ControlGroup(
+        correct=right.successes, outcomes=outcomes, **_counted(right, trials)
+    )
 
 
 def _counted(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
     nothing = sum(trial.not_a_number for trial in trials)
-    return {"trials": rate.trials, "rate": rate.rate, "interval": rate.interval, "not_a_number": nothing}
+    return {
+        "trials": rate.trials,
+        "rate": rate.rate,
+        "interval": rate.interval,
+        "not_a_number": nothing,
+    }
 
 
 def mean_number(values: Iterable[float]) -> float:

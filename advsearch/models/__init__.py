@@ -1,4 +1,6 @@
-"""The network under test: loading it, asking it, naming its classes; and what a source of models needs. Torch only."""
+"""The network under test: loading it, asking it, naming its classes; and what a source
+of models needs. Torch only.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,14 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.features import PARTS, pooled
 from advsearch.models.inputs import WithState
-from advsearch.models.labels import LabelSet, find_label_set, matching_labels, names_nothing, patterns, read_labels
+from advsearch.models.labels import (
+    LabelSet,
+    find_label_set,
+    matching_labels,
+    names_nothing,
+    patterns,
+    read_labels,
+)
 from advsearch.models.loading import load_model
 from advsearch.models.model import (
     PRESETS,
@@ -35,7 +44,14 @@ from advsearch.pictures import png_of, upright
 from advsearch.trust.archives import without_unpickling
 from advsearch.trust.code import how_to_allow, may_fetch
 from advsearch.trust.foreign_code import first_line, foreign
-from advsearch.trust.network import KEY, NoRedirect, check_address, connecting, is_local, read_key
+from advsearch.trust.network import (
+    KEY,
+    NoRedirect,
+    check_address,
+    connecting,
+    is_local,
+    read_key,
+)
 
 __all__ = [
     "INTERRUPTS",

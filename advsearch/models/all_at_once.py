@@ -12,9 +12,11 @@ from advsearch.errors import InputError
 
 @final
 class AllAtOnce(nn.Module):
-    """A network that takes all pictures of a rig in one call, as a model of single pictures.
+    """A network that takes all pictures of a rig in one call, as a model of single
+    pictures.
 
-    Its output counts for each of them, so that any rule of the task `rig` gives the same.
+    Its output counts for each of them, so that any rule of the task `rig` gives the
+    same.
 
     Args:
         network: from (N, K, 3, H, W), or (N, K, H, W, 3), to an output with N rows.
@@ -29,14 +31,25 @@ class AllAtOnce(nn.Module):
         super().__init__()
         if layout not in ("NKCHW", "NKHWC"):
             raise InputError(f"layout: expected NKCHW or NKHWC, got {layout!r}")
-        self.network, self.cameras, self.layout = network, cameras, layout
+        self.network = network
+        self.cameras = cameras
+        self.layout = layout
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return the output (N * K, ...) for pictures (N * K, 3, H, W), those of each configuration together."""
+        """Return the output (N * K, ...) for pictures (N * K, 3, H, W), those of each
+        configuration together.
+        """
         count = len(images)
-        missing = -count % self.cameras  # who loads a model tries it with a picture or two
-        full = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)]) if missing else images
+        # who loads a model tries it with a picture or two
+        missing = -count % self.cameras
+        full = (
+            torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
+            if missing
+            else images
+        )
         together = full.unflatten(0, (-1, self.cameras))
-        together = together if self.layout == "NKCHW" else together.permute(0, 1, 3, 4, 2)
+        together = (
+            together if self.layout == "NKCHW" else together.permute(0, 1, 3, 4, 2)
+        )
         output: Tensor = self.network(together)
         return output.repeat_interleave(self.cameras, dim=0)[:count]

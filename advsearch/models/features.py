@@ -1,8 +1,10 @@
-"""What a network sees before it decides: the numbers that its last layer turns into logits.
+"""What a network sees before it decides: the numbers that its last layer turns into
+logits.
 
-It is found by running the network once: a hook on the last `nn.Linear` or convolution of an `nn.Module`, or the last
-such operator of a graph (`torch.export`), reads its input where it returns one value per class, else its output.
-For any other network it is the logits less their mean. Maps and sequences are averaged over their positions.
+It is found by running the network once: a hook on the last `nn.Linear` or convolution
+of an `nn.Module`, or the last such operator of a graph (`torch.export`), reads its
+input where it returns one value per class, else its output. For any other network it is
+the logits less their mean. Maps and sequences are averaged over their positions.
 """
 
 from __future__ import annotations
@@ -21,37 +23,55 @@ LAYERS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
 
 _ATEN = torch.ops.aten
 
-CHANNELS_LAST = {getattr(_ATEN, name).default: int(name == "addmm") for name in ("linear", "addmm", "mm", "matmul")}
-CHANNELS_SECOND = {getattr(_ATEN, name).default: 0 for name in ("conv1d", "conv2d", "conv3d", "convolution")}
+CHANNELS_LAST = {
+    getattr(_ATEN, name).default: int(name == "addmm")
+    for name in ("linear", "addmm", "mm", "matmul")
+}
+CHANNELS_SECOND = {
+    getattr(_ATEN, name).default: 0
+    for name in ("conv1d", "conv2d", "conv3d", "convolution")
+}
 OPERATORS: dict[Any, int] = {**CHANNELS_LAST, **CHANNELS_SECOND}
-"""Operators that may be a last layer, and which of their arguments is the activation."""
+"""Operators that may be a last layer, and which of their arguments is the
+activation.
+"""
 
-Read = Callable[[Tensor], Tensor]  # from a batch as `Model.batches` yields it, N images, to features (N, F)
+# from a batch as `Model.batches` yields it, N images, to features (N, F)
+Read = Callable[[Tensor], Tensor]
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model seen as a differentiable function from images to features. Made by `features_of`."""
+    """A model seen as a differentiable function from images to features. Made by
+    `features_of`.
+    """
 
     model: Model
     read: Read = field(repr=False)
     size: int  # F, numbers per image
-    source: str  # for messages and reports, such as "the input of head (Linear), 192 numbers"
-    penultimate: bool = True  # False where they are the logits, for want of anything else
+    # for messages and reports, such as "the input of head (Linear), 192 numbers"
+    source: str
+    # False where they are the logits, for want of anything else
+    penultimate: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the features (N, F), float32, of images as `Model` takes them; differentiable. One more run of the
-        network: the logits are not computed along. Raises InputError: not an image, or values that are clearly not in
-        [0, 1]."""
+        """Return the features (N, F), float32, of images as `Model` takes them;
+        differentiable. One more run of the network: the logits are not computed along.
+        Raises InputError: not an image, or values that are clearly not in [0, 1].
+        """
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
-        features: Tensor = joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches])
+        features: Tensor = joined(
+            [self.read(self.model.prepared(b))[: len(b)].float() for b in batches]
+        )
         return features.to(images.device)
 
 
 def features_of(model: Model) -> Features:
-    """Return the penultimate features of a model, found by showing it grey images; see the module's docstring."""
+    """Return the penultimate features of a model, found by showing it grey images; see
+    the module's docstring.
+    """
     grey = torch.full((min(2, model.batch_limits[1]), *model.input_size, 3), 0.5)
     with torch.no_grad():
         x = model.prepared(grey)
@@ -60,7 +80,11 @@ def features_of(model: Model) -> Features:
                 read, where = last
                 size = read(x).shape[1]
                 return Features(model, read, size, f"the {where}, {size} numbers")
-    why = f"the logits, {model.classes} numbers: no layer before them can be read in a {type(model.module).__name__}"
+    why = (
+        f"the logits, {model.classes} numbers: no layer before them can be read in "
+        "a "
+        f"{type(model.module).__name__}"
+    )
 
     def centred(x: Tensor) -> Tensor:
         logits: Tensor = model.ask(x)
@@ -70,7 +94,9 @@ def features_of(model: Model) -> Features:
 
 
 class _Call(NamedTuple):
-    """A call of a layer: what it is of, what went in (None for weights) and came out, and the axis of channels."""
+    """A call of a layer: what it is of, what went in (None for weights) and came out,
+    and the axis of channels.
+    """
 
     layer: Any
     name: str
@@ -80,24 +106,35 @@ class _Call(NamedTuple):
 
 
 Calls = Callable[[Any, Tensor, Any], list[_Call]]
-"""Runs a network on a batch and returns the calls of its layers, or of one of them, in their order."""
+"""Runs a network on a batch and returns the calls of its layers, or of one of them, in
+their order.
+"""
 
 
 def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
-    """Return how to read features (N, F) of the last layer of a network, means over all axes but the first and that of
-    channels, and what that layer is; None where there is none."""
-    usable = [call for call in calls(model.module, x, None) if len(call.output) == len(x)]
+    """Return how to read features (N, F) of the last layer of a network, means over all
+    axes but the first and that of channels, and what that layer is; None where there is
+    none.
+    """
+    usable = [
+        call for call in calls(model.module, x, None) if len(call.output) == len(x)
+    ]
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     if not usable:
         return None
-    last, part = (heads or usable)[-1], "input" if heads else "output"
+    last = (heads or usable)[-1]
+    part = "input" if heads else "output"
     if getattr(last, part) is None:
         return None
 
     def read(batch: Tensor) -> Tensor:
         value: Tensor = getattr(calls(model.module, batch, last.layer)[-1], part)
         channels_last = value.movedim(last.axis, -1)
-        return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last
+        return (
+            channels_last.flatten(1, -2).mean(dim=1)
+            if value.dim() > 2
+            else channels_last
+        )
 
     return read, f"{part} of {last.name}"
 
@@ -105,15 +142,34 @@ def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
 def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
     """Those of a module that calls its layers."""
     calls: list[_Call] = []
-    if not isinstance(network, nn.Module) or isinstance(network, torch.jit.ScriptModule):
+    if not isinstance(network, nn.Module) or isinstance(
+        network, torch.jit.ScriptModule
+    ):
         return calls
-    names: dict[nn.Module, str] = {layer: name for name, layer in network.named_modules() if isinstance(layer, LAYERS)}
+    names: dict[nn.Module, str] = {
+        layer: name
+        for name, layer in network.named_modules()
+        if isinstance(layer, LAYERS)
+    }
 
-    def keep(layer: nn.Module, args: tuple[Tensor, ...], kwargs: dict[str, Tensor], output: Tensor) -> None:
+    def keep(
+        layer: nn.Module,
+        args: tuple[Tensor, ...],
+        kwargs: dict[str, Tensor],
+        output: Tensor,
+    ) -> None:
         input = args[0] if args else kwargs["input"]
         if len(input) == len(output) and input.dim() > 1:
             name = f"{names[layer] or 'the network'} ({type(layer).__name__})"
-            calls.append(_Call(layer, name, input, output, -1 if isinstance(layer, nn.Linear) else 1))
+            calls.append(
+                _Call(
+                    layer,
+                    name,
+                    input,
+                    output,
+                    -1 if isinstance(layer, nn.Linear) else 1,
+                )
+            )
 
     with ExitStack() as hooks:
         for layer in names if only is None else [only]:
@@ -129,9 +185,18 @@ def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     class Reader(fx.Interpreter):
         def run_node(self, n: fx.Node) -> Any:
             value = super().run_node(n)
-            if n.op == "call_function" and n.target in OPERATORS and only in (None, n) and isinstance(value, Tensor):
+            if (
+                n.op == "call_function"
+                and n.target in OPERATORS
+                and only in (None, n)
+                and isinstance(value, Tensor)
+            ):
                 source = n.args[OPERATORS[n.target]]
-                input = self.env[source] if isinstance(source, fx.Node) and source.op != "get_attr" else None
+                input = (
+                    self.env[source]
+                    if isinstance(source, fx.Node) and source.op != "get_attr"
+                    else None
+                )
                 axis = -1 if n.target in CHANNELS_LAST else 1
                 calls.append(_Call(n, f"the operator {n.name}", input, value, axis))
             return value
@@ -141,15 +206,22 @@ def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     return calls
 
 
-PARTS = ("image_embeds", "pooler_output", "last_hidden_state")  # of outputs that hold the features, the best first
+# of outputs that hold the features, the best first
+PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has one of `PARTS`; None where
-    there are none. Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the first stands
-    for the picture if `token`, otherwise their mean."""
+    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has
+    one of `PARTS`; None where there are none. Maps (N, D, H, W) are averaged over their
+    positions. Of several tokens (N, T, D), the first stands for the picture if `token`,
+    otherwise their mean.
+    """
     for part in PARTS:
-        value = returned.get(part) if isinstance(returned, Mapping) else getattr(returned, part, None)
+        value = (
+            returned.get(part)
+            if isinstance(returned, Mapping)
+            else getattr(returned, part, None)
+        )
         if isinstance(value, Tensor):
             if value.dim() == 3:
                 return value[:, 0] if token else value.mean(dim=1)

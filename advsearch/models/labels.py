@@ -14,33 +14,44 @@ from typing import Any, NamedTuple
 from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.trust.stored_files import parse_json, read_text
 
-PROMPT = "a photo of a {}"  # the text that a name is put into where nothing else is said
+# the text that a name is put into where nothing else is said
+PROMPT = "a photo of a {}"
 LARGEST = 16 << 20  # bytes of a label file
 LONGEST = 1000  # characters of a label name; those of ImageNet have up to 130
 LONGEST_NAMES = 1 << 20  # characters of all names that a network's metadata say
 MOST_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
 DATA = Path(__file__).parent / "data"
 SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
-"""Names of the classes of data sets that many networks are trained on, in the order of their outputs. `coco91` has the
-background first and the numbers that its authors gave, of which 11 have no class; `coco90` is that without background;
-`voc` has the background first."""
+"""Names of the classes of data sets that many networks are trained on, in the order of
+their outputs. `coco91` has the background first and the numbers that its authors gave,
+of which 11 have no class; `coco90` is that without background; `voc` has the background
+first.
+"""
 
 NOTHING = frozenset(
-    "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled unlabelled unused ??? ∅".split()
+    "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled "
+    "unlabelled unused ??? ∅".split()
 )
-"""Names of classes that stand for no thing, without blanks, hyphens and underscores; "none of the above" is a thing."""
+"""Names of classes that stand for no thing, without blanks, hyphens and underscores;
+"none of the above" is a thing.
+"""
 
 
 def names_nothing(name: str) -> bool:
-    """Whether a class of that name stands for no thing: background, "no object", a number that nothing has."""
+    """Whether a class of that name stands for no thing: background, "no object", a
+    number that nothing has.
+    """
     return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """The classes that count as right for one object ("coffee mug" and "cup" may both be)."""
+    """The classes that count as right for one object ("coffee mug" and "cup" may both
+    be).
+    """
 
-    names: tuple[str, ...]  # the model's full label names, in the order in which they were asked for
+    # the model's full label names, in the order in which they were asked for
+    names: tuple[str, ...]
     indices: tuple[int, ...]  # distinct, in the same order
 
     def __len__(self) -> int:
@@ -53,12 +64,15 @@ class LabelSet:
         return index in self.indices
 
 
-def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str], *, named: bool = True) -> LabelSet:
+def find_label_set(
+    text: str | int | Sequence[str | int], labels: Sequence[str], *, named: bool = True
+) -> LabelSet:
     """Return the classes named by `text`.
 
-    Terms are separated by commas. A term matches a class, whatever its case, if it equals the class's label name or one
-    of the comma-separated synonyms in it ("tench, Tinca tinca"). ``"#504"`` is always a class index; a bare ``"504"``
-    is one unless a label is called that.
+    Terms are separated by commas. A term matches a class, whatever its case, if it
+    equals the class's label name or one of the comma-separated synonyms in it ("tench,
+    Tinca tinca"). ``"#504"`` is always a class index; a bare ``"504"`` is one unless a
+    label is called that.
 
     Args:
         text: the terms, e.g. ``"coffee mug,cup"``, or a sequence of terms and indices.
@@ -66,26 +80,43 @@ def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str],
         named: False if the names are placeholders, so that messages can say so.
 
     Raises:
-        InputError: no term, an unknown name (with near matches), a name of several classes (with their indices), an
-            index that the model does not have.
+        InputError: no term, an unknown name (with near matches), a name of several
+            classes (with their indices), an index that the model does not have.
     """
-    terms = [str(text)] if isinstance(text, (str, int)) else [str(term) for term in text]
-    terms = [term.strip() for joined in terms for term in joined.split(",") if term.strip()]
+    terms = (
+        [str(text)] if isinstance(text, (str, int)) else [str(term) for term in text]
+    )
+    terms = [
+        term.strip() for joined in terms for term in joined.split(",") if term.strip()
+    ]
     if not terms:
-        raise InputError(f"label: expected at least one label name or class index, got {text!r}")
+        raise InputError(
+            f"label: expected at least one label name or class index, got {text!r}"
+        )
     table = _name_table(labels)
     indices = tuple(dict.fromkeys(_find(term, table, labels, named) for term in terms))
     return LabelSet(tuple(labels[index] for index in indices), indices)
 
 
 def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
-    """Return index and name of the classes whose names are like `word`, best first, and then those that mean the same.
-    What is like a word says `resembling`; what means the same ("cup" for "mug") is a table of everyday things. The name
-    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet"."""
-    table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
-    everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
+    """Return index and name of the classes whose names are like `word`, best first, and
+    then those that mean the same. What is like a word says `resembling`; what means the
+    same ("cup" for "mug") is a table of everyday things. The name is the part of the
+    label that matched: "frying pan" of "frying pan, frypan, skillet".
+    """
+    table = {
+        name: indices
+        for name, indices in _name_table(labels).items()
+        if "," not in name
+    }
+    everyday = [
+        [_key(name) for name in names]
+        for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))
+    ]
     key = _key(word)
-    same = [name for names in everyday if key in names for name in names if name in table]
+    same = [
+        name for names in everyday if key in names for name in names if name in table
+    ]
     like = resembling(word, table)
     if same and not any(key in name for name in like):  # nothing but other spellings
         like = []
@@ -96,19 +127,29 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     return list(parts.items())
 
 
-def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
+def _find(
+    term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool
+) -> int:
     indices = table.get(_key(term), [])
-    number = re.fullmatch(r"#\s*(-?\d+)", term) or (None if indices else re.fullmatch(r"(-?\d+)", term))
+    number = re.fullmatch(r"#\s*(-?\d+)", term) or (
+        None if indices else re.fullmatch(r"(-?\d+)", term)
+    )
     if number:
         index = int(number[1])
         if not 0 <= index < len(labels):
-            raise InputError(f"label: expected a class index from 0 to {len(labels) - 1}, got {index}")
+            raise InputError(
+                "label: expected a class index from 0 to "
+                f"{len(labels) - 1}, got {index}"
+            )
         return index
     if len(indices) == 1:
         return indices[0]
     if indices:
         listed = ", ".join(f"#{index} ({labels[index]})" for index in indices)
-        raise InputError(f"label {term!r} names {len(indices)} classes: {listed}. Give the index, e.g. '#{indices[0]}'")
+        raise InputError(
+            f"label {term!r} names {len(indices)} classes: {listed}. Give "
+            f"the index, e.g. '#{indices[0]}'"
+        )
     shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
     hint = f"Its {len(labels)} labels: {shown}"
     if not named:
@@ -125,7 +166,9 @@ def _key(name: str) -> str:  # what is compared
 
 
 def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
-    """Return, for every full name and every synonym, the class indices that carry it, ascending."""
+    """Return, for every full name and every synonym, the class indices that carry it,
+    ascending.
+    """
     table: dict[str, list[int]] = {}
     for index, label in enumerate(labels):
         for name in dict.fromkeys(_key(part) for part in (label, *label.split(","))):
@@ -134,19 +177,22 @@ def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
     return table
 
 
-# ---- label files -----------------------------------------------------------------------------------------------------
+# ---- label files
+# -----------------------------------------------------------------------------------------------------
 
 
 def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ...]:
     """Return label names in index order.
 
     Args:
-        source: the names themselves, in a sequence or a text with commas between them; one of `SETS`; or a path to a
-            JSON list of names, a JSON object from index to name (every index from 0 on, once), or a text file with one
-            name per line (UTF-8). A text with commas that is the path of a file stands for that.
+        source: the names themselves, in a sequence or a text with commas between them;
+            one of `SETS`; or a path to a JSON list of names, a JSON object from index
+            to name (every index from 0 on, once), or a text file with one name per line
+            (UTF-8). A text with commas that is the path of a file stands for that.
 
     Raises:
-        FileFormatError: the file is missing, empty or something else; the message names it.
+        FileFormatError: the file is missing, empty or something else; the message names
+            it.
         InputError: `source` holds something other than non-empty names.
     """
     if isinstance(source, (str, os.PathLike)):
@@ -156,14 +202,17 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
             return _read_file(Path(source))
         source = str(source).split(",")
     if not isinstance(source, Sequence):
-        raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")
+        raise InputError(
+            f"labels: expected a path or a list of names, got {type(source).__name__}"
+        )
     return _checked(source, InputError, "labels")
 
 
 def names_in(names: Any) -> tuple[str, ...] | None:
-    """Return the names that a network says its classes have, in order: as YOLO's do in `names`, and their files in
-    metadata. A stranger says them: a mapping from 0, 1, ... to names, a list of names, or the text of one; None of
-    anything else."""
+    """Return the names that a network says its classes have, in order: as YOLO's do in
+    `names`, and their files in metadata. A stranger says them: a mapping from 0, 1, ...
+    to names, a list of names, or the text of one; None of anything else.
+    """
     if isinstance(names, str):
         if len(names) > LONGEST_NAMES or not _FLAT.fullmatch(names):
             return None
@@ -173,18 +222,31 @@ def names_in(names: Any) -> tuple[str, ...] | None:
             return None
     if isinstance(names, Mapping):
         names = list(names.values()) if list(names) == list(range(len(names))) else None
-    return read_labels(names) if isinstance(names, (list, tuple)) and not _problem(names) else None
+    return (
+        read_labels(names)
+        if isinstance(names, (list, tuple)) and not _problem(names)
+        else None
+    )
 
 
 _TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
-_FLAT = re.compile(rf"\{{(?:\d{{1,6}}: {_TEXT}(?:, |(?=\}})))*\}}|\[(?:{_TEXT}(?:, |(?=\])))*\]")
+_FLAT = re.compile(
+    rf"\{{(?:\d{{1,6}}: {_TEXT}(?:, |(?=\}})))*\}}|\[(?:{_TEXT}(?:, "
+    r"|(?=\])))*\]"
+)
 """A mapping or a list as Python writes it: nothing in it is deep or runs."""
 
 
 def _lists_names(source: str | os.PathLike[str]) -> bool:
-    """Whether a text is names with commas between them, not the path of a file, be it there or not."""
+    """Whether a text is names with commas between them, not the path of a file, be it
+    there or not.
+    """
     text = str(source)
-    return isinstance(source, str) and "," in text and not (os.path.isfile(text) or text.endswith((".json", ".txt")))
+    return (
+        isinstance(source, str)
+        and "," in text
+        and not (os.path.isfile(text) or text.endswith((".json", ".txt")))
+    )
 
 
 class LabelsOrigin(NamedTuple):
@@ -198,28 +260,45 @@ def find_labels_origin(given: object) -> LabelsOrigin:
     """Return where labels came from."""
     if given is None:
         return LabelsOrigin("labels of the model")
-    is_file = isinstance(given, (str, os.PathLike)) and str(given) not in SETS and not _lists_names(given)
-    return LabelsOrigin(f"label file {given}", is_file=True) if is_file else LabelsOrigin()
+    is_file = (
+        isinstance(given, (str, os.PathLike))
+        and str(given) not in SETS
+        and not _lists_names(given)
+    )
+    return (
+        LabelsOrigin(f"label file {given}", is_file=True) if is_file else LabelsOrigin()
+    )
 
 
 def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the texts that a model is given beside a picture, from a list or a text with | between them. Raises
-    InputError where one is no text, or empty."""
+    """Return the texts that a model is given beside a picture, from a list or a text
+    with | between them. Raises InputError where one is no text, or empty.
+    """
     if given is None:
         return None
-    texts = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
+    texts = (
+        [part.strip() for part in given.split("|")]
+        if isinstance(given, str)
+        else list(given)
+    )
     for text in texts or [""]:
         if not isinstance(text, str) or not text:
-            raise InputError(f"prompt: expected a text, such as {PROMPT!r}, got {text!r}")
+            raise InputError(
+                f"prompt: expected a text, such as {PROMPT!r}, got {text!r}"
+            )
     return tuple(texts)
 
 
 def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the texts that a name is put into, ``{}`` in its place; one of our own for None. Raises InputError where
-    one has no ``{}``."""
+    """Return the texts that a name is put into, ``{}`` in its place; one of our own for
+    None. Raises InputError where one has no ``{}``.
+    """
     for text in prompts or ():
         if "{}" not in text:
-            raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {text!r}")
+            raise InputError(
+                f"prompt: expected a text with {{}} where the name goes, "
+                f"such as {PROMPT!r}, got {text!r}"
+            )
     return prompts or (PROMPT,)
 
 
@@ -234,15 +313,19 @@ def _label_sets() -> dict[str, tuple[str, ...]]:
     return {name: tuple(stored[name]) for name in SETS}
 
 
-def fitting_labels(classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str) -> tuple[str, ...]:
-    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is not that
-    of a model's classes."""
+def fitting_labels(
+    classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str
+) -> tuple[str, ...]:
+    """Return the labels, or placeholders for None; InputError (FileFormatError, for a
+    file) if their number is not that of a model's classes.
+    """
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
     if len(labels) == classes:
         return labels
     message = (
-        f"{origin.text}: {len(labels)} labels, but model {model} has {classes} classes; give one per class, in index "
+        f"{origin.text}: {len(labels)} labels, but model {model} has {classes} "
+        "classes; give one per class, in index "
         "order"
         f"{''.join(f' (`labels={name}` has {classes})' for name in sets_of(classes))}"
     )
@@ -254,8 +337,14 @@ def _read_file(path: Path) -> tuple[str, ...]:
     try:
         text = read_text(path, "a label file", LARGEST)
     except OSError as error:
-        advice = "" if path.suffix else ", and several names have commas between them, such as 'mug,cup'"
-        raise FileFormatError(f"{where}: cannot be read ({error.strerror or error}){advice}") from None
+        advice = (
+            ""
+            if path.suffix
+            else (", and several names have commas between them, such as 'mug,cup'")
+        )
+        raise FileFormatError(
+            f"{where}: cannot be read ({error.strerror or error}){advice}"
+        ) from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
     names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
@@ -263,20 +352,32 @@ def _read_file(path: Path) -> tuple[str, ...]:
         try:
             names = parse_json(text)
         except json.JSONDecodeError as error:
-            raise FileFormatError(f"{where}: not valid JSON (line {error.lineno}: {error.msg})") from None
+            raise FileFormatError(
+                f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
+            ) from None
         except ValueError as error:
-            raise FileFormatError(f"{where}: expected label names, got {error}") from None
+            raise FileFormatError(
+                f"{where}: expected label names, got {error}"
+            ) from None
     if isinstance(names, dict):
-        indices, last = list(map(str, range(len(names)))), len(names) - 1
+        indices = list(map(str, range(len(names))))
+        last = len(names) - 1
         if set(names) != set(indices):
-            raise FileFormatError(f"{where}: expected the {len(names)} keys to be the indices 0 to {last}, each once")
+            raise FileFormatError(
+                f"{where}: expected the {len(names)} keys to be the "
+                f"indices 0 to {last}, each once"
+            )
         names = [names[index] for index in indices]
     if not isinstance(names, list):
-        raise FileFormatError(f"{where}: expected a list of names or an object from index to name")
+        raise FileFormatError(
+            f"{where}: expected a list of names or an object from index to name"
+        )
     return _checked(names, FileFormatError, where)
 
 
-def _checked(names: Sequence[Any], kind: type[InputError], where: str) -> tuple[str, ...]:
+def _checked(
+    names: Sequence[Any], kind: type[InputError], where: str
+) -> tuple[str, ...]:
     if problem := _problem(names):
         raise kind(f"{where}: {problem}")
     return tuple(name.strip() for name in names)
@@ -287,7 +388,13 @@ def _problem(names: Sequence[Any]) -> str:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):
         if not isinstance(name, str) or not name.strip():
-            return f"expected a name (non-empty text) for class {index}, got {repr(name)[:60]}"
+            return (
+                f"expected a name (non-empty text) for class {index}, got "
+                f"{repr(name)[:60]}"
+            )
         if len(name) > LONGEST:
-            return f"expected a name of at most {LONGEST} characters for class {index}, got {len(name):,}"
+            return (
+                f"expected a name of at most {LONGEST} characters for class "
+                f"{index}, got {len(name):,}"
+            )
     return ""

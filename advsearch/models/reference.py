@@ -1,7 +1,9 @@
-"""The bundled reference classifier: a small residual network for images of 128 x 128 pixels.
+"""The bundled reference classifier: a small residual network for images of 128 x 128
+pixels.
 
-Plain on purpose: it is the victim, not the method. 1.2 million parameters, 4.7 MB in float32, about 65 million
-multiply-adds an image. SiLU instead of ReLU keeps the logits smooth in the image, so that gradients mean something.
+Plain on purpose: it is the victim, not the method. 1.2 million parameters, 4.7 MB in
+float32, about 65 million multiply-adds an image. SiLU instead of ReLU keeps the logits
+smooth in the image, so that gradients mean something.
 """
 
 from __future__ import annotations
@@ -24,15 +26,21 @@ from advsearch.models.probe import probe
 from advsearch.models.source import frozen, load_weights
 
 INPUT_SIZE = (128, 128)
-STEM, WIDTHS, DEPTHS = 24, (32, 64, 128, 192), (1, 1, 2, 1)
-MEAN, STD = 0.45, 0.25  # of display-referred values; one pair for all channels is enough
-WEIGHTS, RECORD = "reference.safetensors", "reference.json"
+STEM = 24
+WIDTHS = (32, 64, 128, 192)
+DEPTHS = (1, 1, 2, 1)
+MEAN = 0.45  # of display-referred values; one pair for all channels is enough
+STD = 0.25
+WEIGHTS = "reference.safetensors"
+RECORD = "reference.json"
 REMEDY = "run `make reference` to train it, or install a release, which contains it"
 
 
 class ReferenceNet(nn.Module):
-    """A residual network for at least 2 classes: stem of stride 2, four stages of strides 4 to 32, average pooling,
-    dropout of pooled features in training, a linear layer."""
+    """A residual network for at least 2 classes: stem of stride 2, four stages of
+    strides 4 to 32, average pooling, dropout of pooled features in training, a linear
+    layer.
+    """
 
     def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
         super().__init__()
@@ -47,13 +55,19 @@ class ReferenceNet(nn.Module):
         self.head = nn.Linear(width, classes)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+                nn.init.kaiming_normal_(
+                    module.weight, mode="fan_out", nonlinearity="relu"
+                )
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Return logits (N, classes) of images (N, 3, H, W), display-referred sRGB in [0, 1]; H and W at least 32."""
-        x = ((images - MEAN) * (1.0 / STD)).contiguous(memory_format=torch.channels_last)
+        """Return logits (N, classes) of images (N, 3, H, W), display-referred sRGB in
+        [0, 1]; H and W at least 32.
+        """
+        x = ((images - MEAN) * (1.0 / STD)).contiguous(
+            memory_format=torch.channels_last
+        )
         features: Tensor = self.features(x).mean(dim=(2, 3))
         logits: Tensor = self.head(self.dropout(features))
         return logits
@@ -62,7 +76,9 @@ class ReferenceNet(nn.Module):
 class _Convolution(nn.Module):
     """A convolution without bias, then batch normalisation."""
 
-    def __init__(self, inputs: int, outputs: int, size: int, *, stride: int = 1) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, size: int, *, stride: int = 1
+    ) -> None:
         super().__init__()
         self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
         self.normalise = nn.BatchNorm2d(outputs)
@@ -73,7 +89,9 @@ class _Convolution(nn.Module):
 
 
 class _Residual(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut, which is average-pooled and projected where the shape changes."""
+    """Two 3 x 3 convolutions beside a shortcut, which is average-pooled and projected
+    where the shape changes.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int) -> None:
         super().__init__()
@@ -92,19 +110,27 @@ class _Residual(nn.Module):
 
 
 def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
-    """Return an untrained network in channels-last memory format; weights come from torch's current random state."""
+    """Return an untrained network in channels-last memory format; weights come from
+    torch's current random state.
+    """
     if classes < 2:
-        raise ModelError(f"reference network: expected at least 2 classes, got {classes}")
+        raise ModelError(
+            f"reference network: expected at least 2 classes, got {classes}"
+        )
     return ReferenceNet(classes, dropout=dropout).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
 def folded(net: ReferenceNet) -> ReferenceNet:
-    """Return a copy for inference: evaluation mode, normalisation merged into the convolutions, parameters frozen."""
+    """Return a copy for inference: evaluation mode, normalisation merged into the
+    convolutions, parameters frozen.
+    """
     copied = copy.deepcopy(net).eval().requires_grad_(False)
     for module in list(copied.modules()):
         for name, layer in module.named_children():
             if isinstance(layer, _Convolution):
-                setattr(module, name, fuse_conv_bn_eval(layer.convolve, layer.normalise))
+                setattr(
+                    module, name, fuse_conv_bn_eval(layer.convolve, layer.normalise)
+                )
     return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
@@ -114,35 +140,47 @@ def data_folder() -> Path:
 
 
 def load(folder: Path | None = None, weights: Path | None = None) -> Model:
-    """Return the model "reference" with its labels, from the folder with its two files (by default the package's own),
-    or with other weights from a safetensors file. Raises ModelError: they are missing, damaged, or do not fit this
-    version's network; FileFormatError: `weights` is missing or is not safetensors."""
+    """Return the model "reference" with its labels, from the folder with its two files
+    (by default the package's own), or with other weights from a safetensors file.
+    Raises ModelError: they are missing, damaged, or do not fit this version's network;
+    FileFormatError: `weights` is missing or is not safetensors.
+    """
     net, labels = network(folder, weights)
     name = "reference" if weights is None else f"reference@{weights}"
     bare = Model(
         frozen(folded(net), name), name, (), Preprocessing(INPUT_SIZE),
-        make_trainable=lambda: network(folder, weights)[0],  # `folded` has merged its normalisation
+        # `folded` has merged its normalisation
+        make_trainable=lambda: network(folder, weights)[0],
     )  # fmt: skip
     return probe(bare, labels, LabelsOrigin("labels of the reference model"))
 
 
-def network(folder: Path | None = None, weights: Path | None = None) -> tuple[ReferenceNet, tuple[str, ...]]:
-    """Return the network with its weights, which can be trained further, and the labels; arguments and errors as for
-    `load`."""
+def network(
+    folder: Path | None = None, weights: Path | None = None
+) -> tuple[ReferenceNet, tuple[str, ...]]:
+    """Return the network with its weights, which can be trained further, and the
+    labels; arguments and errors as for `load`.
+    """
     folder = folder or data_folder()
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         labels = tuple(str(label) for label in record["labels"])
         state = safetensors.load((folder / WEIGHTS).read_bytes())
     except FileNotFoundError as error:
-        raise ModelError(f"the reference model is not there ({error.filename}); {REMEDY}") from None
+        raise ModelError(
+            f"the reference model is not there ({error.filename}); {REMEDY}"
+        ) from None
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
-        raise ModelError(f"the reference model in {folder} cannot be read ({error}); {REMEDY}") from None
+        raise ModelError(
+            f"the reference model in {folder} cannot be read ({error}); {REMEDY}"
+        ) from None
     net = build(len(labels))
     try:
         net.load_state_dict(state)
     except RuntimeError as error:
-        raise ModelError(f"the weights in {folder / WEIGHTS} are of another network; {REMEDY}") from error
+        raise ModelError(
+            f"the weights in {folder / WEIGHTS} are of another network; {REMEDY}"
+        ) from error
     if weights is not None:
         load_weights(net, weights, "reference")
     return net, labels

@@ -1,4 +1,5 @@
-"""What a loader hands over: a network that is ready to be asked, and what its file or maker says about it.
+"""What a loader hands over: a network that is ready to be asked, and what its file or
+maker says about it.
 
 The maker may be Python code: ``package.module:callable``, with weights after an ``@``.
 """
@@ -25,24 +26,43 @@ from safetensors.torch import load_file
 from torch import nn
 from torch.nn.parameter import is_lazy
 
-from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
+from advsearch.errors import (
+    FileFormatError,
+    InputError,
+    ModelError,
+    UnknownNameError,
+    resembling,
+)
 from advsearch.models.inputs import takes_image_size
-from advsearch.models.model import CPU, GIVEN_BY, PROGRAMS, Model, Triple, sharing_copy, warn
+from advsearch.models.model import (
+    CPU,
+    GIVEN_BY,
+    PROGRAMS,
+    Model,
+    Triple,
+    sharing_copy,
+    warn,
+)
 from advsearch.trust.archives import LARGEST
 from advsearch.trust.code import check_import, current_directory_importable
 from advsearch.trust.foreign_code import first_line
 from advsearch.trust.stored_files import open_regular
 
-QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
+# what is asked where nothing else is said
+QUESTION = "What is this? Answer with its name only."
 SIDE = 448
-"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
+"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of
+32, the cells of Qwen's.
+"""
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a network is to be asked: the task's name, what its user gave as names of classes and as texts (None if they
-    did not), the most tokens of a free answer, and how often each picture is asked for one. `ask` has limits for a
-    model behind an address (`advsearch.models.address.LIMITS`)."""
+    """What a network is to be asked: the task's name, what its user gave as names of
+    classes and as texts (None if they did not), the most tokens of a free answer, and
+    how often each picture is asked for one. `ask` has limits for a model behind an
+    address (`advsearch.models.address.LIMITS`).
+    """
 
     task: str = "classification"
     names: tuple[str, ...] | None = None
@@ -52,31 +72,44 @@ class Purpose:
     ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Raise a ModelError where a network cannot do the task: `what` it does, such as "compares a picture with
-        texts", is good for `tasks`, and for a user's own, which may read its output in any way."""
+        """Raise a ModelError where a network cannot do the task: `what` it does, such
+        as "compares a picture with texts", is good for `tasks`, and for a user's own,
+        which may read its output in any way.
+        """
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
-            raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
+            raise ModelError(
+                f"model {model} {what} and cannot do task {self.task}; use {instead}"
+            )
 
     def in_words(self, model: str, what: str) -> tuple[bool, str | None]:
-        """Return whether a network that says words answers freely, and the question that its user asks, None for a
-        default. Raises ModelError as `check`, and InputError where there are several questions, or names for a free
-        answer."""
+        """Return whether a network that says words answers freely, and the question
+        that its user asks, None for a default. Raises ModelError as `check`, and
+        InputError where there are several questions, or names for a free answer.
+        """
         self.check(model, what, "classification", "answer")
-        free, prompts = self.task == "answer", self.prompts or ()
+        free = self.task == "answer"
+        prompts = self.prompts or ()
         if free and self.names is not None:
-            raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+            raise InputError(
+                "labels: task answer has no classes; leave them out, and "
+                "say the right words with `label`"
+            )
         if len(prompts) > 1:
-            raise InputError(f"prompt: expected one question for model {model}, got {len(prompts)}")
+            raise InputError(
+                f"prompt: expected one question for model {model}, got {len(prompts)}"
+            )
         return free, prompts[0] if prompts else None
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
-        """Return the names, for a network that does a task and has no classes of its own. Raises ModelError as `check`,
-        and InputError where there are no names."""
+        """Return the names, for a network that does a task and has no classes of its
+        own. Raises ModelError as `check`, and InputError where there are no names.
+        """
         self.check(model, what, task)
         if self.names is None:
             raise InputError(
-                f"model {model} {what} and has no classes of its own: name them, two at least, such as "
+                f"model {model} {what} and has no classes of its own: name them, two "
+                "at least, such as "
                 "`labels=mug,cup,bowl` or `labels=imagenet`"
             )
         return self.names
@@ -84,10 +117,12 @@ class Purpose:
 
 @dataclass(frozen=True)
 class Source:
-    """A frozen network and its own defaults, which the caller's options override. They are as in `load_model`, and None
-    where the source does not say."""
+    """A frozen network and its own defaults, which the caller's options override. They
+    are as in `load_model`, and None where the source does not say.
+    """
 
-    module: Callable[[torch.Tensor], Any]  # in evaluation mode, its parameters without gradients
+    # in evaluation mode, its parameters without gradients
+    module: Callable[[torch.Tensor], Any]
     name: str
     input_size: tuple[int, int] | None = None
     mean: Triple | None = None
@@ -95,27 +130,40 @@ class Source:
     layout: str | None = None
     channels: str | None = None
     labels: tuple[str, ...] | None = None
-    processor: Callable[[torch.Tensor], torch.Tensor] | None = None  # as in `Preprocessing`
+    # as in `Preprocessing`
+    processor: Callable[[torch.Tensor], torch.Tensor] | None = None
     batch_limits: tuple[int, int] = (1, 64)  # (fewest, most) images at once
     dtype: torch.dtype = torch.float32  # of the input
     device: torch.device = CPU
     reads_text: bool = False  # it is given texts beside the picture
     takes_more: bool = False  # it is called with more than pictures
     value_range: tuple[float, float] | None = None
-    size_type: torch.dtype | None = None  # in which it takes the size of pictures, see `WithImageSize`
+    # in which it takes the size of pictures, see `WithImageSize`
+    size_type: torch.dtype | None = None
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
-    """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`.
-    Raises ModelError where it has lazy layers that have no weights yet."""
-    lazy = [key for key, weights in (*module.named_parameters(), *module.named_buffers()) if is_lazy(weights)]
+    """Return a source with the module frozen, its type and device read off its
+    parameters; `fields` go to `Source`. Raises ModelError where it has lazy layers that
+    have no weights yet.
+    """
+    lazy = [
+        key
+        for key, weights in (*module.named_parameters(), *module.named_buffers())
+        if is_lazy(weights)
+    ]
     if lazy:
         layer = lazy[0].rpartition(".")[0]
         raise ModelError(
-            f"model {name}: its layer {layer} ({type(module.get_submodule(layer)).__name__}) has no weights before it "
-            "has seen a picture; call the network once with one, load its weights, and give it then"
+            f"model {name}: its layer {layer} "
+            f"({type(module.get_submodule(layer)).__name__}) has no weights before it "
+            "has seen a picture; call the network once with one, load its weights, and "
+            "give it then"
         )
-    placed = next((p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()), None)
+    placed = next(
+        (p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()),
+        None,
+    )
     if placed is not None:
         fields = {"dtype": placed.dtype, "device": placed.device, **fields}
     if takes_image_size(module):
@@ -126,16 +174,24 @@ def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
 def frozen(module: nn.Module, name: str) -> nn.Module:
     """Return the module in evaluation mode, with parameters that collect no gradient.
 
-    An ordinary module is copied, except for its weights, which the copy shares: the caller may go on training the
-    original, and the copy sees the new weights as long as they are changed in place (as optimisers do). Exported and
-    scripted programs, and modules that cannot be copied (with a warning), are frozen themselves.
+    An ordinary module is copied, except for its weights, which the copy shares: the
+    caller may go on training the original, and the copy sees the new weights as long as
+    they are changed in place (as optimisers do). Exported and scripted programs, and
+    modules that cannot be copied (with a warning), are frozen themselves.
     """
     if not isinstance(module, PROGRAMS):
         try:
             module = sharing_copy(module)
-        except (TypeError, AttributeError, RuntimeError, pickle.PickleError, copy.Error) as error:  # locks, files
+        except (
+            TypeError,
+            AttributeError,
+            RuntimeError,
+            pickle.PickleError,
+            copy.Error,
+        ) as error:  # locks, files
             warn(
-                f"model {name} cannot be copied ({first_line(error)}): the module itself is set to evaluation mode and "
+                f"model {name} cannot be copied ({first_line(error)}): the module "
+                "itself is set to evaluation mode and "
                 "its parameters are frozen"
             )
     with suppress(NotImplementedError):  # programs of torch.export have no modes
@@ -146,8 +202,10 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
 
 
 def load_weights(module: nn.Module, path: Path, name: str) -> None:
-    """Load a safetensors file into the module; its keys and shapes must be the module's own. Raises FileFormatError:
-    the file is missing or is not safetensors; ModelError: keys or shapes do not fit."""
+    """Load a safetensors file into the module; its keys and shapes must be the module's
+    own. Raises FileFormatError: the file is missing or is not safetensors; ModelError:
+    keys or shapes do not fit.
+    """
     try:
         open_regular(path, "weights", LARGEST).close()
         state = load_file(path)
@@ -155,14 +213,20 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         raise FileFormatError(f"weights {path} of model {name}: no such file") from None
     except (SafetensorError, OSError) as error:
         raise FileFormatError(
-            f"weights {path} of model {name}: expected a complete safetensors file ({first_line(error)}); "
+            f"weights {path} of model {name}: expected a complete safetensors file "
+            f"({first_line(error)}); "
             "make one with safetensors.torch.save_file(module.state_dict(), path)"
         ) from None
     own = module.state_dict()
-    missing = [key for key in own if key not in state and not key.endswith("num_batches_tracked")]
+    missing = [
+        key
+        for key in own
+        if key not in state and not key.endswith("num_batches_tracked")
+    ]
     unexpected = [key for key in state if key not in own]
     shapes = [
-        f"{key} is {tuple(state[key].shape)} in the file and {tuple(own[key].shape)} in the network"
+        f"{key} is {tuple(state[key].shape)} in the file and {tuple(own[key].shape)} "
+        "in the network"
         for key in own
         if key in state and state[key].shape != own[key].shape
     ]
@@ -172,7 +236,10 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         if keys
     ]
     if problems or shapes:
-        raise ModelError(f"weights {path} do not fit model {name}: {'; '.join([*problems, *shapes[:2]])}")
+        raise ModelError(
+            f"weights {path} do not fit model {name}: "
+            f"{'; '.join([*problems, *shapes[:2]])}"
+        )
     module.load_state_dict(state, strict=False)
 
 
@@ -183,37 +250,53 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 
 
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
-    """Return the model behind ``package.module:callable[@weights.safetensors]``. The module is looked for on `sys.path`
-    and in the current directory. The attribute is an `nn.Module`, a `Model`, or something that returns one when called
-    without arguments (a function, or a class of modules). `libraries` may stand before the colon too: a module that
-    there is not may be one of them, misspelt. Raises ModelError: it cannot be imported, raises, returns something else,
-    or the weights do not fit; UnknownNameError: the module has no such attribute; near matches are named; InputError:
-    it must not be imported (`trust.code.check_import`)."""
+    """Return the model behind ``package.module:callable[@weights.safetensors]``. The
+    module is looked for on `sys.path` and in the current directory. The attribute is an
+    `nn.Module`, a `Model`, or something that returns one when called without arguments
+    (a function, or a class of modules). `libraries` may stand before the colon too: a
+    module that there is not may be one of them, misspelt. Raises ModelError: it cannot
+    be imported, raises, returns something else, or the weights do not fit;
+    UnknownNameError: the module has no such attribute; near matches are named;
+    InputError: it must not be imported (`trust.code.check_import`).
+    """
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")
     value: Any = _import_module(module_name, spec, libraries)
     for part in attribute.split("."):
         if not hasattr(value, part):
-            known = [key for key in vars(value) if not key.startswith("_") and callable(getattr(value, key))]
-            raise UnknownNameError(f"attribute of {module_name}", part, near_names(part, known))
+            known = [
+                key
+                for key in vars(value)
+                if not key.startswith("_") and callable(getattr(value, key))
+            ]
+            raise UnknownNameError(
+                f"attribute of {module_name}", part, near_names(part, known)
+            )
         value = getattr(value, part)
     if not isinstance(value, (nn.Module, Model)):
         if not callable(value):
-            raise ModelError(f"model {spec}: expected a callable or an nn.Module, got {type(value).__name__}")
+            raise ModelError(
+                f"model {spec}: expected a callable or an nn.Module, got "
+                f"{type(value).__name__}"
+            )
         try:
             value = value()
         except Exception as error:  # the user's code may raise anything
-            raise ModelError(f"model {spec}: calling it without arguments failed ({_where(error)})") from error
+            raise ModelError(
+                f"model {spec}: calling it without arguments failed ({_where(error)})"
+            ) from error
     if isinstance(value, Model):
         if weights is not None:
             raise ModelError(
-                f"model {spec}: {target} returns a ready Model, weights cannot be put into it; leave out '@...'"
+                f"model {spec}: {target} returns a ready Model, weights cannot be put "
+                "into it; leave out '@...'"
             )
         return value
     if not isinstance(value, nn.Module):
         raise ModelError(
-            f"model {spec}: expected it to return an nn.Module or an advsearch Model, got {type(value).__name__}"
+            f"model {spec}: expected it to return an nn.Module or an advsearch Model, "
+            f"got {type(value).__name__}"
         )
     if weights is not None:
         load_weights(value, weights, target)
@@ -226,18 +309,31 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             message = f"module {name!r} needs {error.name!r}, which is not installed"
-            if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
+            if error.name is not None and (
+                name == error.name or name.startswith(error.name + ".")
+            ):
                 near = resembling(name, libraries)
-                meant = f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?" if near else ""
-                message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}{meant}"
+                meant = (
+                    f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?"
+                    if near
+                    else ""
+                )
+                message = (
+                    f"no module named {error.name!r} on the Python path or in "
+                    f"{os.getcwd()}{meant}"
+                )
             raise ModelError(f"model {spec}: {message}") from error
         except Exception as error:  # the user's code may raise anything
-            raise ModelError(f"model {spec}: importing {name!r} failed ({_where(error)})") from error
+            raise ModelError(
+                f"model {spec}: importing {name!r} failed ({_where(error)})"
+            ) from error
 
 
 def _where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
-    return first_line(error) + (f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else "")
+    return first_line(error) + (
+        f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    )
 
 
 def near_names(name: str, known: Iterable[str]) -> list[str]:
@@ -247,16 +343,23 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
 
 
 def library(name: str, spec: str, extra: str) -> Any:
-    """Return an optional library, that an extra of advsearch installs and a model needs. Raises ModelError where it is
-    not installed, or cannot be imported."""
+    """Return an optional library, that an extra of advsearch installs and a model
+    needs. Raises ModelError where it is not installed, or cannot be imported.
+    """
     try:
         return importlib.import_module(name)
-    except Exception as error:  # a build for another torch raises RuntimeError, among others
+    except (
+        Exception
+    ) as error:  # a build for another torch raises RuntimeError, among others
         command = f"pip install 'advsearch[{extra}]'"
         if isinstance(error, ModuleNotFoundError) and error.name == name:
-            raise ModelError(f"model {spec}: needs {name}, which is not installed: {command}") from error
+            raise ModelError(
+                f"model {spec}: needs {name}, which is not installed: {command}"
+            ) from error
         raise ModelError(
-            f"model {spec}: needs {name}, which cannot be imported here ({first_line(error)}). Install builds that fit "
-            f"each other: {command}, torch's own index where that has them; or export the network with torch.export "
+            f"model {spec}: needs {name}, which cannot be imported here "
+            f"({first_line(error)}). Install builds that fit "
+            f"each other: {command}, torch's own index where that has them; or export "
+            "the network with torch.export "
             f"where {name} works, and give the .pt2 file"
         ) from error

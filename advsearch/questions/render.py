@@ -10,14 +10,19 @@ from advsearch.runs.results import RenderResult
 
 
 def make_view(result: RenderResult) -> ShownResult:
-    """Return the file that was written, and a table of what the model predicts for each view."""
+    """Return the file that was written, and a table of what the model predicts for each
+    view.
+    """
     height, width = result.size
     headline = f"{result.out}: {width} x {height} pixels"
     if result.answered:
         headline += f"\n{result.answered}: with the predictions drawn in"
     if len(result.views) > 1:
         rows = [
-            [f"{view.azimuth:g}", "; ".join(seen_text(result.task, answer) for answer in view.answers)]
+            [
+                f"{view.azimuth:g}",
+                "; ".join(seen_text(result.task, answer) for answer in view.answers),
+            ]
             for view in result.views
         ]
         heads = ("azimuth", f"model {result.model} sees")
@@ -34,7 +39,8 @@ def make_view(result: RenderResult) -> ShownResult:
 @experiment(
     "render --object mug --environment kitchen --out mug.png",
     "render --object mug.obj --environment room.hdr --out around.png --around 8",
-    "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
+    "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out "
+    "mug.exr",
     python_function="advsearch.api.render:render",
     view=make_view,
 )

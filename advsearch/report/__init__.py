@@ -1,1 +1,3 @@
-"""Pages and pictures about runs, made from what a run left behind. Never imports torch or mitsuba."""
+"""Pages and pictures about runs, made from what a run left behind. Never imports torch
+or mitsuba.
+"""

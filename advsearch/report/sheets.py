@@ -1,7 +1,8 @@
 """Pictures as PDF sheets in true millimetres, to print, cut out and stick on.
 
-A first page has a square and a ruler to measure, and says what follows. Then come the pieces, each at its own size with
-bleed around it and marks where it is cut; one that is larger than a page goes on as many as it takes.
+A first page has a square and a ruler to measure, and says what follows. Then come the
+pieces, each at its own size with bleed around it and marks where it is cut; one that is
+larger than a page goes on as many as it takes.
 """
 
 from __future__ import annotations
@@ -27,20 +28,28 @@ from advsearch.trust.stored_files import read_bytes
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 INCH = 25.4
-PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}  # Width and height in millimetres
-MARGIN, FOOT = 15.0, 20.0  # White around what is printed, and more below for the ruler, millimetres
+# Width and height in millimetres
+PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+MARGIN = 15.0  # White around what is printed, and more below for the ruler, millimetres
+FOOT = 20.0
 SQUARE = 50.0  # Side of the square that is measured with a ruler, millimetres
 RULER = 100.0
-MARK, AWAY = 5.0, 1.0  # Length of a mark where to cut, and its distance from the bleed, millimetres
+# Length of a mark where to cut, and its distance from the bleed, millimetres
+MARK = 5.0
+AWAY = 1.0
 MOST_SHEETS = 200  # Sheets that are written unless more are asked for
 SHEETS_EVER = 10_000
 CHECKLIST = (
     "\u2610 Print all pages, and measure the square.",
-    "\u2610 Photograph the colour chart on the last page: upright and whole, in even light, without gloss.",
-    "\u2610 advsearch.measured_palette(PHOTOGRAPH) says what came out. Where that is far off, search within it.",
+    "\u2610 Photograph the colour chart on the last page: upright and whole, in even "
+    "light, without gloss.",
+    "\u2610 advsearch.measured_palette(PHOTOGRAPH) says what came out. Where that is "
+    "far off, search within it.",
     "\u2610 Cut the pieces out, and stick them on.",
-    "\u2610 Align the object with renderings by phone (advsearch dashboard), and photograph it.",
-    "\u2610 Compare: advsearch show, and advsearch report, say how often photographs and renderings agree.",
+    "\u2610 Align the object with renderings by phone (advsearch dashboard), and "
+    "photograph it.",
+    "\u2610 Compare: advsearch show, and advsearch report, say how often photographs "
+    "and renderings agree.",
 )
 """What is to be done, to tick off."""
 LARGEST_PROFILE = 16 << 20
@@ -48,9 +57,11 @@ LARGEST_PROFILE = 16 << 20
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A picture with a name that is printed beside it: (h, w, 3) uint8 sRGB, with `bleed` pixels on each side, in
-    columns and in rows. Width and height of one pixel are in millimetres; `inside` (h, w) is what is cut out, where it
-    is less than the rectangle within the bleed."""
+    """A picture with a name that is printed beside it: (h, w, 3) uint8 sRGB, with
+    `bleed` pixels on each side, in columns and in rows. Width and height of one pixel
+    are in millimetres; `inside` (h, w) is what is cut out, where it is less than the
+    rectangle within the bleed.
+    """
 
     name: str
     picture: Bytes
@@ -61,20 +72,25 @@ class Piece:
     @property
     def size(self) -> tuple[float, float]:
         height, width = self.picture.shape[:2]
-        return (width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * self.pixel[1]
+        return (width - 2 * self.bleed[0]) * self.pixel[0], (
+            height - 2 * self.bleed[1]
+        ) * self.pixel[1]
 
     @property
     def frame(self) -> tuple[float, float]:
         """Bleed and marks on each side, millimetres: across and down."""
-        return self.bleed[0] * self.pixel[0] + AWAY + MARK, self.bleed[1] * self.pixel[1] + AWAY + MARK
+        return self.bleed[0] * self.pixel[0] + AWAY + MARK, self.bleed[1] * self.pixel[
+            1
+        ] + AWAY + MARK
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
     """A part of a piece on a page, with the name that is printed beside it.
 
-    Trim: first and last column and row of the part within the piece's picture, half-open: x0, x1, y0, y1. Its left and
-    upper edge are at x and y on the page, millimetres from the upper left corner.
+    Trim: first and last column and row of the part within the piece's picture,
+    half-open: x0, x1, y0, y1. Its left and upper edge are at x and y on the page,
+    millimetres from the upper left corner.
     """
 
     piece: Piece
@@ -86,7 +102,9 @@ class Placed:
     @property
     def extent(self) -> tuple[float, float]:
         """Width and height that it takes with bleed and marks, millimetres."""
-        (x0, x1, y0, y1), frame, pixel = self.trim, self.piece.frame, self.piece.pixel
+        (x0, x1, y0, y1) = self.trim
+        frame = self.piece.frame
+        pixel = self.piece.pixel
         return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
 
 
@@ -96,28 +114,38 @@ def write_sheets(
 ) -> int:  # fmt: skip
     """Write the PDF of at least one piece, and return how many pages it has.
 
-    Colours are converted into an ICC `profile` of an RGB printer; None leaves them sRGB. At most so many sheets, 1 to
-    `SHEETS_EVER`, may follow the first page, which has the title. `last` makes one more page, of the title, the size of
-    the paper and the conversion of the profile, if any. Raises InputError where there is no such paper, or there would
-    be more sheets, and FileFormatError where the profile is none of an RGB printer.
+    Colours are converted into an ICC `profile` of an RGB printer; None leaves them
+    sRGB. At most so many sheets, 1 to `SHEETS_EVER`, may follow the first page, which
+    has the title. `last` makes one more page, of the title, the size of the paper and
+    the conversion of the profile, if any. Raises InputError where there is no such
+    paper, or there would be more sheets, and FileFormatError where the profile is none
+    of an RGB printer.
     """
     if paper not in PAPERS:
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
     if not 1 <= most <= SHEETS_EVER:
-        raise InputError(f"sheets: expected a whole number from 1 to {SHEETS_EVER}, got {most}")
+        raise InputError(
+            f"sheets: expected a whole number from 1 to {SHEETS_EVER}, got {most}"
+        )
     convert: Any = None
     if profile is not None:
         data = read_bytes(profile, "an ICC profile", LARGEST_PROFILE)
         try:
             printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
-            convert = ImageCms.buildTransform(ImageCms.createProfile("sRGB"), printer, "RGB", "RGB")
+            convert = ImageCms.buildTransform(
+                ImageCms.createProfile("sRGB"), printer, "RGB", "RGB"
+            )
         except (ImageCms.PyCMSError, OSError, ValueError) as error:
-            raise FileFormatError(f"{profile}: expected the ICC profile of an RGB printer ({error})") from None
+            raise FileFormatError(
+                f"{profile}: expected the ICC profile of an RGB printer ({error})"
+            ) from None
     pages = list(pages_of(pieces, PAPERS[paper]))
     if len(pages) > most:
         raise InputError(
-            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {most} are written; say that so many are "
-            f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller `size`"
+            f"sheets: it takes {len(pages)} sheets of {paper}, and up to {most} are "
+            "written; say that so many are "
+            f"wanted (`sheets={len(pages)}`), or give a larger `paper` or a smaller "
+            "`size`"
         )
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
@@ -126,7 +154,14 @@ def write_sheets(
             for part in page:
                 _draw(axes, part, convert)
             right, bottom = (side - MARGIN for side in PAPERS[paper])
-            axes.text(right, bottom, f"{title}: sheet {number} of {len(pages)}", fontsize=7, ha="right", va="bottom")
+            axes.text(
+                right,
+                bottom,
+                f"{title}: sheet {number} of {len(pages)}",
+                fontsize=7,
+                ha="right",
+                va="bottom",
+            )
             _ruler(axes, PAPERS[paper])
             file.savefig(figure)
         if last is not None:
@@ -134,10 +169,15 @@ def write_sheets(
     return len(pages) + 1 + (last is not None)
 
 
-def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[list[Placed]]:
-    """Yield what is on each page: rows of parts, the highest first, from the upper left. Raises InputError where a
-    pixel is larger than a page, or there would be more than `SHEETS_EVER` pages."""
-    width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
+def pages_of(
+    pieces: Sequence[Piece], paper: tuple[float, float]
+) -> Iterator[list[Placed]]:
+    """Yield what is on each page: rows of parts, the highest first, from the upper
+    left. Raises InputError where a pixel is larger than a page, or there would be more
+    than `SHEETS_EVER` pages.
+    """
+    width = paper[0] - 2 * MARGIN
+    height = paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _parts(piece, width, height)]
     parts.sort(key=lambda part: -part.extent[1])
     page: list[Placed] = []
@@ -145,33 +185,58 @@ def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[li
     for part in parts:
         across, down = part.extent
         if x + across > width and x > 0.0:
-            x, y, row = 0.0, y + row, 0.0
+            x = 0.0
+            y = y + row
+            row = 0.0
         if y + down > height and page:
             yield page
-            page, x, y, row = [], 0.0, 0.0, 0.0
+            page = []
+            x = 0.0
+            y = 0.0
+            row = 0.0
         frame = part.piece.frame
         page.append(replace(part, x=MARGIN + x + frame[0], y=MARGIN + y + frame[1]))
-        x, row = x + across, max(row, down)
+        x = x + across
+        row = max(row, down)
     if page:
         yield page
 
 
 def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
-    """Cut a piece into equal parts that fit on a page with bleed and marks, in whole pixels."""
-    (left, top), cuts = piece.bleed, []
+    """Cut a piece into equal parts that fit on a page with bleed and marks, in whole
+    pixels.
+    """
+    (left, top) = piece.bleed
+    cuts = []
     lengths = piece.picture.shape[1] - 2 * left, piece.picture.shape[0] - 2 * top
-    for length, side, frame, pixel in zip(lengths, (width, height), piece.frame, piece.pixel, strict=True):
+    for length, side, frame, pixel in zip(
+        lengths, (width, height), piece.frame, piece.pixel, strict=True
+    ):
         most = (side - 2 * frame) / pixel
         if most < 1.0:
-            raise InputError("size: a pixel of it is larger than a sheet; give a smaller one, or a larger `paper`")
+            raise InputError(
+                "size: a pixel of it is larger than a sheet; give a "
+                "smaller one, or a larger `paper`"
+            )
         count = math.ceil(length / math.floor(most))
-        cuts.append(list(itertools.pairwise(round(length * number / count) for number in range(count + 1))))
+        cuts.append(
+            list(
+                itertools.pairwise(
+                    round(length * number / count) for number in range(count + 1)
+                )
+            )
+        )
     columns, rows = cuts
     if len(columns) * len(rows) > SHEETS_EVER:
-        raise InputError(f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one")
+        raise InputError(
+            f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one"
+        )
     for i, (y0, y1) in enumerate(rows):
         for j, (x0, x1) in enumerate(columns):
-            name = f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of {len(columns)}"
+            name = (
+                f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of "
+                f"{len(columns)}"
+            )
             name = name if len(columns) * len(rows) > 1 else piece.name
             yield Placed(piece, name, (left + x0, left + x1, top + y0, top + y1))
 
@@ -186,28 +251,41 @@ def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
 
 
 def _line(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
-    axes.plot(xs, ys, color="black", linewidth=0.4, solid_capstyle="butt", clip_on=False)
+    axes.plot(
+        xs, ys, color="black", linewidth=0.4, solid_capstyle="butt", clip_on=False
+    )
 
 
 def _cover(
-    pieces: Sequence[Piece], title: str, paper: tuple[float, float], sheets: int, profile: Path | None
+    pieces: Sequence[Piece],
+    title: str,
+    paper: tuple[float, float],
+    sheets: int,
+    profile: Path | None,
 ) -> Figure:
     figure, axes = blank(paper)
-    x, y = MARGIN, MARGIN + 5.0
+    x = MARGIN
+    y = MARGIN + 5.0
     axes.text(x, y, title, fontsize=14, va="top")
     colours = "sRGB" if profile is None else f"converted from sRGB by {profile.name}"
     lines = [
-        f'{sheets} sheets follow. Print all pages at 100 % ("actual size"), then measure this square: '
+        f'{sheets} sheets follow. Print all pages at 100 % ("actual size"), then '
+        "measure this square: "
         f"{SQUARE:g} mm a side.",
         "Cut along the lines between the marks; the colour beyond them is bleed.",
         f"Colours: {colours}.",
         "",
         *CHECKLIST,
         "",
-        *[f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm" for piece in pieces[:30]],
+        *[
+            f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm"
+            for piece in pieces[:30]
+        ],
         *([f"and {len(pieces) - 30} more"] if len(pieces) > 30 else []),
     ]
-    top, right, bottom = y + 15.0, x + SQUARE, y + 15.0 + SQUARE
+    top = y + 15.0
+    right = x + SQUARE
+    bottom = y + 15.0 + SQUARE
     _line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
     axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
     _ruler(axes, paper)
@@ -215,7 +293,8 @@ def _cover(
 
 
 def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
-    x, y = MARGIN, paper[1] - MARGIN
+    x = MARGIN
+    y = paper[1] - MARGIN
     _line(axes, [x, x + RULER], [y, y])
     for step in range(int(RULER) // 10 + 1):
         _line(axes, [x + 10.0 * step] * 2, [y, y - (4.0 if step % 5 == 0 else 2.5)])
@@ -223,14 +302,27 @@ def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
 
 
 def _draw(axes: Axes, part: Placed, convert: Any) -> None:
-    piece, (x0, x1, y0, y1) = part.piece, part.trim
-    (left, top), (wide, high) = piece.bleed, piece.pixel
+    piece = part.piece
+    (x0, x1, y0, y1) = part.trim
+    (left, top) = piece.bleed
+    (wide, high) = piece.pixel
     picture = piece.picture[y0 - top : y1 + top, x0 - left : x1 + left]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
-    right, bottom = part.x + (x1 - x0) * wide, part.y + (y1 - y0) * high
-    outer = (part.x - left * wide, right + left * wide, part.y - top * high, bottom + top * high)
-    axes.imshow(picture, extent=(outer[0], outer[1], outer[3], outer[2]), interpolation="none", aspect="auto")
+    right = part.x + (x1 - x0) * wide
+    bottom = part.y + (y1 - y0) * high
+    outer = (
+        part.x - left * wide,
+        right + left * wide,
+        part.y - top * high,
+        bottom + top * high,
+    )
+    axes.imshow(
+        picture,
+        extent=(outer[0], outer[1], outer[3], outer[2]),
+        interpolation="none",
+        aspect="auto",
+    )
     for x, edge_x, away in ((part.x, outer[0], -1.0), (right, outer[1], 1.0)):
         for y, edge_y, up in ((part.y, outer[2], -1.0), (bottom, outer[3], 1.0)):
             _line(axes, [edge_x + away * AWAY, edge_x + away * (AWAY + MARK)], [y, y])

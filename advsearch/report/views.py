@@ -1,15 +1,20 @@
-"""What a person is shown of a result: said once, and set as text, as a page and in a notebook by whoever shows it.
+"""What a person is shown of a result: said once, and set as text, as a page and in a
+notebook by whoever shows it.
 
-A question has `shown(result)` in its `result`; of one that has not, the fields of its result are shown as they are
-called and described. All rules of wording claims are here too: sentences that a run stands for, and no more than that.
+A question has `shown(result)` in its `result`; of one that has not, the fields of its
+result are shown as they are called and described. All rules of wording claims are here
+too: sentences that a run stands for, and no more than that.
 A claim is one of four kinds:
 
-- `found`: the search ended as `found` and fresh renders confirm it. It says that such a configuration exists.
-- `not found`: the search ran to its end and its best configuration was rendered afresh. It says how many renders of
-  which policy found none, and that this shows no absence.
-- `measured`: a share that was counted to the end, with its interval and what was counted.
-- `nothing claimed`: everything else: interrupted, wrong already, not verified, broken off, of an unknown ending, or a
-  run that says nothing about how often a model is right.
+- `found`: the search ended as `found` and fresh renders confirm it. It says that such a
+configuration exists.
+- `not found`: the search ran to its end and its best configuration was rendered afresh.
+  It says how many renders of which policy found none, and that this shows no absence.
+- `measured`: a share that was counted to the end, with its interval and what was
+counted.
+- `nothing claimed`: everything else: interrupted, wrong already, not verified, broken
+  off, of an unknown ending, or a run that says nothing about how often a model is
+  right.
 """
 
 from __future__ import annotations
@@ -28,10 +33,27 @@ from pydantic import Field
 from advsearch import registry
 from advsearch.errors import InputError
 from advsearch.report import wording
-from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, figure_of, new_axes
+from advsearch.report.figures import (
+    BLUE,
+    GREY,
+    RED,
+    Figures,
+    drawn,
+    figure_of,
+    new_axes,
+)
 from advsearch.report.wording import share_text as share_text
 from advsearch.runs.files import png_bytes
-from advsearch.runs.results import INTERRUPTED, RUNNING, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
+from advsearch.runs.results import (
+    INTERRUPTED,
+    RUNNING,
+    AverageCase,
+    Fields,
+    Formation,
+    Interval,
+    Result,
+    VerifiedRate,
+)
 from advsearch.runs.results import Extent as Extent
 
 if TYPE_CHECKING:
@@ -40,18 +62,31 @@ if TYPE_CHECKING:
 
 LONG = 24  # Rows of a table of fields above which it is folded
 _ELSEWHERE = (
-    *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds"),
+    *(
+        "run",
+        "object",
+        "objects",
+        "controls",
+        "environment",
+        "ending",
+        "warnings",
+        "seconds",
+    ),
     *("command_line", "python_only"),
     *("figures", "model", "renders", "seed"),
 )
 """Fields that stand in the heading or below, or nowhere."""
 Column = str | Callable[[Any], str]
-"""How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a function."""
+"""How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a
+function.
+"""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in the folder of the run, and what is said of it, behind a name if it has one."""
+    """A picture in the folder of the run, and what is said of it, behind a name if it
+    has one.
+    """
 
     file: str
     caption: str
@@ -70,14 +105,20 @@ class ResultPart:
         note: how the table is to be read, for a page.
         figure: file of a figure of the numbers in the run's folder, for a page.
         pictures: groups, each of which stands side by side.
-        draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and `text` say what is on it.
+        draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and
+            `text` say what is on it.
         height: of the chart, CSS pixels.
-        size: of the figure that is kept of it, width and height in inches; None: as high as the chart.
+        size: of the figure that is kept of it, width and height in inches; None: as
+            high as the chart.
         parts: the run among the parts that each row is of.
-        shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
-        bars: drawn beside each row on a page, decoration: from, to and a mark, in [0, 1]; None for no bar.
-        layout: of the pictures on a page: `pair`, `small`, `large`, `rows`, or as many as they are.
-        live: name of what a script of the page fills; without the script the part is hidden.
+        shares: in [0, 1], by row and column: the larger, the stronger the colour of the
+            cell.
+        bars: drawn beside each row on a page, decoration: from, to and a mark, in [0,
+            1]; None for no bar.
+        layout: of the pictures on a page: `pair`, `small`, `large`, `rows`, or as many
+            as they are.
+        live: name of what a script of the page fills; without the script the part is
+            hidden.
         folded: whether a page shows it only when asked to.
         only: `page`, `text` or `notebook`, where nobody else is shown it.
     """
@@ -101,23 +142,38 @@ class ResultPart:
     only: str = ""
 
     @classmethod
-    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> ResultPart:
-        """Return a table, a row for each of some values, with columns by their heads, and `more` of its attributes."""
-        made = [[made(row) if callable(made) else made.format(row) for made in columns.values()] for row in rows]
+    def table(
+        cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any
+    ) -> ResultPart:
+        """Return a table, a row for each of some values, with columns by their heads,
+        and `more` of its attributes.
+        """
+        made = [
+            [
+                made(row) if callable(made) else made.format(row)
+                for made in columns.values()
+            ]
+            for row in rows
+        ]
         return cls(heads=tuple(columns), rows=made, **more)
 
     @property
     def empty(self) -> bool:
         """Whether there is nothing to show."""
-        return not (any(self.text) or self.rows or self.pictures or self.draw or self.live)
+        return not (
+            any(self.text) or self.rows or self.pictures or self.draw or self.live
+        )
 
 
 @dataclass(frozen=True)
 class ShownResult:
-    """A result: what a reader should know first, in a sentence or two, the other sections, and by name what it was
-    done with, beside what all questions have (environment, renders, time and seed). Cautions have to be known beside
-    the warnings; `about` is what it is of, in a few names, and empty: the object, the controls and the model. Where
-    `says_interrupted`, `said` states by itself that an interrupted run was interrupted."""
+    """A result: what a reader should know first, in a sentence or two, the other
+    sections, and by name what it was done with, beside what all questions have
+    (environment, renders, time and seed). Cautions have to be known beside the
+    warnings; `about` is what it is of, in a few names, and empty: the object, the
+    controls and the model. Where `says_interrupted`, `said` states by itself that an
+    interrupted run was interrupted.
+    """
 
     said: str
     sections: Sequence[ResultPart] = ()
@@ -137,51 +193,100 @@ def remarks_of(result: Result, given: ShownResult) -> list[str]:
     ending = getattr(result, "ending", "")
     unsaid = ending == INTERRUPTED and not given.says_interrupted
     stopped = ["Not finished: these are the results so far."] if unsaid else []
-    stopped += ["It is running: this is what has come out so far."] if ending == RUNNING else []
+    stopped += (
+        ["It is running: this is what has come out so far."]
+        if ending == RUNNING
+        else []
+    )
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 
 def subject_of(result: Result, given: ShownResult) -> list[str]:
-    named = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
-    return [*given.about] or [", ".join([names] if isinstance(names, str) else names) for names in named if names]
+    named = [
+        getattr(result, name, None) or ()
+        for name in ("object", "objects", "controls", "model")
+    ]
+    return [*given.about] or [
+        ", ".join([names] if isinstance(names, str) else names)
+        for names in named
+        if names
+    ]
 
 
 def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
-    renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
+    renders = getattr(result, "renders", None)
+    seconds = getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
     own = {
-        "environment": "" if "environments" in given.facts else getattr(result, "environment", ""),
+        "environment": ""
+        if "environments" in given.facts
+        else getattr(result, "environment", ""),
         "renders": "" if spent is None else str(spent),
         "workers": wording.workers_text(getattr(result, "shared", None)),
         "time": wording.seconds_text(seconds["total"]) if seconds else "",
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
-    return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
+    return {
+        name: text
+        for name, text in {**given.facts, **own, **given.facts}.items()
+        if text
+    }
 
 
 def fields_shown(result: Result) -> ShownResult:
-    """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
+    """Return the lists of a result as tables, its other fields as facts, and what their
+    names mean.
+    """
     values = {name: getattr(result, name) for name in type(result).described()}
-    lists = {name: value for name, value in values.items() if isinstance(value, (list, tuple)) and value}
-    tables = {name: rows for name, rows in lists.items() if all(isinstance(row, Fields) for row in rows)}
-    elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
-    plain = {_words(name): _text(value) for name, value in values.items() if name not in elsewhere}
-    described: list[tuple[Fields, set[str]]] = [(result, {name for name, text in plain.items() if text})]
-    sections, meanings = [], dict[str, str]()
+    lists = {
+        name: value
+        for name, value in values.items()
+        if isinstance(value, (list, tuple)) and value
+    }
+    tables = {
+        name: rows
+        for name, rows in lists.items()
+        if all(isinstance(row, Fields) for row in rows)
+    }
+    elsewhere = (
+        *_ELSEWHERE,
+        *tables,
+        *(name.replace(" ", "_") for name in result.facts()),
+    )
+    plain = {
+        _words(name): _text(value)
+        for name, value in values.items()
+        if name not in elsewhere
+    }
+    described: list[tuple[Fields, set[str]]] = [
+        (result, {name for name, text in plain.items() if text})
+    ]
+    sections = []
+    meanings = dict[str, str]()
     for name, rows in tables.items():
         names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
-        columns = [column for column in names if any(_text(getattr(row, column, None)) for row in rows)]
-        cells = [[_text(getattr(row, column, None)) for column in columns] for row in rows]
+        columns = [
+            column
+            for column in names
+            if any(_text(getattr(row, column, None)) for row in rows)
+        ]
+        cells = [
+            [_text(getattr(row, column, None)) for column in columns] for row in rows
+        ]
         heads = list(map(_words, columns))
-        sections.append(ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG))
+        sections.append(
+            ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG)
+        )
         described.append((rows[0], set(heads)))
     for fields, words in described:
         for name, about in type(fields).described().items():
             if about.description and _words(name) in words:
                 meanings.setdefault(_words(name), about.description.replace("`", ""))
     meaning = [[*pair] for pair in meanings.items()]
-    sections.append(ResultPart("What these words mean", rows=meaning, folded=True, only="page"))
+    sections.append(
+        ResultPart("What these words mean", rows=meaning, folded=True, only="page")
+    )
     brief = result.brief or str(values.get("ending", "done"))
     return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, plain)
 
@@ -198,10 +303,16 @@ def _text(value: object) -> str:
     if isinstance(value, Fields):
         return _text({name: getattr(value, name) for name in type(value).model_fields})
     if isinstance(value, Mapping):
-        texts = {_words(str(name)).lower(): _text(inner) for name, inner in value.items()}
+        texts = {
+            _words(str(name)).lower(): _text(inner) for name, inner in value.items()
+        }
         return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
     if isinstance(value, (list, tuple)):
-        between = " to " if len(value) == 2 and all(isinstance(inner, float) for inner in value) else "; "
+        between = (
+            " to "
+            if len(value) == 2 and all(isinstance(inner, float) for inner in value)
+            else "; "
+        )
         return between.join(filter(None, map(_text, value)))
     return str(value)
 
@@ -217,12 +328,16 @@ Kind = Literal["found", "not found", "measured", "nothing claimed"]
 class Claim(Fields):
     """One sentence that a run stands for, and no more than that."""
 
-    kind: Kind = Field(description="`found`, `not found`, `measured` or `nothing claimed`")
+    kind: Kind = Field(
+        description="`found`, `not found`, `measured` or `nothing claimed`"
+    )
     statement: str
     extent: Extent | None = Field(description="null where nothing was counted")
 
     @classmethod
-    def of_case(cls, name: str, ending: str, rate: VerifiedRate | None, spent: str | None = None) -> Claim:
+    def of_case(
+        cls, name: str, ending: str, rate: VerifiedRate | None, spent: str | None = None
+    ) -> Claim:
         """Return the claim about one adversarial scene of several.
 
         Args:
@@ -234,8 +349,10 @@ class Claim(Fields):
         return case_claim(name, ending, rate, spent)
 
 
-NOTHING, NO_PROOF = "Nothing is claimed", "This does not show that there is none."
-ENDED = ("budget spent", "stalled")  # Endings of a search that ran to its end without finding anything
+NOTHING = "Nothing is claimed"
+NO_PROOF = "This does not show that there is none."
+# Endings of a search that ran to its end without finding anything
+ENDED = ("budget spent", "stalled")
 
 
 WHY = {
@@ -247,48 +364,82 @@ WHY = {
 }
 
 
-def case_claim(name: str, ending: str, rate: VerifiedRate | None, spent: str | None) -> Claim:
-    """One adversarial scene of many. `spent` is what was searched; None where nothing was, and a scene was only tried
-    again."""
+def case_claim(
+    name: str, ending: str, rate: VerifiedRate | None, spent: str | None
+) -> Claim:
+    """One adversarial scene of many. `spent` is what was searched; None where nothing
+    was, and a scene was only tried again.
+    """
     extent = extent_of("fresh renders that count as a success", rate)
     if ending == "found" and rate is not None and rate.successes:
-        return claim("found", f"{name}: an adversarial scene holds in {wording.rate_text(rate)}.", extent)
+        return claim(
+            "found",
+            f"{name}: an adversarial scene holds in {wording.rate_text(rate)}.",
+            extent,
+        )
     if rate is not None and spent is None and ending in (*ENDED, "not verified"):
         return claim(
-            "measured", f"{name}: the adversarial scene is not confirmed, in {wording.rate_text(rate)}.", extent
+            "measured",
+            f"{name}: the adversarial scene is not confirmed, in "
+            f"{wording.rate_text(rate)}.",
+            extent,
         )
     if rate is not None and ending in ENDED:
-        text = f"{name}: no failure was found; the best configuration counts in {wording.rate_text(rate)}."
+        text = (
+            f"{name}: no failure was found; the best configuration counts in "
+            f"{wording.rate_text(rate)}."
+        )
         return claim("not found", f"{text} Searched were {spent}. {NO_PROOF}", extent)
-    return nothing_claimed(WHY.get(ending, f"it ended as {ending!r}"), f"This is about {name}.")
+    return nothing_claimed(
+        WHY.get(ending, f"it ended as {ending!r}"), f"This is about {name}."
+    )
 
 
 def average_claim(case: AverageCase, name: str) -> Claim:
     what = "configurations in which the model is right"
     extent = counted(what, case.correct, case.configurations, case.interval)
-    text = f"{name}: the model is right in {share_text(extent)} configurations drawn by chance"
+    text = (
+        f"{name}: the model is right in {share_text(extent)} configurations drawn "
+        "by chance"
+    )
     return claim("measured", f"{text} from the whole space and budget.", extent)
 
 
 def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
-    """``24 renders by the policy auto and 24 by random search``; what was predicted instead is said too."""
+    """``24 renders by the policy auto and 24 by random search``; what was predicted
+    instead is said too.
+    """
     own = renders.get("search", 0) + renders.get("gradient", 0)
     text = f"{wording.count(own, 'render')} by the policy {policy}"
     if renders.get("products"):
         text += f", {renders['products']} more predicted,"
-    return f"{text} and {renders.get('baseline', 0)} by random search" if random else text
+    return (
+        f"{text} and {renders.get('baseline', 0)} by random search" if random else text
+    )
 
 
 def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
-    return None if rate is None else counted(what, rate.successes, rate.trials, rate.interval)
+    return (
+        None
+        if rate is None
+        else counted(what, rate.successes, rate.trials, rate.interval)
+    )
 
 
-def counted(what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
+def counted(
+    what: str,
+    count: int,
+    total: int,
+    interval: Interval | None,
+    share: float | None = None,
+) -> Extent:
     return Extent.from_count(what, count, total, interval, share)
 
 
 def nothing_claimed(why: str, more: str = "") -> Claim:
-    return claim("nothing claimed", f"{NOTHING}: {why}.{' ' + more if more else ''}", None)
+    return claim(
+        "nothing claimed", f"{NOTHING}: {why}.{' ' + more if more else ''}", None
+    )
 
 
 def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
@@ -298,8 +449,9 @@ def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
 # ---------------------------------------------------------------------------------------------------------------------
 # HTML that is escaped by construction: text becomes markup only through `element`.
 #
-# And results as a notebook shows them (what is said, pictures or a figure, and tables, without styles), and charts that
-# stand inline in a page; their colours come from its style sheet, so that they follow its scheme.
+# And results as a notebook shows them (what is said, pictures or a figure, and tables,
+# without styles), and charts that stand inline in a page; their colours come from its
+# style sheet, so that they follow its scheme.
 
 _VOID = frozenset({"meta", "img", "br", "hr", "input", "link"})
 
@@ -311,8 +463,9 @@ class Html(str):
 
 
 def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
-    """Return one element. Children that are not `Html` are escaped; None is left out. Of attributes ``class_`` is
-    ``class``, and other underscores become hyphens."""
+    """Return one element. Children that are not `Html` are escaped; None is left out.
+    Of attributes ``class_`` is ``class``, and other underscores become hyphens.
+    """
     names = {"class_": "class", "viewBox": "viewBox"}
     given = "".join(
         f' {names.get(name, name.replace("_", "-"))}="{escape(str(value), quote=True)}"'
@@ -325,7 +478,13 @@ def element(tag: str, *children: str | None, **attributes: str | float) -> Html:
 
 def join_html(*parts: str | None) -> Html:
     """Return the parts one after the other, escaped where they are not `Html`."""
-    return Html("".join(part if isinstance(part, Html) else escape(part) for part in parts if part is not None))
+    return Html(
+        "".join(
+            part if isinstance(part, Html) else escape(part)
+            for part in parts
+            if part is not None
+        )
+    )
 
 
 SHOWN = 224  # Width of a picture on the page, in pixels
@@ -335,13 +494,16 @@ WIDTH = 6.2  # Of a figure, in inches
 
 
 class InNotebook:
-    """What a notebook shows of a result: what its question says of it, as HTML and as a figure; and its table."""
+    """What a notebook shows of a result: what its question says of it, as HTML and as a
+    figure; and its table.
+    """
 
     tabular: ClassVar[str] = "table"
     """The field that is its table."""
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the figure of the result and return the matplotlib axes; nothing is drawn where it has none.
+        """Draw the figure of the result and return the matplotlib axes; nothing is
+        drawn where it has none.
 
         Args:
             axes: to draw on; None makes new ones.
@@ -353,14 +515,17 @@ class InNotebook:
         return axes
 
     def to_pandas(self) -> Any:
-        """Return the rows of its table as a `pandas.DataFrame`; columns are called as in `summary.json`.
+        """Return the rows of its table as a `pandas.DataFrame`; columns are called as
+        in `summary.json`.
 
         Raises:
             InputError: it has no table.
         """
         rows = getattr(self, self.tabular, None)
         if rows is None:
-            raise InputError(f"to_pandas: the result of {getattr(self, 'command', '')} has no table")
+            raise InputError(
+                f"to_pandas: the result of {getattr(self, 'command', '')} has no table"
+            )
         from pandas import json_normalize  # takes half a second
 
         return json_normalize([row.to_dict() for row in rows])
@@ -372,20 +537,38 @@ class InNotebook:
         return result_figure(shown(self)).get("png")  # type: ignore[arg-type]
 
 
-def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
+def result_html(
+    given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None
+) -> str:
     figures = []
     for name, image in (pictures or {}).items():
         picture = _picture(png_bytes(image), SHOWN, name)
-        figures.append(element("figure", picture, element("figcaption", name), style="display:inline-block"))
+        figures.append(
+            element(
+                "figure",
+                picture,
+                element("figcaption", name),
+                style="display:inline-block",
+            )
+        )
     figure = result_figure(given)
-    chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
+    chart = (
+        _picture(figure["png"], 2 * SHOWN, "the numbers of the table")
+        if figure
+        else None
+    )
     parts = []
     for part in given.sections:
         if part.only in ("", "notebook") and not part.empty:
-            inside = [element("p", text) for text in part.text if text and part.draw is None]
+            inside = [
+                element("p", text) for text in part.text if text and part.draw is None
+            ]
             if part.rows:
                 heads = element("tr", *(element("th", cell) for cell in part.heads))
-                rows = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
+                rows = (
+                    element("tr", *(element("td", cell) for cell in row))
+                    for row in part.rows
+                )
                 head = element("thead", heads) if part.heads else None
                 inside.append(element("table", head, element("tbody", *rows)))
             title = element("p", element("b", part.title)) if part.title else None
@@ -404,21 +587,36 @@ def result_figure(given: ShownResult) -> Figures:
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
     arrays = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
-    return png_bytes(np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1))
+    return png_bytes(
+        np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1)
+    )
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
-    return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", width=width, alt=alt)
+    return element(
+        "img",
+        src=f"data:image/png;base64,{base64.b64encode(png).decode()}",
+        width=width,
+        alt=alt,
+    )
 
 
 HEIGHT = 300
-WIDE, NARROW = 720, 350
-"""Height and widths of a chart in CSS pixels: for a screen, and for a phone, which would shrink the letters of the wide
-one until nobody can read them. The style sheet shows one of them.
+WIDE = 720
+NARROW = 350
+"""Height and widths of a chart in CSS pixels: for a screen, and for a phone, which
+would shrink the letters of the wide one until nobody can read them. The style sheet
+shows one of them.
 """
-COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
+COLORS = {
+    "search": "#010101",
+    "baseline": "#020202",
+    "soft": "#030303",
+    "line": "#040404",
+}
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
-OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}  # The same of the colours that figures have
+# The same of the colours that figures have
+OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
 STYLE: dict[Any, Any] = {
     "font.size": 13.0, "path.simplify": False,
     "legend.fontsize": 13.0, "legend.labelcolor": "linecolor", "legend.borderpad": 0.0, "legend.handlelength": 1.6,
@@ -430,9 +628,13 @@ STYLE: dict[Any, Any] = {
 }  # fmt: skip
 
 
-def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:
-    """Return what `draw` draws on axes, without its title and with the page's legend. The words say what it shows to
-    who does not see it; width and height are in CSS pixels."""
+def study_chart(
+    draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT
+) -> Html:
+    """Return what `draw` draws on axes, without its title and with the page's legend.
+    The words say what it shows to who does not see it; width and height are in CSS
+    pixels.
+    """
 
     def on_figure(figure: Figure) -> None:
         axes = figure.subplots()
@@ -441,7 +643,9 @@ def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, h
         for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
             legend.remove()
         columns = 1 if width == NARROW else 2
-        figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
+        figure.legend(
+            loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
+        )
 
     (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
@@ -451,16 +655,24 @@ def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, h
 
 
 def _inline(file: str, prefix: str) -> Html:
-    """Return what a file in SVG draws: without its head, hundredths of a pixel, names and frames to cut at.
+    """Return what a file in SVG draws: without its head, hundredths of a pixel, names
+    and frames to cut at.
 
-    All that is drawn lies in the frame. Names that are pointed at, those of markers, stay, behind the prefix: a page of
-    two charts would have them twice.
+    All that is drawn lies in the frame. Names that are pointed at, those of markers,
+    stay, behind the prefix: a page of two charts would have them twice.
     """
     shapes = file[file.index("<g ") : file.rindex("</svg>")]
-    needless = r'<clipPath.*?</clipPath>|<!--.*?-->| clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
+    needless = (
+        r"<clipPath.*?</clipPath>|<!--.*?-->| "
+        r'clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
+    )
     shapes = re.sub(needless, "", shapes, flags=re.DOTALL)
     pointed = set(re.findall(r'href="#([^"]+)"', shapes))
-    shapes = re.sub(r' id="([^"]*)"', lambda one: f' id="{prefix}{one[1]}"' if one[1] in pointed else "", shapes)
+    shapes = re.sub(
+        r' id="([^"]*)"',
+        lambda one: f' id="{prefix}{one[1]}"' if one[1] in pointed else "",
+        shapes,
+    )
     shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)
     shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
     for name, color in (*COLORS.items(), *OF_FIGURES.items()):

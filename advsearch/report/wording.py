@@ -1,4 +1,6 @@
-"""Numbers and results in plain words, and what a task's predictions are called in sentences and tables, by its name."""
+"""Numbers and results in plain words, and what a task's predictions are called in
+sentences and tables, by its name.
+"""
 
 from __future__ import annotations
 
@@ -11,25 +13,44 @@ from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
-    from advsearch.runs.results import ConditionRow, ControlGroup, Extent, Formation, Interval, SharedWork, VerifiedRate
+    from advsearch.runs.results import (
+        ConditionRow,
+        ControlGroup,
+        Extent,
+        Formation,
+        Interval,
+        SharedWork,
+        VerifiedRate,
+    )
 
 
-CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
-DEPTH, SIMILARITY, COMMAND = "depth", "similarity", "command"
+CLASSIFICATION = "classification"
+DETECTION = "detection"
+SEGMENTATION = "segmentation"
+DEPTH = "depth"
+SIMILARITY = "similarity"
+COMMAND = "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
     CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
-    DETECTION: "how far the best right box is over the score that counts, in log-odds; below 0 where none is found",
-    SEGMENTATION: "the lead of right classes at the pixel that decides, in logits; below 0 where too few are right",
-    DEPTH: "the logarithm of the tolerance, less that of the factor by which the object's distance is off",
+    DETECTION: "how far the best right box is over the score that counts, in log-odds; "
+    "below 0 where none is found",
+    SEGMENTATION: "the lead of right classes at the pixel that decides, in logits; "
+    "below 0 where too few are right",
+    DEPTH: "the logarithm of the tolerance, less that of the factor by which the "
+    "object's distance is off",
     SIMILARITY: "how far the right name leads the nearest wrong one, in logits",
-    COMMAND: "1 less how many envelopes the action is from the clean one; below 0 outside of it",
+    COMMAND: "1 less how many envelopes the action is from the clean one; below 0 "
+    "outside of it",
 }
 _MARKS = {
-    DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
-    SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
-    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right. Beside it is the inverse of "
+    DETECTION: "Blue is the true box, orange what the model finds with a score that "
+    "counts.",
+    SEGMENTATION: "Blue is the true outline, orange the pixels to which the model "
+    "gives a right class.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is "
+    "right. Beside it is the inverse of "
     "the true distance, and of the model's: light is near.",
 }
 _WANTED = {
@@ -64,11 +85,18 @@ _OUTCOMES = {
 }
 """What a count of each is called, the usual ones first."""
 _LOOSELY = {DETECTION: "in a loose box", SEGMENTATION: "in part"}
-_DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
+_DOING = {
+    "calls": "calling",
+    "finds": "finding",
+    "sees": "seeing",
+    "takes": "taking",
+    "judges": "judging",
+}
 _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
 
-Said = Any  # A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one
+# A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one
+Said = Any
 
 
 def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
@@ -77,9 +105,11 @@ def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
 
 
 def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
-    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98`` for 0.99979.
+    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
+    for 0.99979.
 
-    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at most, as show how far it is away.
+    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at
+    most, as show how far it is away.
     """
     value = 100.0 * share
     away = min(value, 100.0 - value)
@@ -90,28 +120,43 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     if text not in ("0", "100"):
         return text
     least = 10.0**-decimals
-    return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
+    return (
+        f"under {least:.{decimals}f}"
+        if text == "0"
+        else f"over {100.0 - least:.{decimals}f}"
+    )
 
 
-def share_of_text(count: int, total: int, interval: tuple[float, float], share: float | None = None) -> str:
-    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``; the share is count over total
-    unless another one is given."""
+def share_of_text(
+    count: int, total: int, interval: tuple[float, float], share: float | None = None
+) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``;
+    the share is count over total unless another one is given.
+    """
     if not total:
         return "none of 0"
     low, high = map(percent_number, interval)
-    return f"{percent(count / total if share is None else share)} ({low} to {high}) of {total:,}"
+    return (
+        f"{percent(count / total if share is None else share)} ({low} to {high}) "
+        "of "
+        f"{total:,}"
+    )
 
 
 def repeats_remark(name: str, repeats: int, units: int) -> str:
-    """Return what is said of a sweep in which nothing is drawn, with so many `repeats` of each of its units, which are
-    called by a `name`."""
+    """Return what is said of a sweep in which nothing is drawn, with so many `repeats`
+    of each of its units, which are called by a `name`.
+    """
     if units == 1:
         return (
-            f"Nothing is drawn: all {repeats} repeats are of one {name} and differ in noise alone. The shares are of "
-            f"this one {name}; nothing is shown of others, so that there is no interval over {name}s."
+            f"Nothing is drawn: all {repeats} repeats are of one {name} and differ in "
+            "noise alone. The shares are of "
+            f"this one {name}; nothing is shown of others, so that there is no "
+            f"interval over {name}s."
         )
     return (
-        f"Nothing is drawn: the {repeats} repeats of each {name} differ in noise alone and count as one. Intervals "
+        f"Nothing is drawn: the {repeats} repeats of each {name} differ in noise alone "
+        "and count as one. Intervals "
         f"are over {units} {name}s."
     )
 
@@ -122,19 +167,31 @@ def with_article(name: str) -> str:
 
 
 def beside_text(run: str, pair: Any) -> str:
-    """Return what a model does without and with the adversarial scene of a run (`PairedRates`), in sentences."""
+    """Return what a model does without and with the adversarial scene of a run
+    (`PairedRates`), in sentences.
+    """
     sides = [
-        f"{side.correct} of {side.configurations} ({percent(side.accuracy)}, 95 % interval "
+        f"{side.correct} of {side.configurations} ({percent(side.accuracy)}, 95 % "
+        "interval "
         f"{interval_text(side.interval)})"
         for side in (pair.clean, pair.answer)
     ]
     low, high = (100.0 * end for end in pair.interval)
-    ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
-    shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
+    ends = (
+        f"{-high:.0f} to {-low:.0f}"
+        if pair.difference < 0
+        else f"{low:.0f} to {high:.0f}"
+    )
+    shown = (
+        "" if low > 0.0 or high < 0.0 else ("; that there is a difference is not shown")
+    )
     return (
-        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the adversarial scene of "
-        f"{run}: {abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % "
-        f"interval of pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the "
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} "
+        "with the adversarial scene of "
+        f"{run}: {abs(100.0 * pair.difference):.0f} points "
+        f"{'fewer' if pair.difference < 0 else 'more'} (95 % "
+        f"interval of pairs {ends}){shown}. Right in the clean one alone are "
+        f"{pair.clean_only} pairs, with the "
         f"adversarial one alone {pair.answer_only}."
     )
 
@@ -146,20 +203,31 @@ def margin_text(task: str) -> str:
 def objective_label(objective: str) -> str:
     """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
     named = objective_name(objective)
-    return next((f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names), named)
+    return next(
+        (f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names),
+        named,
+    )
 
 
 def objective_name(objective: str) -> str:
-    """Return what an objective is called beside its value: that of a margin has the margin's sign turned."""
-    return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(objective, objective)
+    """Return what an objective is called beside its value: that of a margin has the
+    margin's sign turned.
+    """
+    return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(
+        objective, objective
+    )
 
 
 def marks_text(task: str) -> str:
-    return _MARKS.get(task, "Blue is true of the scene, orange is the model's prediction.")
+    return _MARKS.get(
+        task, "Blue is true of the scene, orange is the model's prediction."
+    )
 
 
 def wanted(objective: str, thing: str) -> str:
-    """Return what a search with an objective looks for, as a clause: "makes the model miss this mug"."""
+    """Return what a search with an objective looks for, as a clause: "makes the model
+    miss this mug".
+    """
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
@@ -167,13 +235,15 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
     """Return a prediction and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
     0.12"]``.
     """
-    label, share = prediction.label, prediction.probability
+    label = prediction.label
+    share = prediction.probability
     if task == COMMAND:
         return [label, (getattr(prediction, "payload", None) or {}).get("text", "")]
     if share is None:
         return [label, ""]
     if task == SIMILARITY:
-        kept, similar = getattr(prediction, "payload", None), percent(share, PROBABILITY_DECIMALS)
+        kept = getattr(prediction, "payload", None)
+        similar = percent(share, PROBABILITY_DECIMALS)
         if isinstance(kept, dict) and "cosine" in kept:
             if "rank" not in kept:
                 similar = f"cosine {kept['cosine']:.2f}"
@@ -185,23 +255,39 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
         outcome = get_outcome(payload)
         stated = payload if isinstance(payload, dict) else {}
         if outcome is Outcome.MISSED:
-            return [f"{label} found", f"best score of {stated.get('class', 'it')} {share:.2f}"]
+            return [
+                f"{label} found",
+                f"best score of {stated.get('class', 'it')} {share:.2f}",
+            ]
         overlap = stated.get("iou")
         if outcome is Outcome.LOOSE and isinstance(overlap, float):
             return [label, f"score {share:.2f}, overlap {overlap:.2f}"]
         return [label, f"score {share:.2f}"]
-    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
+    return [
+        label,
+        f"accuracy {percent(share)}"
+        if task == SEGMENTATION
+        else percent(share, PROBABILITY_DECIMALS),
+    ]
 
 
 def prediction_text(task: str, prediction: Said) -> str:
-    """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
+    """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of
+    cup 0.12)``.
+    """
     label, number = prediction_cells(task, prediction)
     if task == SEGMENTATION and number:
-        accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
+        accuracy = (
+            f"accuracy over the object's pixels {percent(prediction.probability)}"
+        )
         outcome = get_outcome(getattr(prediction, "payload", None))
         if outcome is Outcome.MISSED:
             return f"{label} found, {accuracy}"
-        return f"{label}, {accuracy}" if outcome is Outcome.LOOSE else f"{accuracy}, most often {label}"
+        return (
+            f"{label}, {accuracy}"
+            if outcome is Outcome.LOOSE
+            else f"{accuracy}, most often {label}"
+        )
     if task == DETECTION and number:
         return f"{label} ({number})"
     return f"{label}, {number}" if number else label
@@ -211,34 +297,59 @@ SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
 
 
 def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is seen of each thing, for a table, from its name to `runs.results.ThingSeen` as a mapping."""
+    """Return what is seen of each thing, for a table, from its name to
+    `runs.results.ThingSeen` as a mapping.
+    """
     rows = []
     for name, seen in things.items():
-        share = "nothing" if seen["box"] is None else "in part" if seen["share"] is None else percent(seen["share"])
+        share = (
+            "nothing"
+            if seen["box"] is None
+            else "in part"
+            if seen["share"] is None
+            else percent(seen["share"])
+        )
         box = "" if seen["box"] is None else ", ".join(map(str, seen["box"]))
-        rows.append([name, share, box, "" if seen["distance"] is None else f"{seen['distance']:.1f} m"])
+        rows.append(
+            [
+                name,
+                share,
+                box,
+                "" if seen["distance"] is None else f"{seen['distance']:.1f} m",
+            ]
+        )
     return rows
 
 
 def seen_cells(task: str, prediction: Said) -> list[str]:
-    """Return one of the predictions of a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
+    """Return one of the predictions of a whole picture, for a table: ``["cup", "score
+    0.77"]``, ``["mug", "91 %"]``.
+    """
     if prediction.probability is None:
         return [prediction.label, ""]
     if task == DETECTION:
         return [prediction.label, f"score {prediction.probability:.2f}"]
     share = percent(prediction.probability, PROBABILITY_DECIMALS)
-    return [prediction.label, f"{share} of the picture" if task == SEGMENTATION else share]
+    return [
+        prediction.label,
+        f"{share} of the picture" if task == SEGMENTATION else share,
+    ]
 
 
 def seen_text(task: str, prediction: Said) -> str:
     """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
     label, number = seen_cells(task, prediction)
-    return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
+    return (
+        f"{label} ({number})"
+        if task == DETECTION and number
+        else f"{label} {number}".rstrip()
+    )
 
 
 def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> str:
-    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``; of a detector by
-    what becomes of the thing."""
+    """Return what a model does to a thing, as a clause: ``calls this mug a vase``,
+    ``finds no cup``; of a detector by what becomes of the thing.
+    """
     if label == NOT_A_NUMBER:
         return f"predicts nothing for {thing}, for its output is not a number"
     if outcome is Outcome.MISSED:
@@ -259,22 +370,34 @@ def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> 
 
 
 def calling(task: str, label: str, outcome: Outcome | None = None) -> str:
-    """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    """Return the same of a thing that was named already: ``calling it a vase``,
+    ``finding no cup``.
+    """
     verb, _, rest = calls(task, "it", label, outcome).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
 def outcomes_text(outcomes: Mapping[str, int] | None, task: str = "") -> str:
-    """Return how often each outcome came about that is not right: ``12 missed, 6 in a loose box``; empty where nothing
-    is known of them."""
+    """Return how often each outcome came about that is not right: ``12 missed, 6 in a
+    loose box``; empty where nothing is known of them.
+    """
     names = _OUTCOMES | ({Outcome.LOOSE: _LOOSELY[task]} if task in _LOOSELY else {})
-    counts = ((name, (outcomes or {}).get(outcome.value, 0)) for outcome, name in names.items())
+    counts = (
+        (name, (outcomes or {}).get(outcome.value, 0))
+        for outcome, name in names.items()
+    )
     return ", ".join(f"{number} {name}" for name, number in counts if number)
 
 
 def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
-    """Return the outcome of all of some predictions; None where they have several, or nothing is known of them."""
-    return get_outcome({"outcome": next(iter(outcomes))}) if outcomes and len(outcomes) == 1 else None
+    """Return the outcome of all of some predictions; None where they have several, or
+    nothing is known of them.
+    """
+    return (
+        get_outcome({"outcome": next(iter(outcomes))})
+        if outcomes and len(outcomes) == 1
+        else None
+    )
 
 
 NO_INTERVAL = "no interval"
@@ -293,34 +416,52 @@ def value_text(value: Any) -> str:
 
 
 def figure_value(value: float | str) -> str:
-    """Return a value as figures write it; of a file, its name without folder and suffix."""
+    """Return a value as figures write it; of a file, its name without folder and
+    suffix.
+    """
     if isinstance(value, str):
         return PurePath(value).stem if "/" in value else value
     return f"{value:.4g}"
 
 
 def short_names(text: str) -> str:
-    """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
+    """Return the last parts of paths, of one or of several separated by commas:
+    ``a.hdr, studio``.
+    """
     return ", ".join(map(short_name, split_names(text)))
 
 
 def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    return f"{percent_number(interval[0])}-{percent_number(interval[1])} %" if interval else NO_INTERVAL
+    return (
+        f"{percent_number(interval[0])}-{percent_number(interval[1])} %"
+        if interval
+        else NO_INTERVAL
+    )
 
 
 def rate_text(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs are not numbers."""
-    nothing = f"in {rated.not_a_number} its output is not a number" if rated.not_a_number else ""
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs
+    are not numbers.
+    """
+    nothing = (
+        f"in {rated.not_a_number} its output is not a number"
+        if rated.not_a_number
+        else ""
+    )
     if nothing and not rated.successes:
         return f"none of {rated.trials} fresh renders: {nothing}"
-    rate = f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
+    rate = (
+        f"{rated.successes} of {rated.trials} fresh renders (95 % interval "
+        f"{interval_text(rated.interval)})"
+    )
     return f"{rate}, and {nothing}" if nothing else rate
 
 
 def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
-    """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of outputs that are not numbers, how
-    many."""
+    """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of
+    outputs that are not numbers, how many.
+    """
     number = rated.successes if hasattr(rated, "successes") else rated.correct
     nothing = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
     return [f"{number}/{rated.trials}{nothing}", interval_text(rated.interval)]
@@ -341,7 +482,11 @@ def seconds_text(seconds: Any) -> str:
     whole = round(float(seconds))
     if whole < 100:
         return f"{float(seconds):.1f} s"
-    return f"{whole // 60} min {whole % 60} s" if whole < 6000 else f"{whole // 3600} h {whole % 3600 // 60} min"
+    return (
+        f"{whole // 60} min {whole % 60} s"
+        if whole < 6000
+        else f"{whole // 3600} h {whole % 3600 // 60} min"
+    )
 
 
 def count(number: Any, thing: str) -> str:
@@ -350,42 +495,80 @@ def count(number: Any, thing: str) -> str:
 
 
 def workers_text(shared: SharedWork | None) -> str:
-    """How many shared the work, and where their time went; empty where nothing was shared."""
+    """How many shared the work, and where their time went; empty where nothing was
+    shared.
+    """
     if shared is None:
         return ""
-    busy = None if shared.utilisation is None else f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}"
-    counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
+    busy = (
+        None
+        if shared.utilisation is None
+        else f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}"
+    )
+    counts = {
+        "lost": shared.lost,
+        "refused": shared.refused,
+        "given out again": shared.retried,
+    }
     listed = [f"{number} {what}" for what, number in counts.items() if number]
-    first = [f"{shared.most} at most", busy, f"loading took {seconds_text(shared.loading)}"]
+    first = [
+        f"{shared.most} at most",
+        busy,
+        f"loading took {seconds_text(shared.loading)}",
+    ]
     return ", ".join(filter(None, [*first, *listed]))
 
 
-def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``; gains
-    of several scenes by their names."""
+def formation_text(
+    formation: Formation, gains: Mapping[str, float] | None = None
+) -> str:
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn),
+    exposure 0 stops, gain 1.35``; gains of several scenes by their names.
+    """
     height, width = formation.resolution
-    denoised = "not denoised" if formation.denoiser == "none" else f"denoised ({formation.denoiser})"
+    denoised = (
+        "not denoised"
+        if formation.denoiser == "none"
+        else f"denoised ({formation.denoiser})"
+    )
     exposure = f"exposure {number_text(formation.exposure)} stops"
-    made = f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
+    made = (
+        f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
+    )
     if formation.gain is not None:
-        return f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
+        return (
+            f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
+        )
     names = {name: ", ".join(map(short_name, name.split(", "))) for name in gains or {}}
-    each = "; ".join(f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items())
-    return f"{made}, sampler {formation.sampler}, a gain for each scene" + (f": {each}" if each else "")
+    each = "; ".join(
+        f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items()
+    )
+    return f"{made}, sampler {formation.sampler}, a gain for each scene" + (
+        f": {each}" if each else ""
+    )
 
 
 def number_text(value: Any) -> str:
-    """Return a value as text; a number with the digits that mean something to a reader."""
+    """Return a value as text; a number with the digits that mean something to a
+    reader.
+    """
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
-    return " and ".join(one.text for one in conditions) or "everything that was looked at"
+    return " and ".join(one.text for one in conditions) or (
+        "everything that was looked at"
+    )
 
 
 def share_text(extent: Extent) -> str:
     """Return ``12 of 20 (60 %, 95 % interval 36-81 %)``."""
     share = "none"
     if extent.total:
-        share = percent(extent.count / extent.total if extent.share is None else extent.share)
-    return f"{extent.count} of {extent.total} ({share}, 95 % interval {interval_text(extent.interval)})"
+        share = percent(
+            extent.count / extent.total if extent.share is None else extent.share
+        )
+    return (
+        f"{extent.count} of {extent.total} ({share}, 95 % interval "
+        f"{interval_text(extent.interval)})"
+    )

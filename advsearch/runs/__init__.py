@@ -1,1 +1,3 @@
-"""What a run leaves behind: its directory, results, pictures and summary; docs/runs.md says which names hold."""
+"""What a run leaves behind: its directory, results, pictures and summary; docs/runs.md
+says which names hold.
+"""

@@ -1,4 +1,6 @@
-"""The run directory: all that a run leaves behind (docs/runs.md), made, locked and filled here."""
+"""The run directory: all that a run leaves behind (docs/runs.md), made, locked and
+filled here.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
-from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
+from advsearch.errors import (
+    AdvsearchError,
+    FileFormatError,
+    InputError,
+    RunExistsError,
+    StorageError,
+    UnknownNameError,
+)
 from advsearch.runs import files, store
 from advsearch.runs import summary as summary
 from advsearch.runs.trackers import Tracker, check_tracker
@@ -39,16 +48,20 @@ if TYPE_CHECKING:
 HOME = Path("runs")  # where runs live that are called by name, in the current directory
 
 REPORT = "report.html"
-COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
+# of a sweep that has ended: its rows as columns of numbers
+# (advsearch/viewer/columns.py)
+COLUMNS = "columns.bin"
 IMAGES = "images"
 SMALL_PICTURES = f"{IMAGES}/rows"  # of a sweep, in folders of a thousand
 PHOTOGRAPHS = f"{IMAGES}/photos"  # of the real thing, aligned with renderings
 ARTIFACTS = "artifacts"
-OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, to turn in a browser
+# what was attacked, before and after, to turn in a browser
+OBJECT_FILE = f"{ARTIFACTS}/object.glb"
 AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
 PARTS = "parts"  # runs that a study consists of
 
-ONLY_HERE = "only in Python"  # the note of parts that no file and no command can name: pairs of role and name
+# the note of parts that no file and no command can name: pairs of role and name
+ONLY_HERE = "only in Python"
 BEGUN_WITH = "settings"  # the note of settings that decide the run's numbers
 LONGEST_VALUE = 40  # characters of a value that an error states
 
@@ -61,11 +74,13 @@ CONTENTS = (
 
 @final
 class RunDirectory:
-    """The directory of one run, locked against other processes until `close`. Make one with `create`.
+    """The directory of one run, locked against other processes until `close`. Make one
+    with `create`.
 
-    Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory of a
-    new run is removed again, so that bad input leaves nothing behind. Where it was removed or renamed meanwhile, the
-    next write or the end of the block is a StorageError.
+    Used in a `with` block it is closed at the end; when the block raises before there
+    is any result, the directory of a new run is removed again, so that bad input leaves
+    nothing behind. Where it was removed or renamed meanwhile, the next write or the end
+    of the block is a StorageError.
     """
 
     def __init__(self, path: Path, held: RunLock) -> None:
@@ -84,19 +99,23 @@ class RunDirectory:
         overwrite: bool = False,
         default: str = "attack",
     ) -> RunDirectory:
-        """Make the directory of a new run, lock it, and write `run.yaml`, from which `advsearch run` repeats the run.
+        """Make the directory of a new run, lock it, and write `run.yaml`, from which
+        `advsearch run` repeats the run.
 
-        With `overwrite`, only a directory that advsearch wrote is touched, and in it only what advsearch writes.
+        With `overwrite`, only a directory that advsearch wrote is touched, and in it
+        only what advsearch writes.
 
         Args:
-            run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN`` with the next free number.
+            run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN``
+                with the next free number.
             config: what the run does; a run without it can't be repeated or resumed.
 
         Raises:
             RunExistsError: there is something already.
         """
         path = _numbered(default) if run is None else run_path(run)
-        check_there(path)  # or the folder of the study that it is a part of would be made
+        # or the folder of the study that it is a part of would be made
+        check_there(path)
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -128,8 +147,9 @@ class RunDirectory:
 
     @classmethod
     def of(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
-        """Open the directory of the run that `config` describes: a new one, or the one to go on with, as for
-        `find_run`."""
+        """Open the directory of the run that `config` describes: a new one, or the one
+        to go on with, as for `find_run`.
+        """
         log: str | None = getattr(config, "log", None)
         check_tracker(log)
         run = cls.create_for(config) if resumed is None else cls.resume(resumed, config)
@@ -139,14 +159,23 @@ class RunDirectory:
 
     @classmethod
     def create_for(cls, config: Config) -> RunDirectory:
-        """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
+        """Make the directory that `config` asks for, with its `run.yaml`; errors as for
+        `create`.
+        """
         (place, overwrite), (first, *others) = config.place, config.title
-        return cls.create(place, config=config, overwrite=overwrite, default=default_name(first, others))
+        return cls.create(
+            place,
+            config=config,
+            overwrite=overwrite,
+            default=default_name(first, others),
+        )
 
     @classmethod
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
-        """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
-        if another process works on it, or it would give other numbers than the run began with."""
+        """Open and lock the directory of a run, to go on with it by `config`, if
+        anything goes on; an InputError says if another process works on it, or it would
+        give other numbers than the run began with.
+        """
         check_there(run_path(run))
         path = find_run(run)
         check_links(path)
@@ -172,18 +201,29 @@ class RunDirectory:
         """Note what decides the numbers of a new run."""
         if config.only_here:
             self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
-        self.check_unchanged(summary.MADE_WITH, summary.made_with(_known_settings(config)))
-        self.check_unchanged(BEGUN_WITH, config.deciding())  # last: with it the others are there, too
+        self.check_unchanged(
+            summary.MADE_WITH, summary.made_with(_known_settings(config))
+        )
+        # last: with it the others are there, too
+        self.check_unchanged(BEGUN_WITH, config.deciding())
 
     def _check_same(self, config: Config) -> None:
-        """Refuse settings, versions and files that decide other numbers than those that are stored."""
-        if self.store.note(BEGUN_WITH) is None:  # it was killed before anything was noted
+        """Refuse settings, versions and files that decide other numbers than those that
+        are stored.
+        """
+        # it was killed before anything was noted
+        if self.store.note(BEGUN_WITH) is None:
             if self.store.count():
-                raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got none")
+                raise FileFormatError(
+                    f"{self.store.path}: expected the settings the "
+                    "run began with, got none"
+                )
             self._note_start(config)
             return
         read_again = {
-            name: value for name, value in _known_settings(config).items() if name not in summary.NOT_READ_AGAIN
+            name: value
+            for name, value in _known_settings(config).items()
+            if name not in summary.NOT_READ_AGAIN
         }
         self.check_unchanged(BEGUN_WITH, config.deciding())
         self.check_unchanged(summary.MADE_WITH, summary.made_with(read_again))
@@ -192,52 +232,64 @@ class RunDirectory:
         """Store facts that decide the numbers of the run under a note.
 
         Raises:
-            InputError: a fact is not what it was when it was stored first; the run can't go on.
+            InputError: a fact is not what it was when it was stored first; the run
+                can't go on.
         """
         stored = self.store.noted(note)
         before = {} if stored is None else stored
         if not isinstance(before, dict):
             got = type(before).__name__
             raise FileFormatError(
-                f"{self.store.path}: expected what the run began with in the note {note!r}, got {got}"
+                f"{self.store.path}: expected what the run began with in the note "
+                f"{note!r}, got {got}"
             )
         if changed := summary.changed_facts(before, facts):
             listed = ", ".join(_with_value(name, before.get(name)) for name in changed)
             raise InputError(
-                f"{self.path}: cannot resume with something else than the run began with: {listed}; restore it, or "
+                f"{self.path}: cannot resume with something else than the run began "
+                f"with: {listed}; restore it, or "
                 f"{self.again}"
             )
         if not facts.keys() <= before.keys():
             self.store.set_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
-        """Store the versions, files and weights that settings name; errors as for `check_unchanged`."""
+        """Store the versions, files and weights that settings name; errors as for
+        `check_unchanged`.
+        """
         facts = dict[str, str]()
         for values in used_settings:
             facts |= summary.made_with(values)
         self.check_unchanged(summary.MADE_WITH, facts)
 
     def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
-        """Add evaluated configurations to the results, and what the last of them told its search; they survive a kill
-        when this returns (see `store`)."""
+        """Add evaluated configurations to the results, and what the last of them told
+        its search; they survive a kill when this returns (see `store`).
+        """
         self.store.append(rows, told)
         if self._tracker is not None:
             self._tracker.rows(rows)
 
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
-        """Return the name of a file that settings name and that is another one than when a run was made, or None."""
+        """Return the name of a file that settings name and that is another one than
+        when a run was made, or None.
+        """
         return summary.changed_file(RunDirectory.read_made_with(run), config.plain())
 
     @staticmethod
     def read_made_with(run: Path) -> dict[str, object]:
-        """Return the versions and the digests of files and weights that a run was made with, as it noted them."""
+        """Return the versions and the digests of files and weights that a run was made
+        with, as it noted them.
+        """
         with store.Store.open_to_read(run) as results:
             noted = results.noted(summary.MADE_WITH)
         return noted if isinstance(noted, dict) else {}
 
     def record_row(self, kind: str, step: int, **columns: Any) -> None:
-        """Add one evaluated configuration to the results; `columns` are those of `store.Row`."""
+        """Add one evaluated configuration to the results; `columns` are those of
+        `store.Row`.
+        """
         self.record(store.Row(kind, step, **columns))
 
     @staticmethod
@@ -246,20 +298,29 @@ class RunDirectory:
         return run / PARTS / name
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
-        its path."""
+        """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB
+        in [0, 1], numpy or torch; return its path.
+        """
         return files.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by convention) and return its path."""
+        """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by
+        convention) and return its path.
+        """
         return files.write_exr(self.path / folder / f"{name}.exr", image)
 
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
-        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
-        return write_bytes(self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames))
+        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and
+        return its path.
+        """
+        return write_bytes(
+            self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames)
+        )
 
     def write_file(self, name: str, data: bytes) -> Path:
-        """Write a file of the run, whose name is relative to the run directory, and return its path."""
+        """Write a file of the run, whose name is relative to the run directory, and
+        return its path.
+        """
         return write_bytes(self.path / name, data)
 
     def write_summary(self, result: Result) -> Path:
@@ -278,7 +339,9 @@ class RunDirectory:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing in it to lose: no result, part, row or answer that was paid for."""
+        """Whether there is nothing in it to lose: no result, part, row or answer that
+        was paid for.
+        """
         has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
         return not has_files and self.store.count() == 0 and not self.store.has_answers
 
@@ -296,7 +359,10 @@ class RunDirectory:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if error is None:
             try:
@@ -312,10 +378,12 @@ class RunDirectory:
 
 @contextmanager
 def begun(config: Config) -> Iterator[Path | None]:
-    """Make the folder of a new run before anything else is done, so that whatever ends the block can be gone on with.
+    """Make the folder of a new run before anything else is done, so that whatever ends
+    the block can be gone on with.
 
-    Yields its path, closed again: what the block does goes on with it. Where the block raises before anything was
-    evaluated, nothing is left of it. It is None for a run that takes the place of another one, which stays until then.
+    Yields its path, closed again: what the block does goes on with it. Where the block
+    raises before anything was evaluated, nothing is left of it. It is None for a run
+    that takes the place of another one, which stays until then.
     """
     place, overwrite = config.place
     if overwrite and place is not None and is_run(run_path(place)):
@@ -338,14 +406,20 @@ def begun(config: Config) -> Iterator[Path | None]:
 
 
 def default_name(object_name: str, controls: Iterable[str]) -> str:
-    """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control ``texture``: a safe name."""
+    """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control
+    ``texture``: a safe name.
+    """
     words = [Path(object_name).stem, *controls]
-    return re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
+    return (
+        re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
+    )
 
 
 def check_links(run: Path) -> None:
-    """Check that what a run's folder has is its own, as `check_no_links`. Small pictures, of which there may be a
-    million, are checked as each is read (`viewer.thumbnails`). Raises FileFormatError."""
+    """Check that what a run's folder has is its own, as `check_no_links`. Small
+    pictures, of which there may be a million, are checked as each is read
+    (`viewer.thumbnails`). Raises FileFormatError.
+    """
     check_no_links(run, CONTENTS, SMALL_PICTURES)
 
 
@@ -357,15 +431,19 @@ def run_path(run: str | Path) -> Path:
 
 
 def typed_name(path: str | Path) -> str:
-    """Return what a user types to name the run in a folder: its name in `HOME`, or its path."""
+    """Return what a user types to name the run in a folder: its name in `HOME`, or its
+    path.
+    """
     path = Path(path)
     return path.name if path.parent == HOME else str(path)
 
 
 def find_run(run: str | Path, *, checked: bool = True) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml). Raises
-    UnknownNameError where there is none, and, unless it is not `checked`, as it must be before anything in it is read,
-    FileFormatError where it has links in it (`check_links`)."""
+    """Return the directory of an existing run, called by name or by path (of the
+    directory, or of its run.yaml). Raises UnknownNameError where there is none, and,
+    unless it is not `checked`, as it must be before anything in it is read,
+    FileFormatError where it has links in it (`check_links`).
+    """
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
@@ -373,21 +451,31 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
                 check_links(folder)
             return folder
     known = (path.name for path in HOME.glob("*") if is_run(path))
-    raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
+    raise UnknownNameError(
+        "run", str(run), known, "Give a name in runs/ or the path of a run's folder."
+    )
 
 
 def read_python_only(path: Path) -> list[PythonOnly]:
-    """Return the parts of a run that existed only in the Python session that made it."""
+    """Return the parts of a run that existed only in the Python session that made
+    it.
+    """
     if not (path / store.NAME).is_file():
         return []
     with store.Store(path / store.NAME, read_only=True) as results:
         noted = results.noted(ONLY_HERE)
     pairs = noted if isinstance(noted, list) else []
-    return [PythonOnly(str(pair[0]), str(pair[1])) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
+    return [
+        PythonOnly(str(pair[0]), str(pair[1]))
+        for pair in pairs
+        if isinstance(pair, list) and len(pair) == 2
+    ]
 
 
 def is_run(path: Path) -> bool:
-    """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
+    """Return whether advsearch wrote the directory: by the header of its `run.yaml` or
+    of its `results.sqlite`.
+    """
     if files.is_results_database(path / store.NAME):
         return True
     if os.path.islink(path / CONFIG):
@@ -400,27 +488,45 @@ def is_run(path: Path) -> bool:
 
 
 def check_free(run: str | Path, *, overwrite: bool = False) -> None:
-    """Check that a run may be put at `run`, or raise RunExistsError; call it before any long work."""
+    """Check that a run may be put at `run`, or raise RunExistsError; call it before any
+    long work.
+    """
     path = run_path(run)
     if "\0" in str(path):
-        raise InputError(f"expected a name or a folder for the run, got {str(path)!r} with a zero byte in it")
+        raise InputError(
+            f"expected a name or a folder for the run, got {str(path)!r} "
+            "with a zero byte in it"
+        )
     if os.path.exists(path) and not path.is_dir():
-        raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with `run`")
+        raise RunExistsError(
+            f"{path}: expected a folder for the run, got a file; "
+            "choose another name with `run`"
+        )
     with storage_errors(path):
         bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
     if bare:
         return
     if not is_run(path):
-        raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with `run`")
+        raise RunExistsError(
+            f"{path}: the folder is not empty and not a run; choose "
+            "another name with `run`"
+        )
     if not overwrite:
-        raise RunExistsError(f"{path}: the run exists already; add `overwrite=True` or choose another name with `run`")
+        raise RunExistsError(
+            f"{path}: the run exists already; add `overwrite=True` or "
+            "choose another name with `run`"
+        )
 
 
 def _numbered(default: str) -> Path:
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
         HOME.mkdir(parents=True, exist_ok=True)
-        taken = [int(found[1]) for path in HOME.iterdir() if (found := pattern.fullmatch(path.name))]
+        taken = [
+            int(found[1])
+            for path in HOME.iterdir()
+            if (found := pattern.fullmatch(path.name))
+        ]
         for number in itertools.count(max(taken, default=0) + 1):
             path = HOME / f"{default}-{number:03d}"
             try:
@@ -449,11 +555,15 @@ def _known_settings(config: Config) -> dict[str, Any]:
 def _with_value(name: str, value: object) -> str:
     """Return a name with the value that it had, where that is short."""
     text = shown(value)
-    return name if value is None or len(text) > LONGEST_VALUE else f"{name} (was {text})"
+    return (
+        name if value is None or len(text) > LONGEST_VALUE else f"{name} (was {text})"
+    )
 
 
 def _is_leftover(path: Path) -> bool:
-    """Whether it is what a kill leaves before there is a run: the lock, or a part of a file."""
+    """Whether it is what a kill leaves before there is a run: the lock, or a part of a
+    file.
+    """
     return path.name == LOCK or path.name.startswith(PART)
 
 

@@ -1,6 +1,9 @@
-"""A run's rows for other programs: as a table (CSV, JSON, Parquet), a line for each, with a column for each metric and
-each value, its unit in the name: ``pose.yaw [degrees]``, ``camera.target[0]`` (docs/runs.md); and as folders of 3DB
-(Leclerc et al. 2021): `details.log`, a JSON object a line, `class_maps.json`, and ``images/<id>_rgb.png``."""
+"""A run's rows for other programs: as a table (CSV, JSON, Parquet), a line for each,
+with a column for each metric and each value, its unit in the name: ``pose.yaw
+[degrees]``, ``camera.target[0]`` (docs/runs.md); and as folders of 3DB (Leclerc et al.
+2021): `details.log`, a JSON object a line, `class_maps.json`, and
+``images/<id>_rgb.png``.
+"""
 
 from __future__ import annotations
 
@@ -24,16 +27,36 @@ from advsearch.trust.writing import placed_by, replacing
 FORMATS = ("csv", "json", "parquet")
 PAYLOAD = "payload"
 OWN = (
-    *("id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin"),
+    *(
+        "id",
+        "kind",
+        "step",
+        "phase",
+        "seed",
+        "spp",
+        "objective",
+        "score",
+        "success",
+        "correct",
+        "margin",
+    ),
     *("label", "label_index", "probability", PAYLOAD),
 )
-AFTER = ("renders", "machine", "seconds", "time")  # columns of the store before and after the values
+# columns of the store before and after the values
+AFTER = ("renders", "machine", "seconds", "time")
 GROUP = 8192  # rows of a Parquet row group, and so what is held in memory at once
 
 
-def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
-    """Write the rows, or those of one kind, whole or not at all to a file, or to a stream, and return how many there
-    were."""
+def write_rows(
+    store: Store,
+    format: str,
+    out: Path | None,
+    stream: IO[bytes],
+    kind: str | None = None,
+) -> int:
+    """Write the rows, or those of one kind, whole or not at all to a file, or to a
+    stream, and return how many there were.
+    """
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
     counts = store.counts()
@@ -50,8 +73,11 @@ def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], k
 
 
 def as_columns(rows: Iterable[Row]) -> list[str]:
-    """Return the columns of a table of these rows; metrics and values in the order in which they first occur."""
-    metrics, seen = dict[str, None](), dict[str, None]()
+    """Return the columns of a table of these rows; metrics and values in the order in
+    which they first occur.
+    """
+    metrics = dict[str, None]()
+    seen = dict[str, None]()
     for row in rows:
         metrics |= dict.fromkeys(row.metrics)
         seen |= dict.fromkeys(_values(row.values))
@@ -59,23 +85,40 @@ def as_columns(rows: Iterable[Row]) -> list[str]:
 
 
 def as_record(row: Row) -> JsonObject:
-    own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
+    own = {
+        one.name: getattr(row, one.name)
+        for one in fields(row)
+        if one.name not in ("values", "metrics")
+    }
     return own | dict(row.metrics) | _values(row.values)
 
 
-def each_value(values: Mapping[str, Value | JsonValue]) -> Iterator[tuple[str, JsonValue, str]]:
-    """Yield values by name with their units; of several numbers each, as ``camera.target[0]``."""
+def each_value(
+    values: Mapping[str, Value | JsonValue],
+) -> Iterator[tuple[str, JsonValue, str]]:
+    """Yield values by name with their units; of several numbers each, as
+    ``camera.target[0]``.
+    """
     for name, told in values.items():
-        value, unit = (told.get("value"), told.get("unit")) if isinstance(told, Mapping) else (told, None)
+        value, unit = (
+            (told.get("value"), told.get("unit"))
+            if isinstance(told, Mapping)
+            else (told, None)
+        )
         unit = str(unit or "")
         if isinstance(value, (list, tuple)):
-            yield from ((f"{name}[{number}]", inner, unit) for number, inner in enumerate(value))
+            yield from (
+                (f"{name}[{number}]", inner, unit) for number, inner in enumerate(value)
+            )
         else:
             yield name, value, unit
 
 
 def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
-    return {f"{name} [{unit}]" if unit else name: value for name, value, unit in each_value(values)}
+    return {
+        f"{name} [{unit}]" if unit else name: value
+        for name, value, unit in each_value(values)
+    }
 
 
 def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
@@ -83,69 +126,118 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
     for record in map(_flat, records):
-        writer.writerow({name: int(value) if isinstance(value, bool) else value for name, value in record.items()})
+        writer.writerow(
+            {
+                name: int(value) if isinstance(value, bool) else value
+                for name, value in record.items()
+            }
+        )
     text.detach()
 
 
 def _flat(record: JsonObject) -> JsonObject:
     payload = record[PAYLOAD]
-    return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
+    return (
+        record
+        if payload is None
+        else {
+            **record,
+            PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False),
+        }
+    )
 
 
 def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     stream.write(b"[")
     for number, one in enumerate(records):
-        line = json.dumps({name: one.get(name) for name in names}, allow_nan=False, ensure_ascii=False)
+        line = json.dumps(
+            {name: one.get(name) for name in names}, allow_nan=False, ensure_ascii=False
+        )
         stream.write((",\n " if number else "\n ").encode() + line.encode())
     stream.write(b"\n]\n")
 
 
-def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
+def _parquet(
+    records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
+) -> None:
     try:
         # comes with the extra `parquet`
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError("format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
+        raise InputError(
+            "format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"
+        ) from None
     rows = map(_flat, records)
     first = list(itertools.islice(rows, GROUP))
-    arrow = {"str": pyarrow.string(), "bool": pyarrow.bool_(), "int": pyarrow.int64(), "float": pyarrow.float64()}
-    kinds = {one.name: arrow.get(str(one.type).partition(" ")[0], arrow["str"]) for one in fields(Row)}
+    arrow = {
+        "str": pyarrow.string(),
+        "bool": pyarrow.bool_(),
+        "int": pyarrow.int64(),
+        "float": pyarrow.float64(),
+    }
+    kinds = {
+        one.name: arrow.get(str(one.type).partition(" ")[0], arrow["str"])
+        for one in fields(Row)
+    }
     for name in set(names) - {*OWN, *AFTER}:
-        kinds[name] = arrow["str" if any(isinstance(record.get(name), str) for record in first) else "float"]
+        kinds[name] = arrow[
+            "str"
+            if any(isinstance(record.get(name), str) for record in first)
+            else "float"
+        ]
     schema = pyarrow.schema([(name, kinds[name]) for name in names])
     with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
         while first:
             columns: dict[str, list[Any]] = {}
             for name, kind in zip(names, schema.types, strict=True):
-                made: Any = str if kind == pyarrow.string() else float if kind == pyarrow.float64() else None
+                made: Any = (
+                    str
+                    if kind == pyarrow.string()
+                    else float
+                    if kind == pyarrow.float64()
+                    else None
+                )
                 values = [record.get(name) for record in first]
-                columns[name] = [made(value) if made and value is not None else value for value in values]
+                columns[name] = [
+                    made(value) if made and value is not None else value
+                    for value in values
+                ]
             writer.write_table(pyarrow.table(columns, schema))
             first = list(itertools.islice(rows, GROUP))
 
 
-DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
+DETAILS = "details.log"
+CLASSES = "class_maps.json"
+IMAGES = "images"
 LARGEST = 4 << 30
 LONGEST = 1 << 20  # most bytes of one of its lines
 MOST_CLASSES = 16 << 20  # most bytes of a `class_maps.json`
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
-    """Yield each line of such a folder as a row of a sweep, and the file of its picture, if there is one; a
-    FileFormatError names the line that is not what it should be."""
+    """Yield each line of such a folder as a row of a sweep, and the file of its
+    picture, if there is one; a FileFormatError names the line that is not what it
+    should be.
+    """
     try:
-        classes = parse_json(read_text(folder / CLASSES, "the classes of 3DB", MOST_CLASSES))
+        classes = parse_json(
+            read_text(folder / CLASSES, "the classes of 3DB", MOST_CLASSES)
+        )
         if not isinstance(classes, list):
             raise ValueError(type(classes).__name__)
     except FileNotFoundError:
         classes = []
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"{folder / CLASSES}: expected a list of names, got {error}") from None
+        raise FileFormatError(
+            f"{folder / CLASSES}: expected a list of names, got {error}"
+        ) from None
     try:
         file = open_regular(folder / DETAILS, "the log of 3DB", LARGEST)
     except OSError as error:
-        raise FileFormatError(f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}") from None
+        raise FileFormatError(
+            f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
+        ) from None
     with file:
         for number in range(1 << 62):
             line = file.readline(LONGEST + 1)
@@ -157,30 +249,54 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
                 yield _imported(folder, number, line, list(map(str, classes)))
 
 
-def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) -> tuple[Row, Path | None]:
+def _imported(
+    folder: Path, number: int, line: bytes, classes: Sequence[str]
+) -> tuple[Row, Path | None]:
     try:
         told = parse_json(line.decode())
     except ValueError as error:
         raise _wrong(folder, number, str(error)) from None
     if not isinstance(told, dict) or not isinstance(told.get("render_args"), dict):
         raise _wrong(folder, number, "a line without render_args")
-    values: dict[str, Value] = {"object": _value(told.get("model")), "environment": _value(told.get("environment"))}
+    values: dict[str, Value] = {
+        "object": _value(told.get("model")),
+        "environment": _value(told.get("environment")),
+    }
     for name, value in told["render_args"].items():
         if isinstance(value, list):
-            values |= {f"{name}[{place}]": _value(inner) for place, inner in enumerate(value)}
+            values |= {
+                f"{name}[{place}]": _value(inner) for place, inner in enumerate(value)
+            }
         else:
             values["model" if name == "network" else name] = _value(value)
     prediction = told.get("prediction")
     first = prediction[0] if isinstance(prediction, list) and prediction else prediction
     index = int(first) if _is_number(first) else None
-    label = classes[index] if index is not None and 0 <= index < len(classes) else "" if index is None else str(index)
+    label = (
+        classes[index]
+        if index is not None and 0 <= index < len(classes)
+        else ""
+        if index is None
+        else str(index)
+    )
     loss = told.get("loss")
     margin = 0.0 - loss if isinstance(loss, (int, float)) else None
     right = str(told.get("is_correct")) == "True"
-    row = Row("sweep", number, correct=right, margin=margin, label=label, label_index=index, values=values)
+    row = Row(
+        "sweep",
+        number,
+        correct=right,
+        margin=margin,
+        label=label,
+        label_index=index,
+        values=values,
+    )
     picture = folder / IMAGES / f"{told.get('id')}_rgb.png"
     safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", str(told.get("id")))
-    return row, picture if safe and picture.is_file() and not picture.is_symlink() else None
+    return (
+        row,
+        picture if safe and picture.is_file() and not picture.is_symlink() else None,
+    )
 
 
 def _is_number(value: JsonValue) -> TypeGuard[int | float]:
@@ -192,4 +308,7 @@ def _value(value: JsonValue) -> Value:
 
 
 def _wrong(folder: Path, number: int, got: str) -> FileFormatError:
-    return FileFormatError(f"{folder / DETAILS}: line {number + 1}: expected a line of 3DB's log, got {got[:120]}")
+    return FileFormatError(
+        f"{folder / DETAILS}: line {number + 1}: expected a line of "
+        f"3DB's log, got {got[:120]}"
+    )

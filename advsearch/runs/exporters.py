@@ -1,4 +1,5 @@
-"""Exporters: what writes a run in another format, by the word of `advsearch export --format`.
+"""Exporters: what writes a run in another format, by the word of `advsearch export
+--format`.
 
 A package outside adds its own (docs/extending.md).
 """
@@ -35,7 +36,8 @@ class Exporter(ABC):
         name: the word of `--format`.
         writes: what the name after `--out` is of: "a PDF file".
         example: a command line without `advsearch` in front.
-        suffix: of files that are of this format if no other is requested, without the dot; by default the name.
+        suffix: of files that are of this format if no other is requested, without the
+            dot; by default the name.
         options: flags of `advsearch export` that belong to it: "size".
     """
 
@@ -47,7 +49,9 @@ class Exporter(ABC):
     write_png = staticmethod(write_png)
 
     @abstractmethod
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         """Write a run. What libraries print meanwhile does not reach standard output.
 
         Args:
@@ -65,6 +69,8 @@ EXPORTERS: Registry[type[Exporter]] = Registry(
     "advsearch.exporters",
     list_built_ins("exporter"),
     "a subclass of Exporter whose name is that of the entry point",
-    lambda name, entry: isinstance(entry, type) and issubclass(entry, Exporter) and entry.name == name,
+    lambda name, entry: (
+        isinstance(entry, type) and issubclass(entry, Exporter) and entry.name == name
+    ),
 )
 """Every exporter by its word, imported when it is used."""

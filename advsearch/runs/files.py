@@ -1,4 +1,6 @@
-"""The files of a run: `results.sqlite`, its tables and how it is opened, and pictures."""
+"""The files of a run: `results.sqlite`, its tables and how it is opened, and
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,12 @@ from advsearch.trust.databases import (
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replacing, storage_errors, write_bytes
 
-APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
+# in the header of every results.sqlite that is ours: "ADVS"
+APPLICATION_ID = 0x41445653
 VERSION = 10
-"""Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
+"""Of the tables; in the header of the file. Files of another version are read by the
+advsearch that wrote them.
+"""
 
 SCHEMA = f"""
     -- How this file came to be; times are UTC.
@@ -80,7 +85,9 @@ SCHEMA = f"""
 
 
 def is_results_database(path: Path) -> bool:
-    """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
+    """Return whether the file at `path` starts like a results.sqlite of advsearch; a
+    link does not.
+    """
     if os.path.islink(path):
         return False
     try:
@@ -88,17 +95,22 @@ def is_results_database(path: Path) -> bool:
             header = file.read(72)
     except (OSError, FileFormatError):
         return False
-    return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
+    return header[:15] == b"SQLite format 3" and header[
+        68:72
+    ] == APPLICATION_ID.to_bytes(4, "big")
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open the file for writing; where there is none, it is made with its tables in one step."""
+    """Open the file for writing; where there is none, it is made with its tables in one
+    step.
+    """
     check_before_writing(path)
     if not path.exists():
         with replacing(path) as part, closing(sqlite3.connect(part)) as db:
             # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
-            db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
+            # before the log, so that the file itself has it
+            db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             db.execute("PRAGMA journal_mode = WAL")
             db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
     with storage_errors(path):
@@ -108,55 +120,83 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> None:
-    """Refuse, by a FileFormatError, a file of another version, and say which advsearch reads it."""
-    version, day = read_version(db), ""
+    """Refuse, by a FileFormatError, a file of another version, and say which advsearch
+    reads it.
+    """
+    version = read_version(db)
+    day = ""
     if version == VERSION:
         return
     with suppress(sqlite3.Error):
         created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
         day = f", that of {str(created[0])[:10]}" if created else ""
     db.close()
-    advice = f"read it with the advsearch that wrote it{day}" if version else "it is not a finished results.sqlite"
-    raise FileFormatError(f"{path}: expected version {VERSION} of the results, got {version}; {advice}")
+    advice = (
+        f"read it with the advsearch that wrote it{day}"
+        if version
+        else "it is not a finished results.sqlite"
+    )
+    raise FileFormatError(
+        f"{path}: expected version {VERSION} of the results, got {version}; {advice}"
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB values, rounded as
-# verification rounds them, so that the file is exactly what was classified; EXR in float32; an animation of the search.
+# Pictures of a run, (H, W, 3) or (H, W), of numpy or torch, as files: 8-bit PNG of sRGB
+# values, rounded as verification rounds them, so that the file is exactly what was
+# classified; EXR in float32; an animation of the search.
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 
 BAD_PICTURE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
-"""What Pillow raises of a file that is no picture, a damaged one or one that is far too large."""
+"""What Pillow raises of a file that is no picture, a damaged one or one that is far too
+large.
+"""
 
 DIFFERENCE_GAIN = 5.0
 ANIMATION_BYTES = 3_000_000
-ANIMATION_FRAMES = 60  # most frames of an animation; of more, every second, third, ... is shown, and always the last
-ANIMATION_SIDE = 320  # longest side of an animation in pixels; larger pictures are averaged down
+# most frames of an animation; of more, every second, third, ... is shown, and always
+# the last
+ANIMATION_FRAMES = 60
+# longest side of an animation in pixels; larger pictures are averaged down
+ANIMATION_SIDE = 320
 _PALETTE_PIXELS = 200_000
-FRAME_MS, LAST_FRAME_MS = 100, 2500
+FRAME_MS = 100
+LAST_FRAME_MS = 2500
 
 
 def to_8bit(image: Any) -> Bytes:
-    """Return ``round(255 clip(image, 0, 1))`` in float32 with halves to even; NaN becomes 0."""
-    scaled: Floats = np.clip(np.nan_to_num(_floats(image), nan=0.0), 0.0, 1.0) * np.float32(255.0)
+    """Return ``round(255 clip(image, 0, 1))`` in float32 with halves to even; NaN
+    becomes 0.
+    """
+    scaled: Floats = np.clip(
+        np.nan_to_num(_floats(image), nan=0.0), 0.0, 1.0
+    ) * np.float32(255.0)
     return np.rint(scaled).astype(np.uint8)
 
 
 def difference(before: Any, after: Any, gain: float = DIFFERENCE_GAIN) -> Floats:
-    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing changed."""
-    moved: Floats = np.float32(0.5) + np.float32(gain) * (_floats(after) - _floats(before))
+    """Return ``0.5 + gain (after - before)`` clipped to [0, 1]: mid grey where nothing
+    changed.
+    """
+    moved: Floats = np.float32(0.5) + np.float32(gain) * (
+        _floats(after) - _floats(before)
+    )
     return np.clip(moved, 0.0, 1.0)
 
 
 def png_bytes(image: Any) -> bytes:
-    """Return the display-referred picture as an 8-bit PNG; equal pictures give equal bytes."""
+    """Return the display-referred picture as an 8-bit PNG; equal pictures give equal
+    bytes.
+    """
     return png_of(_picture(to_8bit(image)))
 
 
 def smaller_png(data: bytes, side: int) -> bytes:
-    """Return the picture of a PNG as a PNG whose longest side is at most `side` pixels."""
+    """Return the picture of a PNG as a PNG whose longest side is at most `side`
+    pixels.
+    """
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
         image.thumbnail((side, side))
@@ -165,7 +205,9 @@ def smaller_png(data: bytes, side: int) -> bytes:
 
 
 def write_png(path: Path, image: Any) -> Path:
-    """Write the display-referred picture as an 8-bit PNG, whole or not at all, and return the path."""
+    """Write the display-referred picture as an 8-bit PNG, whole or not at all, and
+    return the path.
+    """
     return write_bytes(path, png_bytes(image))
 
 
@@ -173,34 +215,50 @@ def read_png(path: Path) -> Floats:
     """Return the display-referred picture, (H, W, 3) in [0, 1], in a PNG."""
     try:
         with Image.open(path, formats=("PNG",)) as image:
-            values: Floats = np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+            values: Floats = np.asarray(
+                image.convert("RGB"), dtype=np.float32
+            ) / np.float32(255.0)
             return values
     except BAD_PICTURE as error:
         raise FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
 
 
 def write_exr(path: Path, image: Any) -> Path:
-    """Write float32 values as an EXR (scan lines, ZIP), whole or not at all, and return the path."""
+    """Write float32 values as an EXR (scan lines, ZIP), whole or not at all, and return
+    the path.
+    """
     values = np.ascontiguousarray(_picture(_floats(image)))
     return _write_exr(path, {"Y" if values.ndim == 2 else "RGB": values}, {})
 
 
-def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
-    """Write channels (H, W) by name, such as ``normal.X``, as one EXR, whole or not at all, and return the path:
-    numbers in float32, whole numbers as 32 bits, and notes on what they mean as attributes of the file."""
+def write_layers(
+    path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]
+) -> Path:
+    """Write channels (H, W) by name, such as ``normal.X``, as one EXR, whole or not at
+    all, and return the path: numbers in float32, whole numbers as 32 bits, and notes on
+    what they mean as attributes of the file.
+    """
     channels = {}
     for name, layer in layers.items():
         values = layer.numpy() if hasattr(layer, "numpy") else np.asarray(layer)
         whole = values.dtype.kind in "iu"
-        channels[name] = np.ascontiguousarray(values.astype(np.uint32 if whole else np.float32))
+        channels[name] = np.ascontiguousarray(
+            values.astype(np.uint32 if whole else np.float32)
+        )
     return _write_exr(path, channels, notes)
 
 
-def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
+def _write_exr(
+    path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
+) -> Path:
     # late: OpenEXR takes long to import
     import OpenEXR
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **notes}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        **notes,
+    }
     with replacing(path) as part:
         try:
             with OpenEXR.File(header, dict(channels)) as file:
@@ -212,14 +270,24 @@ def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
 
 
 def animation_bytes(frames: Sequence[Any]) -> bytes:
-    """Return the display-referred pictures as a GIF that repeats, holds its last frame and is at most 3 MB."""
-    count, shrink = min(len(frames), ANIMATION_FRAMES), 1
+    """Return the display-referred pictures as a GIF that repeats, holds its last frame
+    and is at most 3 MB.
+    """
+    count = min(len(frames), ANIMATION_FRAMES)
+    shrink = 1
     while True:
-        chosen = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)  # the first and the last among them
-        pictures = [Image.fromarray(_picture(to_8bit(frames[place]))) for place in chosen]
+        # the first and the last among them
+        chosen = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
+        pictures = [
+            Image.fromarray(_picture(to_8bit(frames[place]))) for place in chosen
+        ]
         block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
-        width, height = (side - side % block if side > block else side for side in pictures[0].size)
-        pictures = [picture.reduce(block, (0, 0, width, height)) for picture in pictures]
+        width, height = (
+            side - side % block if side > block else side for side in pictures[0].size
+        )
+        pictures = [
+            picture.reduce(block, (0, 0, width, height)) for picture in pictures
+        ]
         data = _gif(pictures)
         if len(data) <= ANIMATION_BYTES or min(pictures[0].size) < 16:
             return data
@@ -234,10 +302,23 @@ def _gif(pictures: Sequence[Image.Image]) -> bytes:
     pixels = np.concatenate([np.asarray(picture) for picture in pictures])
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    several, buffer = len(frames) > 1, io.BytesIO()
-    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS] if several else LAST_FRAME_MS
-    frames[0].save(buffer, "GIF", loop=0, duration=durations, save_all=several, append_images=frames[1:])
+    frames = [
+        picture.quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in pictures
+    ]
+    several = len(frames) > 1
+    buffer = io.BytesIO()
+    durations = (
+        [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS] if several else LAST_FRAME_MS
+    )
+    frames[0].save(
+        buffer,
+        "GIF",
+        loop=0,
+        duration=durations,
+        save_all=several,
+        append_images=frames[1:],
+    )
     return buffer.getvalue()
 
 
@@ -245,9 +326,13 @@ def _picture(array: Any) -> Any:
     """Return (H, W, 3) or (H, W); one channel loses its axis."""
     squeezed = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
-        raise ValueError(f"expected a picture of shape (H, W, 3) or (H, W), got {tuple(array.shape)}")
+        raise ValueError(
+            f"expected a picture of shape (H, W, 3) or (H, W), got {tuple(array.shape)}"
+        )
     return squeezed
 
 
 def _floats(image: Any) -> Floats:
-    return np.asarray(image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32)
+    return np.asarray(
+        image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32
+    )

@@ -20,10 +20,12 @@ FAULT = "it cannot be read, which is a fault of advsearch"
 
 @dataclass(frozen=True)
 class Listed:
-    """One run in its folder: the command that made it, what the model should recognise, what could change, rows by
-    kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the result
-    in a few words; whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if known; and what
-    is wrong with it, empty where nothing is."""
+    """One run in its folder: the command that made it, what the model should recognise,
+    what could change, rows by kind; ``"running"`` where a process works on it,
+    ``"stopped"`` where it can be resumed, else its ending; the result in a few words;
+    whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if
+    known; and what is wrong with it, empty where nothing is.
+    """
 
     name: str
     path: str
@@ -40,14 +42,22 @@ class Listed:
 
 
 def listed_runs(folder: Path) -> list[Listed]:
-    """Return the runs in a folder, by name; what cannot be read is shown as far as it can."""
+    """Return the runs in a folder, by name; what cannot be read is shown as far as it
+    can.
+    """
     if not folder.is_dir():
         return []
-    return [listed_run(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
+    return [
+        listed_run(path)
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and is_run(path)
+    ]
 
 
 def finished(path: Path) -> bool:
-    """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
+    """Whether a run has come to its end; one that was interrupted, or killed while its
+    report was written, has not.
+    """
     if not (path / summary.NAME).is_file() or summary.read_result(path).goes_on:
         return False
     return not files.is_results_database(path / store.NAME) or not can_resume(path)
@@ -62,19 +72,32 @@ _LISTED: dict[tuple[str, bool], tuple[object, Listed]] = {}
 
 
 def listed_run(path: Path, *, counts: bool = True) -> Listed:
-    """Return the run in a folder; what cannot be read is shown as far as it can, and `fault` says why. To count rows
-    takes a second for a million. A run is read again where its files have changed, or a process works on it."""
+    """Return the run in a folder; what cannot be read is shown as far as it can, and
+    `fault` says why. To count rows takes a second for a million. A run is read again
+    where its files have changed, or a process works on it.
+    """
     running = is_held(path)
-    read = [path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")]
-    key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, read))
+    read = [
+        path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
+    ]
+    key = (os.path.abspath(path), counts)
+    state = (str(path), running, *map(_state, read))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
         faults: list[str] = []
         try:
             check_links(path)
             listed = _as_far_as_read(path, counts, running, faults)
-        except Exception as error:  # whatever is wrong with one run, the others are listed
-            faults.append(str(error) if isinstance(error, AdvsearchError) else f"{FAULT}: {type(error).__name__}")
-            listed = Listed(path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None)
+        except (
+            Exception
+        ) as error:  # whatever is wrong with one run, the others are listed
+            faults.append(
+                str(error)
+                if isinstance(error, AdvsearchError)
+                else f"{FAULT}: {type(error).__name__}"
+            )
+            listed = Listed(
+                path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None
+            )
         _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
     return _LISTED[key][1]
 
@@ -87,7 +110,9 @@ def _state(path: Path) -> object:
     return None
 
 
-def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) -> Listed:
+def _as_far_as_read(
+    path: Path, counts: bool, running: bool, faults: list[str]
+) -> Listed:
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -96,11 +121,20 @@ def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) 
     with _told(faults, path / summary.NAME):
         result = summary.read_result(path)
     if counts:
-        with _told(faults, path / store.NAME), store.Store(path / store.NAME, read_only=True) as results:
+        with (
+            _told(faults, path / store.NAME),
+            store.Store(path / store.NAME, read_only=True) as results,
+        ):
             kinds = results.counts()
-    object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
+    object_name = getattr(result, "object", None) or ",".join(
+        getattr(result, "objects", ())
+    )
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
-    ending = "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))
+    ending = (
+        "stopped"
+        if result is None or result.goes_on
+        else str(getattr(result, "ending", "done"))
+    )
     return Listed(
         path.name, str(path), command=str(config.get("command") or (result.command if result else "?")),
         object=str(config.get("object") or object_name or ("" if config else "?")),

@@ -1,4 +1,6 @@
-"""Measurements of a run that may be stopped: each is stored at once under a key, and is not made again."""
+"""Measurements of a run that may be stopped: each is stored at once under a key, and is
+not made again.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,11 @@ class OutOfTime(Exception):
 
 
 class Measurements:
-    """What a run has measured, in its store; measures what is not there, until the time is up.
+    """What a run has measured, in its store; measures what is not there, until the time
+    is up.
 
-    One measurement is always made, so that a run gets on. What is stored is read back before the first one.
+    One measurement is always made, so that a run gets on. What is stored is read back
+    before the first one.
 
     Attributes:
         made: how many were made in this sitting.
@@ -41,7 +45,9 @@ class Measurements:
         self.made = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
+        """Return the JSON value that is stored under a key, or what `measure` returns
+        in time, and store it.
+        """
         stored = self.stored(key)
         if stored is None:
             if self.made and time.monotonic() >= self._end:
@@ -51,15 +57,27 @@ class Measurements:
             self.put(key, stored)
         return stored
 
-    def get_row(self, key: str, row_type: type[AnyFields], measure: Callable[[], AnyFields]) -> AnyFields:
-        """Return the fields that `measure` returns, or those that are stored; otherwise as `get`."""
+    def get_row(
+        self, key: str, row_type: type[AnyFields], measure: Callable[[], AnyFields]
+    ) -> AnyFields:
+        """Return the fields that `measure` returns, or those that are stored; otherwise
+        as `get`.
+        """
         return row_type.of(self.get(key, lambda: measure().to_dict()))
 
     def get_rows(
-        self, key: str, row_type: type[AnyFields], measure: Callable[[], Sequence[AnyFields]]
+        self,
+        key: str,
+        row_type: type[AnyFields],
+        measure: Callable[[], Sequence[AnyFields]],
     ) -> list[AnyFields]:
-        """Return the rows that `measure` returns, or those that are stored; otherwise as `get`."""
-        return [row_type.of(row) for row in self.get(key, lambda: [row.to_dict() for row in measure()])]
+        """Return the rows that `measure` returns, or those that are stored; otherwise
+        as `get`.
+        """
+        return [
+            row_type.of(row)
+            for row in self.get(key, lambda: [row.to_dict() for row in measure()])
+        ]
 
     def put(self, key: str, value: Any) -> None:
         self._store.set_note(key, json.dumps(value))
@@ -67,11 +85,15 @@ class Measurements:
     def stored(self, key: str) -> Any:
         return self._store.noted(key)
 
-    def collect(self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]) -> AnyResult:
-        """Take rows until they end, the time is up or there is an interrupt, and return the result of those.
+    def collect(
+        self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
+    ) -> AnyResult:
+        """Take rows until they end, the time is up or there is an interrupt, and return
+        the result of those.
 
-        After each new row the summary is written, so that a kill leaves it. The summary never has fewer rows than an
-        earlier sitting left in it: those are read back first.
+        After each new row the summary is written, so that a kill leaves it. The summary
+        never has fewer rows than an earlier sitting left in it: those are read back
+        first.
         """
         context = self._context
         taken: list[Row] = []
@@ -88,7 +110,11 @@ class Measurements:
         except OutOfTime:
             context.ending = OUT_OF_TIME
         result = make_result(taken)
-        if context.ending == INTERRUPTED and not self.made and (context.run.path / NAME).is_file():
+        if (
+            context.ending == INTERRUPTED
+            and not self.made
+            and (context.run.path / NAME).is_file()
+        ):
             earlier = stored_result(context.run.path)
             return earlier if isinstance(earlier, type(result)) else result
         return result

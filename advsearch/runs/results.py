@@ -1,6 +1,8 @@
-"""What every result is made of: named fields, checked when they are put in, written as JSON and read back.
+"""What every result is made of: named fields, checked when they are put in, written as
+JSON and read back.
 
-And what several questions end with: studies, how derivatives are obtained, how long light paths are, pictures.
+And what several questions end with: studies, how derivatives are obtained, how long
+light paths are, pictures.
 """
 
 from __future__ import annotations
@@ -12,7 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic import (
+    AfterValidator,
+    AliasChoices,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+)
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch import registry
@@ -23,11 +33,16 @@ if TYPE_CHECKING:
 
 
 SCHEMA = 1
-INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"  # endings of a run that can go on
-RUNNING = "running"  # how a result stands that is read while a process works on its run; none is kept so
-END = ("warnings", "seconds", "seed", "command_line")  # fields that are written last, in this order
+INTERRUPTED = "interrupted"  # endings of a run that can go on
+OUT_OF_TIME = "out of time"
+# how a result stands that is read while a process works on its run; none is kept so
+RUNNING = "running"
+# fields that are written last, in this order
+END = ("warnings", "seconds", "seed", "command_line")
 
-JsonFloat = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+JsonFloat = Annotated[
+    float, BeforeValidator(lambda value: math.nan if value is None else value)
+]
 """A number that may be NaN or infinite: null in JSON, which is read as NaN."""
 
 Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
@@ -45,9 +60,11 @@ def having(*names: str) -> AfterValidator:
 
 
 def as_fact(form: str = "{}") -> dict[str, JsonValue]:
-    """Return the `json_schema_extra` of a field that terminal, page and notebook show under its name, as in
+    """Return the `json_schema_extra` of a field that terminal, page and notebook show
+    under its name, as in
 
-        speed: float | None = optional("pictures a second", json_schema_extra=as_fact("{:.3g}"))
+        speed: float | None = optional("pictures a second",
+            json_schema_extra=as_fact("{:.3g}"))
 
     Args:
         form: how its value becomes a text.
@@ -56,32 +73,41 @@ def as_fact(form: str = "{}") -> dict[str, JsonValue]:
 
 
 def optional(description: str, **more: Any) -> Any:
-    """Return a field that is None, and then left out, by what it is; `more` as for `pydantic.Field`."""
+    """Return a field that is None, and then left out, by what it is; `more` as for
+    `pydantic.Field`.
+    """
     return Field(default=None, description=description, **more)
 
 
 class Fields(BaseModel):
     """Named fields of a result.
 
-    A field without a default is always there, if need be as null. One with a default is left out where it has it: it
-    belongs to what was not asked for. Fields that a file has and the class has not are passed over.
+    A field without a default is always there, if need be as null. One with a default is
+    left out where it has it: it belongs to what was not asked for. Fields that a file
+    has and the class has not are passed over.
     """
 
     model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
     @classmethod
     def of(cls, source: object) -> Self:
-        """Return the fields with the values that the attributes, or the keys, of something have."""
+        """Return the fields with the values that the attributes, or the keys, of
+        something have.
+        """
         return cls.model_validate(source)
 
     @classmethod
     def described(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
-        """Return the fields by name, and behind them those that are computed from others (`computed_field`)."""
+        """Return the fields by name, and behind them those that are computed from
+        others (`computed_field`).
+        """
         return {**cls.model_fields, **cls.model_computed_fields}
 
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values; NaN and infinity are None."""
-        values: JsonObject = plain(self.model_dump(exclude_defaults=True, by_alias=True))
+        values: JsonObject = plain(
+            self.model_dump(exclude_defaults=True, by_alias=True)
+        )
         return values
 
 
@@ -94,17 +120,27 @@ class Result(Fields):
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
-        """Return the fields that are declared with `as_fact`, as texts by their names; None and NaN are left out."""
+        """Return the fields that are declared with `as_fact`, as texts by their names;
+        None and NaN are left out.
+        """
         found = {}
         for name, about in self.described().items():
-            extra, value = about.json_schema_extra, getattr(self, name)
-            if isinstance(extra, dict) and "fact" in extra and value is not None and value == value:
+            extra = about.json_schema_extra
+            value = getattr(self, name)
+            if (
+                isinstance(extra, dict)
+                and "fact" in extra
+                and value is not None
+                and value == value
+            ):
                 found[name.replace("_", " ")] = str(extra["fact"]).format(value)
         return found
 
     @property
     def goes_on(self) -> bool:
-        """Whether it has not come to its end: it is running, or was stopped and can be resumed."""
+        """Whether it has not come to its end: it is running, or was stopped and can be
+        resumed.
+        """
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME, RUNNING)
 
     @property
@@ -120,11 +156,17 @@ class RunResult(Result):
     environment: str
     controls: list[str]
     ending: str = Field(description="how it ended")
-    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(description="by part of the work, and in `total`")
+    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(
+        description="by part of the work, and in `total`"
+    )
     seed: int = Field(description="the root seed")
-    command_line: str | None = Field(description="the command that asks the same again; null where none does")
+    command_line: str | None = Field(
+        description="the command that asks the same again; null where none does"
+    )
     python_only: list[str] = Field(
-        default=[], description="parts that existed only in Python, so that no command asks the same; absent without"
+        default=[],
+        description="parts that existed only in Python, so that no command "
+        "asks the same; absent without",
     )
 
     def to_dict(self) -> JsonObject:
@@ -155,7 +197,9 @@ class SceneResult(RunResult):
 
 
 class MovedValue(Fields):
-    """A value of the scene that a control leaves out, so that the clean scene has another."""
+    """A value of the scene that a control leaves out, so that the clean scene has
+    another.
+    """
 
     parameter: str
     unit: str
@@ -187,13 +231,16 @@ class Formation(Fields):
     exposure: float = Field(description="stops over the metered one")
     resolution: tuple[int, int] = Field(description="[height, width], pixels")
     gain: float | None = Field(
-        description="from radiance to display-linear values; null where scenes have gains of their own"
+        description="from radiance to display-linear values; null where scenes have "
+        "gains of their own"
     )
 
 
 def plain(value: Any) -> Any:
-    """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
-    Raises TypeError where something in it has no JSON form."""
+    """Return `value` made of what JSON has: numbers of numpy and torch become Python's,
+    NaN and infinity become None. Raises TypeError where something in it has no JSON
+    form.
+    """
     if isinstance(value, enum.Enum):
         return plain(value.value)
     if value is None or isinstance(value, (str, bool, int)):
@@ -209,13 +256,19 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(inner) for inner in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
+        return {
+            one.name: plain(getattr(value, one.name))
+            for one in dataclasses.fields(value)
+        }
     if hasattr(value, "tolist"):
         return plain(value.tolist())
-    raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
+    raise TypeError(
+        f"expected something that JSON can hold, got {type(value).__name__}"
+    )
 
 
-AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
+# a number, a name, or both ends of a part of a range
+AxisValue = int | float | str | tuple[float, float]
 
 
 class CountedPredictions(Fields):
@@ -224,10 +277,13 @@ class CountedPredictions(Fields):
     configurations: int = Field(description="how many were looked at")
     correct: int = Field(description="right predictions")
     accuracy: float | None = Field(
-        description="their share; where some share a [draw](drives.md), the mean over draws of the share of each; null "
+        description="their share; where some share a [draw](drives.md), the mean over "
+        "draws of the share of each; null "
         "where there is no configuration"
     )
-    interval: Interval | None = Field(description="of that share, 95 %; null where all are of one draw")
+    interval: Interval | None = Field(
+        description="of that share, 95 %; null where all are of one draw"
+    )
     outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
 
 
@@ -236,11 +292,16 @@ class ConditionRow(Fields):
 
     parameter: str
     unit: str
-    over: float | None = Field(description="values are larger; null without that bound, and for names")
-    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
+    over: float | None = Field(
+        description="values are larger; null without that bound, and for names"
+    )
+    at_most: float | None = Field(
+        description="values are no larger; null without that bound, and for names"
+    )
     options: list[str] = Field(description="the names it is about; empty for numbers")
     turn: float | None = optional(
-        "degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
+        "degrees after which values count as the same, 180 or 360; `over` may then be "
+        "over `at_most`: the "
         "part goes through 0. Null for other parts"
     )
     text: str
@@ -254,16 +315,31 @@ class Extent(Fields):
     total: int = Field(alias="of")
     interval: Interval = Field(description="95 %, of the share")
     share: float | None = Field(
-        default=None, description="the mean over draws of the share of each, where some share one; absent elsewhere"
+        default=None,
+        description="the mean over draws of the share of each, where "
+        "some share one; absent elsewhere",
     )
 
     @classmethod
     def from_count(
-        cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None
+        cls,
+        what: str,
+        count: int,
+        total: int,
+        interval: Interval | None,
+        share: float | None = None,
     ) -> Extent:
-        """Return a count with the interval of its share, which is `share` where that is not count over total."""
+        """Return a count with the interval of its share, which is `share` where that is
+        not count over total.
+        """
         own_share = share if total and share != count / total else None
-        return cls(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)
+        return cls(
+            what=what,
+            count=count,
+            total=total,
+            interval=interval or (0.0, 1.0),
+            share=own_share,
+        )
 
 
 class StudyResult(RunResult):
@@ -294,7 +370,9 @@ class GroupDerivative(Fields):
     variance_x_seconds: dict[str, JsonFloat] = Field(
         description="squared error x time of each estimator that was measured"
     )
-    step_in_unit: float | None = Field(description="the step in `unit`; null where that is no single number")
+    step_in_unit: float | None = Field(
+        description="the step in `unit`; null where that is no single number"
+    )
     unit: str
 
     @property
@@ -305,17 +383,25 @@ class GroupDerivative(Fields):
 class PlannedGradient(Fields):
     """How every derivative is obtained."""
 
-    renders_per_gradient: int = Field(description="beside the picture itself; adjoints are not counted")
-    spp: int | None = Field(description="samples a pixel of differences; null: that of the search")
+    renders_per_gradient: int = Field(
+        description="beside the picture itself; adjoints are not counted"
+    )
+    spp: int | None = Field(
+        description="samples a pixel of differences; null: that of the search"
+    )
     groups: list[GroupDerivative]
 
 
 class PathCut(Fields):
-    """What paths of at most so many segments leave out, the worst over the configurations looked at."""
+    """What paths of at most so many segments leave out, the worst over the
+    configurations looked at.
+    """
 
     depth: int = Field(description="longest path in segments")
     light: float = Field(description="share of the radiance that is missing")
-    levels: float = Field(description="root-mean-square bias of the displayed picture in 8-bit levels")
+    levels: float = Field(
+        description="root-mean-square bias of the displayed picture in 8-bit levels"
+    )
 
 
 class PathLength(Fields):
@@ -329,23 +415,32 @@ class PathLength(Fields):
 
 
 class Measured(Fields):
-    """A picture, a margin, a gradient or a derivative beside its reference, which took far more renders.
+    """A picture, a margin, a gradient or a derivative beside its reference, which took
+    far more renders.
 
-    Errors and noise are relative to the size of the reference. What was not measured is absent.
+    Errors and noise are relative to the size of the reference. What was not measured is
+    absent.
     """
 
     quantity: str = Field(
-        description="`picture`, `margin` of the model, `gradient` of a control, or `derivative` along a parameter"
+        description="`picture`, `margin` of the model, `gradient` of a control, or "
+        "`derivative` along a parameter"
     )
     control: str = Field(default="", description="whose gradient")
     parameter: str = Field(default="", description="along which the derivative is")
-    estimator: str = Field(description="what computes it: a sampler, or an estimator of derivatives")
+    estimator: str = Field(
+        description="what computes it: a sampler, or an estimator of derivatives"
+    )
     factor: float = Field(default=1.0, description="step as a multiple of the plan's")
     spp: int = Field(description="samples a pixel")
-    repeats: int = Field(description="how often it was computed, each time with other noise")
+    repeats: int = Field(
+        description="how often it was computed, each time with other noise"
+    )
     seconds: float = Field(description="of one, median")
     status: GradientStatus = Field(description="whether it agrees with its reference")
-    error: JsonFloat | None = optional("of one, root mean square; an upper limit where the reference is unusable")
+    error: JsonFloat | None = optional(
+        "of one, root mean square; an upper limit where the reference is unusable"
+    )
     interval: Interval | None = optional("of `error`")
     bias: JsonFloat | None = optional("error of the mean")
     doubt: JsonFloat | None = optional("how much of `bias` the noise explains")
@@ -373,7 +468,9 @@ class ClassPrediction(Fields):
     """One prediction of a picture."""
 
     label: str = Field(description="in words")
-    index: int | None = Field(description="its number among the model's classes; null where there are none")
+    index: int | None = Field(
+        description="its number among the model's classes; null where there are none"
+    )
     probability: float | None = Field(description="null where the model gives none")
 
 
@@ -382,15 +479,21 @@ class ThingSeen(Fields):
 
     label: str | None = Field(description="what a model should call it")
     box: tuple[int, int, int, int] | None = Field(
-        description="the smallest round what is seen of it, [x0, y0, x1, y1] in pixels; null where nothing is"
+        description="the smallest round what is seen of it, [x0, y0, x1, y1] in "
+        "pixels; null where nothing is"
     )
     pixels: int = Field(description="in which it is what is seen first")
     share: float | None = Field(
-        description="of all that there would be of it if nothing stood before it and the picture went on, 0 to 1; null "
+        description="of all that there would be of it if nothing stood before it and "
+        "the picture went on, 0 to 1; null "
         "where it is not known"
     )
-    truncated: bool | None = Field(description="whether it goes on beyond the picture; null where it is not known")
-    distance: float | None = Field(description="of the nearest point that is seen from the camera, metres")
+    truncated: bool | None = Field(
+        description="whether it goes on beyond the picture; null where it is not known"
+    )
+    distance: float | None = Field(
+        description="of the nearest point that is seen from the camera, metres"
+    )
 
 
 class ViewPredictions(Fields):
@@ -398,7 +501,8 @@ class ViewPredictions(Fields):
 
     azimuth: float = Field(description="of the camera, degrees")
     answers: list[ClassPrediction] = Field(
-        validation_alias=AliasChoices("answers", "predictions"), description="the likeliest first"
+        validation_alias=AliasChoices("answers", "predictions"),
+        description="the likeliest first",
     )
     things: dict[str, ThingSeen] | None = optional(
         "what is seen of `object` and of each thing beside it; absent without any"
@@ -418,7 +522,9 @@ class RenderResult(Result):
     command: ClassVar[str] = "render"
 
     out: str = Field(description="the file that was written")
-    answered: str | None = optional("that with boxes and masks drawn in; absent where the task draws none")
+    answered: str | None = optional(
+        "that with boxes and masks drawn in; absent where the task draws none"
+    )
     size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
     object: str
     environment: str
@@ -445,26 +551,39 @@ class ControlGroup(Fields):
     trials: int
     rate: float
     interval: Interval
-    not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
-    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in those that are not right; {ONLY_OF_BOXES}")
+    not_a_number: int = Field(
+        default=0, description="trials whose output is NaN or infinity; absent without"
+    )
+    outcomes: Outcomes = optional(
+        f"{WHAT_BECOMES} in those that are not right; {ONLY_OF_BOXES}"
+    )
 
 
 class VerifiedRate(Fields):
     """Trials with fresh seeds, and how many of them are a success."""
 
     successes: int
-    trials: int = Field(description="that count: over conditions that vary, those whose clean scene is right")
+    trials: int = Field(
+        description="that count: over conditions that vary, those "
+        "whose clean scene is right"
+    )
     rate: float
     interval: Interval
     spp: int = Field(description="samples a pixel")
-    labels: dict[str, int] = Field(description="predictions of the successes, and how often each was given")
+    labels: dict[str, int] = Field(
+        description="predictions of the successes, and how often each was given"
+    )
     outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the successes; {ONLY_OF_BOXES}")
     margin: JsonFloat = Field(
-        description="mean over these trials, below 0 in a success, in logits; of a detector in log-odds"
+        description="mean over these trials, below 0 in a success, in logits; of a "
+        "detector in log-odds"
     )
-    not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
+    not_a_number: int = Field(
+        default=0, description="trials whose output is NaN or infinity; absent without"
+    )
     stopped: str | None = optional(
-        "why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "why there are no more: `asked for` (as many as were) or `decided` (the "
+        "verdict stands); absent of "
         "trials that are no verdict"
     )
 
@@ -483,8 +602,12 @@ class AverageCase(Fields):
 class PredictionError(Fields):
     """How far predicted pictures were from traced ones, at the last comparison."""
 
-    levels: JsonFloat = Field(description="of 255, over the object's pixels, root mean square")
-    logits: JsonFloat = Field(description="of the margin, the mean over the pictures that were compared")
+    levels: JsonFloat = Field(
+        description="of 255, over the object's pixels, root mean square"
+    )
+    logits: JsonFloat = Field(
+        description="of the margin, the mean over the pictures that were compared"
+    )
 
 
 class BankOfConditions(Fields):
@@ -492,17 +615,26 @@ class BankOfConditions(Fields):
 
     made: int = Field(description="how many")
     dropped: int = Field(description="of them made room for newer ones")
-    grown: int = Field(description="comparisons with unseen conditions after which there had to be more")
-    gap: float | None = Field(description="objective under them over that under unseen ones, at the last comparison")
+    grown: int = Field(
+        description="comparisons with unseen conditions after which "
+        "there had to be more"
+    )
+    gap: float | None = Field(
+        description="objective under them over that under unseen "
+        "ones, at the last comparison"
+    )
 
 
 class LinearTransport(Fields):
     """What predicted the pictures of the searches."""
 
     used: bool
-    way: str | None = optional("by what: `matrix`, `basis pictures` (of a sweep), or `surface light`")
+    way: str | None = optional(
+        "by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+    )
     reason: str | None = optional(
-        "why pictures were rendered, all or from some evaluation on, or not predicted by surface light"
+        "why pictures were rendered, all or from some evaluation on, or not predicted "
+        "by surface light"
     )
     conditions: BankOfConditions | None = optional("with `over`")
     entries: int | None = optional("of the matrix")
@@ -513,10 +645,16 @@ class LinearTransport(Fields):
 
 
 class PrintTerms(Fields):
-    """How far colours are from what can be printed, without weights, summed over textures and patches."""
+    """How far colours are from what can be printed, without weights, summed over
+    textures and patches.
+    """
 
-    variation: float = Field(description="mean length of the step from a pixel to its neighbours, in sRGB")
-    off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
+    variation: float = Field(
+        description="mean length of the step from a pixel to its neighbours, in sRGB"
+    )
+    off_print: float = Field(
+        description="mean distance in sRGB from the nearest printable colour"
+    )
 
 
 class SharedWork(Fields):
@@ -529,25 +667,38 @@ class SharedWork(Fields):
     batches: int = Field(description="batches that came back")
     busy: JsonFloat = Field(description="seconds that workers were at batches")
     loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
-    alive: JsonFloat = Field(description="seconds that they were there and did not load")
+    alive: JsonFloat = Field(
+        description="seconds that they were there and did not load"
+    )
     utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
-    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
+    machines: dict[str, dict[str, str]] = Field(
+        description="what rows call by a name, where machines are not alike"
+    )
 
     @classmethod
-    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
+    def of_facts(
+        cls, facts: Any, machines: Mapping[str, Mapping[str, str]]
+    ) -> SharedWork | None:
         """Return the fields from what an executor says; None where it says nothing."""
         if facts is None:
             return None
         share = min(1.0, facts.busy / facts.alive) if facts.alive else None
-        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
+        return cls.model_validate(
+            {**vars(facts), "utilisation": share, "machines": machines}
+        )
 
 
 def kind_of(values: JsonObject) -> type[Result] | None:
-    """Return the class of the result that a `summary.json` has; None where there is no such experiment."""
+    """Return the class of the result that a `summary.json` has; None where there is no
+    such experiment.
+    """
     command = str(values.get("command"))
     if command not in registry.EXPERIMENTS:
         return None
     experiment = registry.get_experiment(command)
     candidates: dict[str, type[Result]] = dict(experiment.other_results)
     main_type: type[Result] = experiment.result
-    return next((result_type for field, result_type in candidates.items() if field in values), main_type)
+    return next(
+        (result_type for field, result_type in candidates.items() if field in values),
+        main_type,
+    )

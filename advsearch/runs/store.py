@@ -1,6 +1,7 @@
-"""`results.sqlite`: every evaluated configuration of a run. Rows survive a kill when `Store.append` returns
-(write-ahead log); a power cut loses at most those of a second (on a slow disk more, so that forcing takes 2 % of the
-time)."""
+"""`results.sqlite`: every evaluated configuration of a run. Rows survive a kill when
+`Store.append` returns (write-ahead log); a power cut loses at most those of a second
+(on a slow disk more, so that forcing takes 2 % of the time).
+"""
 
 from __future__ import annotations
 
@@ -26,18 +27,22 @@ from advsearch.trust.stored_files import parse_json
 from advsearch.trust.writing import check_there, note_open, storage_errors
 
 NAME = "results.sqlite"
-SYNC_INTERVAL = 1.0  # least seconds between two forced writes to the disk; what a power cut may cost
+# least seconds between two forced writes to the disk; what a power cut may cost
+SYNC_INTERVAL = 1.0
 SYNC_SHARE = 0.02  # largest share of the time that forced writes may take
 
 
 @dataclass(frozen=True)
 class Row:
-    """One evaluated configuration: a row of `evaluations`, whose columns `files.SCHEMA` describes.
+    """One evaluated configuration: a row of `evaluations`, whose columns `files.SCHEMA`
+    describes.
 
-    What is no number is None: it is stored so. `success` is None where nothing is sought, as in a sweep, `renders` 0
-    where pictures were predicted and None where they were not counted, `phase` None of trials. `payload` has JSON
-    values, `values` map a parameter to ``{"value": ..., "unit": ...}``, and `metrics` a name to a number. The store
-    sets `time`, seconds since 1970, and `id`, the place in the file from 1, where it is not given.
+    What is no number is None: it is stored so. `success` is None where nothing is
+    sought, as in a sweep, `renders` 0 where pictures were predicted and None where they
+    were not counted, `phase` None of trials. `payload` has JSON values, `values` map a
+    parameter to ``{"value": ..., "unit": ...}``, and `metrics` a name to a number. The
+    store sets `time`, seconds since 1970, and `id`, the place in the file from 1, where
+    it is not given.
     """
 
     kind: str
@@ -64,16 +69,20 @@ class Row:
 
     @property
     def is_out_of_view(self) -> bool:
-        """Whether the object could not be seen in the image, so that nothing was predicted."""
+        """Whether the object could not be seen in the image, so that nothing was
+        predicted.
+        """
         return self.label == OUT_OF_VIEW
 
 
 @dataclass(frozen=True)
 class Told:
-    """What an evaluation told its search beside its row: the digest of the configuration, how many numbers of the
-    gradient were not finite, the cost in evaluations, and, where it is kept, a gradient (d,) float32 and a picture (H,
-    W, 3) uint8. A policy's state follows from what it has been told, so a search goes on by being told all of that
-    again."""
+    """What an evaluation told its search beside its row: the digest of the
+    configuration, how many numbers of the gradient were not finite, the cost in
+    evaluations, and, where it is kept, a gradient (d,) float32 and a picture (H, W, 3)
+    uint8. A policy's state follows from what it has been told, so a search goes on by
+    being told all of that again.
+    """
 
     number: int
     u: bytes
@@ -85,21 +94,30 @@ class Told:
 
 _TOLD = "number, u, non_finite, cost, gradient, picture, height"
 _AS_JSON = ("payload", "values", "metrics")
-_COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
+_COLUMNS = tuple(
+    f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row)
+)
 _INSERT = (
-    f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
+    f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES "
+    f"({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
 )
 
-_INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? AND step = ?"
+_INSERT_TOLD = (
+    "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations "
+    "WHERE "
+    "kind = ? AND step = ?"
+)
 
 
 @final
 class Store:
-    """The open `results.sqlite` of a run; `read_only` beside a process that writes. Close it, or use it in a `with`
-    block."""
+    """The open `results.sqlite` of a run; `read_only` beside a process that writes.
+    Close it, or use it in a `with` block.
+    """
 
     FILE: ClassVar[str] = NAME  # in the directory of a run
-    NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER  # the prediction of a row without a label
+    # the prediction of a row without a label
+    NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
@@ -117,25 +135,41 @@ class Store:
 
     @classmethod
     def open_to_read(cls, run: Path) -> Store:
-        """Open the results in a run directory for reading, beside a process that may write."""
+        """Open the results in a run directory for reading, beside a process that may
+        write.
+        """
         return cls(run / NAME, read_only=True)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
-        """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
-        none of them is kept. A row whose kind and step are there already changes nothing. What it `told` is that of the
-        last one."""
+        """Add rows in one transaction; they survive a kill of the process when this
+        returns, and where the disk is full none of them is kept. A row whose kind and
+        step are there already changes nothing. What it `told` is that of the last one.
+        """
         check_there(self.path)
-        began, stamp = time.monotonic(), time.time()
+        began = time.monotonic()
+        stamp = time.time()
         force = began >= self._next_sync
         with storage_errors(self.path):
             self._db.execute(f"PRAGMA synchronous = {'FULL' if force else 'NORMAL'}")
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
                 if told is not None:
-                    arrays = [None if array is None else array.tobytes() for array in (told.gradient, told.picture)]
+                    arrays = [
+                        None if array is None else array.tobytes()
+                        for array in (told.gradient, told.picture)
+                    ]
                     height = None if told.picture is None else len(told.picture)
-                    beside = (told.number, told.u, told.non_finite, told.cost, *arrays, height)
-                    self._db.execute(_INSERT_TOLD, (*beside, rows[-1].kind, rows[-1].step))
+                    beside = (
+                        told.number,
+                        told.u,
+                        told.non_finite,
+                        told.cost,
+                        *arrays,
+                        height,
+                    )
+                    self._db.execute(
+                        _INSERT_TOLD, (*beside, rows[-1].kind, rows[-1].step)
+                    )
         if force:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
@@ -150,26 +184,51 @@ class Store:
                 row = cursor.fetchone()
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were written, behind the id `after`."""
-        where, given = ("id > ?", [after]) if kind is None else ("id > ? AND kind = ?", [after, kind])
-        for values in self._select(f"{', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", *given):
+        """Yield the rows, or those of one kind, in the order in which they were
+        written, behind the id `after`.
+        """
+        where, given = (
+            ("id > ?", [after])
+            if kind is None
+            else ("id > ? AND kind = ?", [after, kind])
+        )
+        for values in self._select(
+            f"{', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", *given
+        ):
             yield _decode(values, self.path)
 
     def row(self, kind: str, step: int) -> Row | None:
         """Return the last row of a kind with a step; None where there is none."""
-        what = f"{', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? ORDER BY id DESC LIMIT 1"
-        return next((_decode(values, self.path) for values in self._select(what, kind, step)), None)
+        what = (
+            f"{', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? "
+            "ORDER BY id DESC LIMIT 1"
+        )
+        return next(
+            (_decode(values, self.path) for values in self._select(what, kind, step)),
+            None,
+        )
 
     def told(self, kind: str, step: int) -> tuple[Row, Told] | None:
-        """Return a row of a search with what it told; None where there is none, or the run is done."""
+        """Return a row of a search with what it told; None where there is none, or the
+        run is done.
+        """
         row = self.row(kind, step)
-        found = None if row is None else next(self._select(f"{_TOLD} FROM told WHERE row = ?", row.id), None)
+        found = (
+            None
+            if row is None
+            else next(self._select(f"{_TOLD} FROM told WHERE row = ?", row.id), None)
+        )
         return None if row is None or found is None else (row, _told(found, self.path))
 
-    def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield number and picture of what rows of a kind with ids over `after` have told, while the run goes on."""
+    def pictures(
+        self, kind: str, after: int, until: int
+    ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield number and picture of what rows of a kind with ids over `after` have
+        told, while the run goes on.
+        """
         what = (
-            "number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
+            "number, u, non_finite, cost, NULL, picture, height FROM told JOIN "
+            "evaluations ON row = id "
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
         )
         for values in self._select(what, kind, after, until):
@@ -192,16 +251,26 @@ class Store:
                 self._db.execute("VACUUM")
 
     def last_step(self, kind: str) -> int:
-        return int(next(self._select("coalesce(max(step), -1) FROM evaluations WHERE kind = ?", kind))[0])
+        return int(
+            next(
+                self._select(
+                    "coalesce(max(step), -1) FROM evaluations WHERE kind = ?", kind
+                )
+            )[0]
+        )
 
     def count(self, kind: str | None = None) -> int:
         where, given = ("", []) if kind is None else (" WHERE kind = ?", [kind])
         return int(next(self._select(f"count(*) FROM evaluations{where}", *given))[0])
 
     def missing(self, kind: str, count: int) -> Iterator[range]:
-        """Yield the steps from 0 to `count` of which there is no row of a kind, neighbours together."""
+        """Yield the steps from 0 to `count` of which there is no row of a kind,
+        neighbours together.
+        """
         expected = 0
-        for (step,) in self._select("step FROM evaluations WHERE kind = ? ORDER BY step", kind):
+        for (step,) in self._select(
+            "step FROM evaluations WHERE kind = ? ORDER BY step", kind
+        ):
             if step > expected:
                 yield range(expected, min(step, count))
             expected = step + 1
@@ -213,7 +282,13 @@ class Store:
         return {str(kind): count for kind, count in self._select(what)}
 
     def note(self, key: str) -> str | None:
-        return next((str(text) for (text,) in self._select("value FROM meta WHERE key = ?", key)), None)
+        return next(
+            (
+                str(text)
+                for (text,) in self._select("value FROM meta WHERE key = ?", key)
+            ),
+            None,
+        )
 
     def noted(self, key: str) -> Any:
         """Return the JSON value that was noted under `key`, or None."""
@@ -221,7 +296,10 @@ class Store:
         try:
             return None if text is None else parse_json(text)
         except ValueError as error:
-            raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
+            raise FileFormatError(
+                f"{self.path}: expected JSON in the note {key!r}, "
+                f"got {error}; {DAMAGED}"
+            ) from None
 
     @property
     def has_answers(self) -> bool:
@@ -244,7 +322,10 @@ class Store:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -264,7 +345,9 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
                 value = _JSON.encode(value) if value or name != "metrics" else None
             except (TypeError, ValueError):
                 value = _JSON.encode(plain(value))
-        elif type(value) not in _SIMPLE and not (type(value) is float and math.isfinite(value)):
+        elif type(value) not in _SIMPLE and not (
+            type(value) is float and math.isfinite(value)
+        ):
             value = plain(value)
         values.append(value)
     return (*values, stamp, row.id)
@@ -272,33 +355,47 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
 
 _HELD: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
 _TYPES: dict[str, tuple[type, ...]] = {
-    name: tuple(held for kind in get_args(hint) or (hint,) for held in _HELD.get(kind, (kind,)))
+    name: tuple(
+        held for kind in get_args(hint) or (hint,) for held in _HELD.get(kind, (kind,))
+    )
     for name, hint in get_type_hints(Row).items()
 } | {"payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
 """What each column of a row holds; SQLite itself takes anything anywhere."""
 
 _INFINITE = (math.inf, -math.inf)
-LARGEST_NUMBER = 1e300  # larger numbers are none in rows: what is reckoned from them would overflow
+# larger numbers are none in rows: what is reckoned from them would overflow
+LARGEST_NUMBER = 1e300
 
 MOST_STEPS = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
     given = dict(zip(_FIELDS, values, strict=True))
-    wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name]) or value in _INFINITE]
+    wrong = [
+        name
+        for name, value in given.items()
+        if not isinstance(value, _TYPES[name]) or value in _INFINITE
+    ]
     if not wrong and not 0 <= given["step"] <= MOST_STEPS:
         wrong = ["step"]
     if not wrong:
         given["values"] = _named(given["values"], _is_value)
-        given["metrics"] = {} if given["metrics"] is None else _named(given["metrics"], _is_metric)
-        wrong = [f"{name}_json" for name in ("values", "metrics") if given[name] is None]
+        given["metrics"] = (
+            {} if given["metrics"] is None else _named(given["metrics"], _is_metric)
+        )
+        wrong = [
+            f"{name}_json" for name in ("values", "metrics") if given[name] is None
+        ]
     if not wrong and given["payload"] is not None:
         try:
             given["payload"] = parse_json(given["payload"], finite=True)
         except ValueError:
             wrong = ["payload_json"]
     if wrong:
-        raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {DAMAGED}")
+        raise FileFormatError(
+            f"{path}: row {given['id']!r}: expected another type of "
+            f"{wrong[0]}; {DAMAGED}"
+        )
     for name in ("success", "correct"):
         given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)
@@ -307,7 +404,12 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
 def _told(values: tuple[Any, ...], path: Path) -> Told:
     number, u, non_finite, cost, gradient, picture, height = values
     try:
-        if [type(one) for one in (number, u, non_finite, cost)] != [int, bytes, int, int]:
+        if [type(one) for one in (number, u, non_finite, cost)] != [
+            int,
+            bytes,
+            int,
+            int,
+        ]:
             raise TypeError("a number that is none")
         return Told(
             number,
@@ -315,14 +417,20 @@ def _told(values: tuple[Any, ...], path: Path) -> Told:
             non_finite,
             cost,
             gradient=None if gradient is None else np.frombuffer(gradient, np.float32),
-            picture=None if picture is None else np.frombuffer(picture, np.uint8).reshape(height, -1, 3),
+            picture=None
+            if picture is None
+            else np.frombuffer(picture, np.uint8).reshape(height, -1, 3),
         )
     except (TypeError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected what a search was told, got something else ({error})") from None
+        raise FileFormatError(
+            f"{path}: expected what a search was told, got something else ({error})"
+        ) from None
 
 
 def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
-    """What a JSON object has by name; None where it is none, or something in it does not fit."""
+    """What a JSON object has by name; None where it is none, or something in it does
+    not fit.
+    """
     try:
         named = json.loads(text)
     except (ValueError, RecursionError):
@@ -331,11 +439,17 @@ def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
 
 
 def _is_value(told: object) -> bool:
-    if not isinstance(told, dict) or not isinstance(told.get("unit"), str) or "value" not in told:
+    if (
+        not isinstance(told, dict)
+        or not isinstance(told.get("unit"), str)
+        or "value" not in told
+    ):
         return False
     values = told["value"] if isinstance(told["value"], list) else [told["value"]]
     return all(isinstance(value, str) or _is_metric(value) for value in values)
 
 
 def _is_metric(value: object) -> bool:
-    return value is None or (isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER)
+    return value is None or (
+        isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER
+    )

@@ -1,6 +1,8 @@
-"""The result of a run: `summary.json` (docs/results.md), and `artifacts/adversarial.npy`, the configuration, so that it
-can be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings
-name."""
+"""The result of a run: `summary.json` (docs/results.md), and
+`artifacts/adversarial.npy`, the configuration, so that it can be rendered again
+elsewhere. And what a run is made with: versions, and digests of the files that its
+settings name.
+"""
 
 from __future__ import annotations
 
@@ -37,22 +39,34 @@ def to_json(result: Result) -> str:
 
 
 def write_summary(folder: Path, result: Result) -> Path:
-    """Write ``summary.json`` into the run directory, whole or not at all, and return its path."""
+    """Write ``summary.json`` into the run directory, whole or not at all, and return
+    its path.
+    """
     return write_text(folder / NAME, to_json(result) + "\n")
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result of the run in `folder`, `RUNNING` if a process works on it and has not come to its end; a
-    FileFormatError says if there is none, or not what this version writes."""
+    """Return the result of the run in `folder`, `RUNNING` if a process works on it and
+    has not come to its end; a FileFormatError says if there is none, or not what this
+    version writes.
+    """
     result = stored_result(folder)
-    return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
+    return (
+        result.model_copy(update={"ending": RUNNING})
+        if result.goes_on and is_held(folder)
+        else result
+    )
 
 
 def stored_result(folder: Path) -> Result:
-    """Return the result of the run in `folder` as it was written, whoever works on it."""
+    """Return the result of the run in `folder` as it was written, whoever works on
+    it.
+    """
     path = folder / NAME
     try:
-        values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
+        values = parse_json(
+            read_text(path, "the summary of a run", LARGEST), finite=True
+        )
     except FileNotFoundError:
         raise other_summary(path, "no such file; did the run end?") from None
     except (OSError, ValueError) as error:
@@ -60,13 +74,17 @@ def stored_result(folder: Path) -> Result:
     if not isinstance(values, dict):
         raise other_summary(path, type(values).__name__)
     if (kind := kind_of(values)) is None:
-        raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
+        raise other_summary(
+            path, f"one of the command {str(values.get('command'))[:40]!r}"
+        )
     try:
         return kind.of(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
-        got = f"one with a part that is missing or of another type ({what}); run it again"
+        got = (
+            f"one with a part that is missing or of another type ({what}); run it again"
+        )
         raise other_summary(path, got) from None
 
 
@@ -80,25 +98,34 @@ LARGEST_CONFIGURATION = 1 << 30
 MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
 MOST = 1 << 10  # bytes within which a header ends
 HEADER = re.compile(
-    re.escape(MAGIC) + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n", re.DOTALL
+    re.escape(MAGIC)
+    + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n",
+    re.DOTALL,
 )
-"""What is before the numbers. numpy's own reader makes room for whatever shape is named, and parses the header as
-Python, which ends in errors of any kind."""
+"""What is before the numbers. numpy's own reader makes room for whatever shape is
+named, and parses the header as Python, which ends in errors of any kind.
+"""
 
 
 def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
-    """Keep a configuration (d,) of the unit box, whole or not at all, and return where."""
+    """Keep a configuration (d,) of the unit box, whole or not at all, and return
+    where.
+    """
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
     return write_bytes(run / FOLDER / CONFIGURATION, buffer.getvalue())
 
 
 def read_configuration(run: Path) -> NDArray[np.float32]:
-    """Return the configuration (d,) float32 in [0, 1] that a run found, or raise a FileFormatError."""
+    """Return the configuration (d,) float32 in [0, 1] that a run found, or raise a
+    FileFormatError.
+    """
     path = run / FOLDER / CONFIGURATION
     expected = f"{path}: expected the adversarial configuration of a run, got"
     try:
-        data = read_bytes(path, "the adversarial configuration of a run", LARGEST_CONFIGURATION)
+        data = read_bytes(
+            path, "the adversarial configuration of a run", LARGEST_CONFIGURATION
+        )
     except FileNotFoundError:
         raise FileFormatError(f"{expected} no such file; did the run end?") from None
     except OSError as error:
@@ -107,25 +134,35 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
     header = HEADER.match(data)
     if header is not None and len(data) == header.end() + 4 * int(header[1]):
-        u: NDArray[np.float32] = np.frombuffer(data, np.float32, int(header[1]), header.end()).copy()
+        u: NDArray[np.float32] = np.frombuffer(
+            data, np.float32, int(header[1]), header.end()
+        ).copy()
         if bool(((u >= 0.0) & (u <= 1.0)).all()):
             return u
-    raise FileFormatError(f"{path}: expected numbers (d,) float32 in [0, 1], got something else")
+    raise FileFormatError(
+        f"{path}: expected numbers (d,) float32 in [0, 1], got something else"
+    )
 
 
 MADE_WITH = "made with"  # the note of versions and of digests of files
 MOST_FILES = 20_000  # files of a folder that a digest is taken of, at most
 FOLDERS = {"task": "*/*", "model": "*"}
-"""Settings that may name a folder, and which files in it decide: a task's pictures, or what `hf:FOLDER` consists of."""
+"""Settings that may name a folder, and which files in it decide: a task's pictures, or
+what `hf:FOLDER` consists of.
+"""
 
 PACKAGES = ("advsearch", "mitsuba", "drjit", "torch", "numpy")
 
 NOT_READ_AGAIN = ("recipe", "suite")
-"""Settings whose file a run keeps in its store and goes on with, whatever became of the file."""
+"""Settings whose file a run keeps in its store and goes on with, whatever became of the
+file.
+"""
 
 
 def made_with(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return versions by package, and the SHA-256 of each file that settings name, by its name in them."""
+    """Return versions by package, and the SHA-256 of each file that settings name, by
+    its name in them.
+    """
     facts = {"python": platform.python_version()}
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -136,24 +173,48 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
 BUNDLED = {"objects": "object", "environments": "environment"}
 """Folders of `advsearch.bundled`, and what stands in them."""
 NAMES_BUNDLED = (
-    *("object", "environment", "things", "held_out", "held_out_environment", "grid", "controls", "over", "set"),
+    *(
+        "object",
+        "environment",
+        "things",
+        "held_out",
+        "held_out_environment",
+        "grid",
+        "controls",
+        "over",
+        "set",
+    ),
 )
 """Settings that name objects and environments."""
 
 
 def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
+    """Return the SHA-256 of what is bundled and settings name: objects, environments
+    and the reference model.
+    """
     package = Path(__file__).parent.parent
-    names = {name for setting in NAMES_BUNDLED for name in _bundled_names(settings.get(setting))}
-    if settings.get("object") and "environment" in settings and not settings["environment"]:
+    names = {
+        name
+        for setting in NAMES_BUNDLED
+        for name in _bundled_names(settings.get(setting))
+    }
+    if (
+        settings.get("object")
+        and "environment" in settings
+        and not settings["environment"]
+    ):
         names.add(DEFAULT_ENVIRONMENT)
     digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
         for place in sorted((package / "bundled" / "data" / folder).iterdir()):
             if place.stem in names:
                 files = sorted(place.iterdir()) if place.is_dir() else [place]
-                parts = "".join(f"{file.name} {_digest(file)}\n" for file in files if file.is_file())
-                digests[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
+                parts = "".join(
+                    f"{file.name} {_digest(file)}\n" for file in files if file.is_file()
+                )
+                digests[f"bundled {kind} {place.stem}"] = hashlib.sha256(
+                    parts.encode()
+                ).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
     if "reference" in _bundled_names(settings.get("model")) and weights.is_file():
         digests["bundled model reference"] = _digest(weights)
@@ -161,8 +222,9 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 def _bundled_names(value: object) -> set[str]:
-    """Return what may be the name of something bundled in a setting: the words of ``mug,car@12,3.5; person@6,-2``, in
-    lists and mappings, but for the paths of files."""
+    """Return what may be the name of something bundled in a setting: the words of
+    ``mug,car@12,3.5; person@6,-2``, in lists and mappings, but for the paths of files.
+    """
     if isinstance(value, Mapping):
         return {name for inner in value.values() for name in _bundled_names(inner)}
     if isinstance(value, (list, tuple)):
@@ -172,54 +234,87 @@ def _bundled_names(value: object) -> set[str]:
 
 
 def changed_facts(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
-    """Return the names of facts that are others now than before; those that were not known before are none of them.
+    """Return the names of facts that are others now than before; those that were not
+    known before are none of them.
 
     A file is known by the last part of its path, since it may have been moved.
     """
     known: dict[str, list[object]] = {}
     for name, value in before.items():
         known.setdefault(Path(name).name, []).append(value)
-    return [Path(name).name for name, value in now.items() if value not in known.get(Path(name).name, [value])]
+    return [
+        Path(name).name
+        for name, value in now.items()
+        if value not in known.get(Path(name).name, [value])
+    ]
 
 
-def changed_file(before: Mapping[str, object], settings: Mapping[str, object]) -> str | None:
-    """Return the name of a file of some settings that is another one now than before; None if all are the same."""
-    again = {name: value for name, value in settings.items() if name not in NOT_READ_AGAIN}
+def changed_file(
+    before: Mapping[str, object], settings: Mapping[str, object]
+) -> str | None:
+    """Return the name of a file of some settings that is another one now than before;
+    None if all are the same.
+    """
+    again = {
+        name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
+    }
     return next(iter(changed_facts(before, file_digests(again))), None)
 
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each file that settings name, in hexadecimal, and of each that was read for it: materials,
-    pictures and buffers that a mesh or a scene names. A folder has one for all. What is bundled or gone has none."""
+    """Return the SHA-256 of each file that settings name, in hexadecimal, and of each
+    that was read for it: materials, pictures and buffers that a mesh or a scene names.
+    A folder has one for all. What is bundled or gone has none.
+    """
     found: dict[str, str] = {}
     for name, value in settings.items():
         for path in _paths(value):
             with suppress(OSError, ValueError):
                 own = os.path.abspath(path)
                 parts = opened_for(own)
-                folder = path if os.path.isabs(path) else path.removeprefix("hf:") if path.startswith("hf:") else ""
+                folder = (
+                    path
+                    if os.path.isabs(path)
+                    else path.removeprefix("hf:")
+                    if path.startswith("hf:")
+                    else ""
+                )
                 if folder and name in FOLDERS and Path(folder).is_dir():
-                    files = filter(Path.is_file, sorted(islice(Path(folder).glob(FOLDERS[name]), MOST_FILES)))
-                    inside = (f"{file.relative_to(folder).as_posix()}\n{_digest(file)}" for file in files)
+                    files = filter(
+                        Path.is_file,
+                        sorted(islice(Path(folder).glob(FOLDERS[name]), MOST_FILES)),
+                    )
+                    inside = (
+                        f"{file.relative_to(folder).as_posix()}\n{_digest(file)}"
+                        for file in files
+                    )
                     found[folder] = hashlib.sha256("".join(inside).encode()).hexdigest()
                 if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
                 for part in parts:
                     if part != own and Path(part).is_file():
                         beside = os.path.relpath(part, os.path.dirname(own))
-                        found[os.path.join(os.path.dirname(path), beside)] = _digest(Path(part))
+                        found[os.path.join(os.path.dirname(path), beside)] = _digest(
+                            Path(part)
+                        )
     return found
 
 
 def _paths(value: object) -> Iterator[str]:
-    """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE`` or ``camera.csv+object.csv``,
-    in lists and mappings."""
+    """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE``
+    or ``camera.csv+object.csv``, in lists and mappings.
+    """
     if isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:
             yield from _paths(inner)
     elif isinstance(value, str):
         for name in value.split(","):
-            parts = (name, name.rpartition("@")[2], name.partition("#")[0], *split_paths(name))
+            parts = (
+                name,
+                name.rpartition("@")[2],
+                name.partition("#")[0],
+                *split_paths(name),
+            )
             yield from dict.fromkeys(one.strip() for one in parts if one.strip())
 
 

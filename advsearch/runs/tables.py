@@ -1,4 +1,6 @@
-"""Rows of a run as one pandas frame: a row for each configuration, a column for each thing that is known of it."""
+"""Rows of a run as one pandas frame: a row for each configuration, a column for each
+thing that is known of it.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,16 @@ from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Which rows of a sweep are independent: those of different *units*, each of one draw. A unit is a drive with all its
-# frames, or a picture, with the predictions of all models and, where one was swept, without and with the adversarial
-# scene of a run. Where nothing is drawn, samples of a point of the grid differ in noise alone: they are one unit.
+# Which rows of a sweep are independent: those of different *units*, each of one draw. A
+# unit is a drive with all its frames, or a picture, with the predictions of all models
+# and, where one was swept, without and with the adversarial scene of a run. Where
+# nothing is drawn, samples of a point of the grid differ in noise alone: they are one
+# unit.
 
 NOTE = "units"  # the note of a run that says it
-PICTURE, CONFIGURATION, DRIVE = "picture", "configuration", "drive"
+PICTURE = "picture"
+CONFIGURATION = "configuration"
+DRIVE = "drive"
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
@@ -43,7 +49,8 @@ class Units:
 
     # of the axes of the grid, the last one fastest
     sizes: Annotated[tuple[Count, ...], Field(max_length=MOST_AXES)] = ()
-    frames: Annotated[int, Field(strict=True, ge=0)] | None = None  # place of the axis whose values are frames
+    # place of the axis whose values are frames
+    frames: Annotated[int, Field(strict=True, ge=0)] | None = None
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # that are shown the same pictures
     # pictures after which the draws come again; 0 for never
@@ -67,21 +74,27 @@ class Units:
         return self.draw(step // self.models)
 
     def draw(self, picture: Number) -> Number:
-        """Return the number of the draw of a picture, by its number in the whole sweep."""
+        """Return the number of the draw of a picture, by its number in the whole
+        sweep.
+        """
         if self.again:
             picture = picture % self.again
         picture = picture // self.noise
         if self.frames is None:
             return picture
-        place, sample = picture // self.samples, picture % self.samples
+        place = picture // self.samples
+        sample = picture % self.samples
         after = prod(self.sizes[self.frames + 1 :])
-        before = place // (self.sizes[self.frames] * after)  # scenes are like one more axis, the slowest
+        # scenes are like one more axis, the slowest
+        before = place // (self.sizes[self.frames] * after)
         return (before * after + place % after) * self.samples + sample
 
 
 def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
-    """Return what a run notes of its units; None where it notes nothing. Older notes do not say that samples are noise:
-    the summary's sampler does, so that the caller says whether anything `is_drawn`."""
+    """Return what a run notes of its units; None where it notes nothing. Older notes do
+    not say that samples are noise: the summary's sampler does, so that the caller says
+    whether anything `is_drawn`.
+    """
     noted = store.noted(NOTE)
     if noted is None:
         return None
@@ -90,32 +103,49 @@ def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
         if not is_drawn and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
         has_frames = units.frames is None or units.frames < len(units.sizes)
-        if has_frames and prod(units.sizes) * units.samples * units.noise * units.models <= MOST_ROWS:
+        if (
+            has_frames
+            and prod(units.sizes) * units.samples * units.noise * units.models
+            <= MOST_ROWS
+        ):
             return units
-    raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
+    raise FileFormatError(
+        f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}"
+    )
 
 
 KIND = "sweep"  # rows of the sweep itself
 EDGES = "parts of ranges"
-"""The note of a run that says where the range of each drawn parameter is cut: the ends of the parts, by name."""
+"""The note of a run that says where the range of each drawn parameter is cut: the ends
+of the parts, by name.
+"""
 
 SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label", "outcome")
 """Columns of a sweep's frame before those of its parameters; `unit` is the last one."""
 
-AT_ONCE = 10_000  # rows that become numbers and names at once, so that a million rows fit
-TAKEN = {*(one.name for one in fields(Row)), "unit", "outcome"}  # names that a parameter cannot have in a frame
+# rows that become numbers and names at once, so that a million rows fit
+AT_ONCE = 10_000
+# names that a parameter cannot have in a frame
+TAKEN = {*(one.name for one in fields(Row)), "unit", "outcome"}
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
     """Return rows as a frame, with the columns of an export under plain names.
 
-    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit: "degrees".
+    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit:
+    "degrees".
     """
     listed = list(rows)
     names = {one: one.partition(" [")[0] for one in as_columns(listed)}
-    records = [{names[name]: value for name, value in as_record(row).items()} for row in listed]
+    records = [
+        {names[name]: value for name, value in as_record(row).items()} for row in listed
+    ]
     frame = pd.DataFrame(records, columns=list(names.values()))
-    frame.attrs["units"] = {plain: name[len(plain) + 2 : -1] for name, plain in names.items() if plain != name}
+    frame.attrs["units"] = {
+        plain: name[len(plain) + 2 : -1]
+        for name, plain in names.items()
+        if plain != name
+    }
     return frame
 
 
@@ -127,37 +157,59 @@ def read_sweep(
     *,
     is_drawn: bool = True,
 ) -> pd.DataFrame:
-    """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most, as
-    `sweep_frame` does; `unit` says which rows are not independent (`Units`, `units_of`), ``attrs["unit name"]`` what
-    such a unit is, and ``attrs["edges"]`` where the ranges of drawn parameters are cut. Raises FileFormatError where
-    the results cannot be read."""
+    """Return the rows of the sweep in `run` that were written after the row with this
+    id, `most` of them at most, as `sweep_frame` does; `unit` says which rows are not
+    independent (`Units`, `units_of`), ``attrs["unit name"]`` what such a unit is, and
+    ``attrs["edges"]`` where the ranges of drawn parameters are cut. Raises
+    FileFormatError where the results cannot be read.
+    """
     with Store(run / NAME, read_only=True) as store:
-        frame, noted = sweep_frame(islice(store.rows(KIND, after=after), most), also), store.noted(EDGES)
+        frame = sweep_frame(islice(store.rows(KIND, after=after), most), also)
+        noted = store.noted(EDGES)
         units = units_of(store, is_drawn=is_drawn)
     frame.attrs["unit name"] = PICTURE if units is None else units.name
     if units is not None:
         frame["unit"] = units.of(frame["step"].to_numpy())
     for name, ends in noted.items() if isinstance(noted, dict) else ():
-        if isinstance(ends, list) and len(ends) > 1 and all(isinstance(end, (int, float)) for end in ends):
+        if (
+            isinstance(ends, list)
+            and len(ends) > 1
+            and all(isinstance(end, (int, float)) for end in ends)
+        ):
             frame.attrs["edges"][name] = list(map(float, ends))
     return frame
 
 
-def sweep_frame(rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] | None = None) -> pd.DataFrame:
-    """Return rows of a sweep as a frame: `SAID`, a column for each parameter and for what is `also` told of a row, and
-    `unit`, which here is the step.
+def sweep_frame(
+    rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] | None = None
+) -> pd.DataFrame:
+    """Return rows of a sweep as a frame: `SAID`, a column for each parameter and for
+    what is `also` told of a row, and `unit`, which here is the step.
 
-    Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was not judged. `label`, `outcome`
-    (of `options.Outcome`, "" where a row has none) and parameters that have a name anywhere are categories in the order
-    in which they come, "none" where a row has
-    nothing. ``camera.target[0]`` is one of several numbers; ``attrs["units"]`` has the units of parameters.
+    Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was
+    not judged. `label`, `outcome` (of `options.Outcome`, "" where a row has none) and
+    parameters that have a name anywhere are categories in the order in which they come,
+    "none" where a row has nothing. ``camera.target[0]`` is one of several numbers;
+    ``attrs["units"]`` has the units of parameters.
     """
-    units, parts = dict[str, str](), list[pd.DataFrame]()
-    cells = ({**_cells(row, number, units), **(also(row) if also else {})} for number, row in enumerate(rows, 1))
+    units = dict[str, str]()
+    parts = list[pd.DataFrame]()
+    cells = (
+        {**_cells(row, number, units), **(also(row) if also else {})}
+        for number, row in enumerate(rows, 1)
+    )
     while some := list(islice(cells, AT_ONCE)):
         part = pd.DataFrame(some, dtype=object)
-        parts.append(part.astype({name: float for name in part if not part[name].map(type).eq(str).any()}))
-    frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(dict.fromkeys(SAID, np.zeros(0)))
+        parts.append(
+            part.astype(
+                {name: float for name in part if not part[name].map(type).eq(str).any()}
+            )
+        )
+    frame = (
+        pd.concat(parts, ignore_index=True)
+        if parts
+        else pd.DataFrame(dict.fromkeys(SAID, np.zeros(0)))
+    )
     for name in frame.select_dtypes("object"):
         frame[name] = _names(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
@@ -167,11 +219,22 @@ def sweep_frame(rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] 
 
 
 def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
-    """What is known of a row, the `number`-th, by column; `units` gets those of its parameters."""
-    said = row.id or number, row.step, row.correct, row.margin, row.probability, row.seconds
+    """What is known of a row, the `number`-th, by column; `units` gets those of its
+    parameters.
+    """
+    said = (
+        row.id or number,
+        row.step,
+        row.correct,
+        row.margin,
+        row.probability,
+        row.seconds,
+    )
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
     outcome = get_outcome(row.payload)
-    cells: dict[str, Any] = dict(zip(SAID, (*said, label, "" if outcome is None else outcome.value), strict=True))
+    cells: dict[str, Any] = dict(
+        zip(SAID, (*said, label, "" if outcome is None else outcome.value), strict=True)
+    )
     for name, described in row.values.items():
         called = f"parameter {name}" if name in TAKEN else name
         for place, value, unit in each_value({called: described}):
@@ -181,7 +244,16 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
 
 
 def _names(column: pd.Series) -> pd.Categorical:
-    """A column that has names as categories, in the order in which they come; numbers among them behind."""
-    texts = [value if isinstance(value, str) else "none" if pd.isna(value) else f"{float(value):g}" for value in column]
+    """A column that has names as categories, in the order in which they come; numbers
+    among them behind.
+    """
+    texts = [
+        value
+        if isinstance(value, str)
+        else "none"
+        if pd.isna(value)
+        else f"{float(value):g}"
+        for value in column
+    ]
     names = [value for value in column if isinstance(value, str)]
     return pd.Categorical(texts, categories=list(dict.fromkeys([*names, *texts])))

@@ -1,6 +1,8 @@
-"""Experiment trackers: MLflow, TensorBoard, and Weights & Biases get settings and the mean numbers of rows by kind.
+"""Experiment trackers: MLflow, TensorBoard, and Weights & Biases get settings and the
+mean numbers of rows by kind.
 
-A thread of its own sends them, so that neither a slow network nor one that fails holds up the run.
+A thread of its own sends them, so that neither a slow network nor one that fails holds
+up the run.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ def _package(name: str) -> Any:
     try:
         return importlib.import_module(PACKAGES[name])
     except ImportError:
-        raise InputError(f"log {name}: needs {name}; pip install {name}, or leave `log` out") from None
+        raise InputError(
+            f"log {name}: needs {name}; pip install {name}, or leave `log` out"
+        ) from None
 
 
 class Tracker:
@@ -49,8 +53,14 @@ class Tracker:
         self._name = name
         self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
         self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
-        told = {key: str(value)[:LONGEST] for key, value in settings.items() if value is not None}
-        self._thread = threading.Thread(target=self._work, args=(folder, told), name=name, daemon=True)
+        told = {
+            key: str(value)[:LONGEST]
+            for key, value in settings.items()
+            if value is not None
+        }
+        self._thread = threading.Thread(
+            target=self._work, args=(folder, told), name=name, daemon=True
+        )
         self._thread.start()
 
     def rows(self, rows: Sequence[Row]) -> None:
@@ -62,14 +72,20 @@ class Tracker:
             self._put((self._numbers(kind, group), group[-1].step))
 
     def close(self) -> None:
-        """Wait, at most `PATIENCE` seconds, until all is told; a second call does nothing."""
+        """Wait, at most `PATIENCE` seconds, until all is told; a second call does
+        nothing.
+        """
         self._put(None)
         self._thread.join(PATIENCE)
 
     def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
         numbers = {}
         for name in NUMBERS:
-            given = [float(value) for row in rows if (value := getattr(row, name)) is not None]
+            given = [
+                float(value)
+                for row in rows
+                if (value := getattr(row, name)) is not None
+            ]
             if given:
                 numbers[f"{kind}/{name}"] = sum(given) / len(given)
         judged = [row.correct for row in rows if row.correct is not None]
@@ -92,19 +108,28 @@ class Tracker:
                 tell(*message)
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
-            _LOG.warning("%s is told nothing more: %s", self._name, str(error)[:300] or type(error).__name__)
+            _LOG.warning(
+                "%s is told nothing more: %s",
+                self._name,
+                str(error)[:300] or type(error).__name__,
+            )
 
 
 def _opened(
     name: str, folder: Path, settings: Mapping[str, str]
 ) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
-    """Return what tells a tracker numbers by name, of a step of their kind, and what ends its run."""
+    """Return what tells a tracker numbers by name, of a step of their kind, and what
+    ends its run.
+    """
     package = _package(name)
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)
-        return lambda numbers, step: package.log_metrics(dict(numbers), step=step), package.end_run
-    if name == "tensorboard":  # its files are in the run, whose run.yaml has the settings
+        return lambda numbers, step: package.log_metrics(
+            dict(numbers), step=step
+        ), package.end_run
+    # its files are in the run, whose run.yaml has the settings
+    if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
 
         def add(numbers: MetricValues, step: int) -> None:
@@ -112,10 +137,16 @@ def _opened(
                 writer.add_scalar(each, value, step)
 
         return add, writer.close
-    run = package.init(project="advsearch", name=folder.name, config=dict(settings), reinit="create_new")
+    run = package.init(
+        project="advsearch",
+        name=folder.name,
+        config=dict(settings),
+        reinit="create_new",
+    )
 
     def log(numbers: MetricValues, step: int) -> None:
-        # each kind has steps of its own, which are told as a number: its one counter only ever goes up
+        # each kind has steps of its own, which are told as a number: its one counter
+        # only ever goes up
         kind = next(iter(numbers), "rows/").partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 

@@ -1,1 +1,3 @@
-"""Scenes: assets, loading, importing, rendering. Importing this package imports neither Mitsuba nor torch."""
+"""Scenes: assets, loading, importing, rendering. Importing this package imports neither
+Mitsuba nor torch.
+"""

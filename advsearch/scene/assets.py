@@ -1,6 +1,8 @@
-"""What a scene is made of before Mitsuba sees it: meshes, materials, environments, as plain numpy arrays.
+"""What a scene is made of before Mitsuba sees it: meshes, materials, environments, as
+plain numpy arrays.
 
-This module imports numpy only, so that the families of bundled objects and the importers can share it.
+This module imports numpy only, so that the families of bundled objects and the
+importers can share it.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-SLACK = 1e-3  # how far texture coordinates of a texture that does not repeat may lie beyond its edges
+# how far texture coordinates of a texture that does not repeat may lie beyond its edges
+SLACK = 1e-3
 
 
 class MeshRig(Protocol):
@@ -45,48 +48,76 @@ class MeshRig(Protocol):
         """Names of its animations."""
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex goes from the mesh's own, (V, 3) in its units; differentiable."""
+        """Return how far each vertex goes from the mesh's own, (V, 3) in its units;
+        differentiable.
+        """
 
-    def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
+    def measured(
+        self, values: Mapping[str, Tensor], clip: str | None = None
+    ) -> Mapping[str, Value]:
         """Return what else is worth storing, by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh with one UV chart set: v = 0 is the BOTTOM row of the texture image (the OBJ convention). UVs are
-    in [0, 1], but for meshes of Mitsuba scenes, whose textures may go on beyond their edges."""
+    """A triangle mesh with one UV chart set: v = 0 is the BOTTOM row of the texture
+    image (the OBJ convention). UVs are in [0, 1], but for meshes of Mitsuba scenes,
+    whose textures may go on beyond their edges.
+    """
 
     vertices: Floats  # (V, 3) positions, z up, in the author's units
-    faces: npt.NDArray[np.uint32]  # (F, 3) vertices, counter-clockwise seen from outside
+    # (F, 3) vertices, counter-clockwise seen from outside
+    faces: npt.NDArray[np.uint32]
     normals: Floats  # (V, 3) unit shading normals, pointing outwards
     uvs: Floats  # (V, 2)
-    # further numbers of Mitsuba's meshes, (V, n) or (F, n), by its names, which begin with "vertex_" or "face_"
+    # further numbers of Mitsuba's meshes, (V, n) or (F, n), by its names, which begin
+    # with "vertex_" or "face_"
     attributes: Mapping[str, Floats] = field(default_factory=dict)
-    # the faces (N,) of each material that its file names, by that name; each face is in one at most
+    # the faces (N,) of each material that its file names, by that name; each face is in
+    # one at most
     materials: Mapping[str, Ints] = field(default_factory=dict)
-    rig: MeshRig | None = None  # what moves its vertices, for the control `body`; None for what has no joints
+    # what moves its vertices, for the control `body`; None for what has no joints
+    rig: MeshRig | None = None
 
     @property
     def repeats(self) -> bool:
-        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond its edges."""
+        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond
+        its edges.
+        """
         return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
 
     def __post_init__(self) -> None:
         count = len(self.vertices)
-        for name, array, width in (("vertices", self.vertices, 3), ("normals", self.normals, 3), ("uvs", self.uvs, 2)):
+        for name, array, width in (
+            ("vertices", self.vertices, 3),
+            ("normals", self.normals, 3),
+            ("uvs", self.uvs, 2),
+        ):
             if array.shape != (count, width):
-                raise InputError(f"mesh {name}: expected shape ({count}, {width}), got {array.shape}")
+                raise InputError(
+                    f"mesh {name}: expected shape ({count}, {width}), got {array.shape}"
+                )
             if not np.isfinite(array).all():
-                raise InputError(f"mesh {name}: found NaN or infinite values; repair the mesh")
+                raise InputError(
+                    f"mesh {name}: found NaN or infinite values; repair the mesh"
+                )
         if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
-            raise InputError(f"mesh faces: expected shape (F, 3) with F > 0, got {self.faces.shape}; export triangles")
+            raise InputError(
+                "mesh faces: expected shape (F, 3) with F > 0, got "
+                f"{self.faces.shape}; export triangles"
+            )
         if int(self.faces.max()) >= count:
-            raise InputError(f"mesh faces: index {int(self.faces.max())} is past the last vertex {count - 1}")
+            raise InputError(
+                f"mesh faces: index {int(self.faces.max())} is past the "
+                f"last vertex {count - 1}"
+            )
 
 
 @dataclass(frozen=True)
 class Material:
-    """Parameters of the principled BSDF other than base colour; all in [0, 1] (Burley 2012, Disney principled)."""
+    """Parameters of the principled BSDF other than base colour; all in [0, 1] (Burley
+    2012, Disney principled).
+    """
 
     roughness: float = 0.5
     metallic: float = 0.0
@@ -94,8 +125,14 @@ class Material:
     clearcoat: float = 0.0
 
     def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
-        """Return the material with the settings over it whose names are `prefix` and the attribute's."""
-        given = {name: value for name in vars(self) if (value := values.get(prefix + name)) is not None}
+        """Return the material with the settings over it whose names are `prefix` and
+        the attribute's.
+        """
+        given = {
+            name: value
+            for name in vars(self)
+            if (value := values.get(prefix + name)) is not None
+        }
         return replace(self, **given)
 
 
@@ -104,7 +141,9 @@ class FileAxis:
     """An axis of a mesh file that is taken for up, or for the front."""
 
     axis: str  # up: "y" or "z"; front: one of `FACINGS`
-    reason: str = ""  # why, and what to do if it is wrong; empty where the user said it, or the format which is up
+    # why, and what to do if it is wrong; empty where the user said it, or the format
+    # which is up
+    reason: str = ""
 
 
 FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -113,116 +152,169 @@ FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and normal map are of the principled
-    surface; a normal map is `(n + 1) / 2` of unit normals along tangent (along u), normal x tangent and normal."""
+    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and
+    normal map are of the principled surface; a normal map is `(n + 1) / 2` of unit
+    normals along tangent (along u), normal x tangent and normal.
+    """
 
     name: str  # short, used in paths
     mesh: Mesh
     base_color: Floats  # (H, W, 3) display-referred sRGB in [0, 1]
-    material: Material = field(default_factory=Material)  # the remaining surface parameters
-    label: str | None = None  # the class it belongs to in the reference model, or None when unknown
-    # in place of the principled surface, Mitsuba's dictionary of one, with `parts.BASE_COLOR` where the texture goes
+    # the remaining surface parameters
+    material: Material = field(default_factory=Material)
+    # the class it belongs to in the reference model, or None when unknown
+    label: str | None = None
+    # in place of the principled surface, Mitsuba's dictionary of one, with
+    # `parts.BASE_COLOR` where the texture goes
     surface: Mapping[str, object] | None = None
-    opacity: Floats | None = None  # (H, W) in [0, 1], the share of light that does not pass through; None where it is 1
+    # (H, W) in [0, 1], the share of light that does not pass through; None where it is
+    # 1
+    opacity: Floats | None = None
     normal_map: Floats | None = None  # (H, W, 3)
-    emission: Floats | None = None  # (H, W, 3) linear radiance of its faces' front; (1, 1, 3): the same everywhere
+    # (H, W, 3) linear radiance of its faces' front; (1, 1, 3): the same everywhere
+    emission: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectAsset(Shape):
-    """The object a model should recognise. A None is what is not known, or does not come from a file."""
+    """The object a model should recognise. A None is what is not known, or does not
+    come from a file.
+    """
 
     source: str = ""  # where it came from, for messages and logs
-    warnings: tuple[str, ...] = ()  # what the importer had to repair or leave out, one sentence each
+    # what the importer had to repair or leave out, one sentence each
+    warnings: tuple[str, ...] = ()
     up: FileAxis | None = None  # the axis of the file that was taken for up
-    front: FileAxis | None = None  # the axis of the file that was taken for its front, which is +x here
-    # of several materials, what each of `mesh.materials` is like beside its base colour; `material` covers the rest
+    # the axis of the file that was taken for its front, which is +x here
+    front: FileAxis | None = None
+    # of several materials, what each of `mesh.materials` is like beside its base
+    # colour; `material` covers the rest
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    metres: float | None = None  # its largest extent, where distances of the camera are in metres (see below)
+    # its largest extent, where distances of the camera are in metres (see below)
+    metres: float | None = None
     extent: float | None = None  # its largest extent in the coordinates of its file
-    drives: bool = True  # in a lane it faces as the traffic drives; otherwise it faces those who come, as signs do
+    # in a lane it faces as the traffic drives; otherwise it faces those who come, as
+    # signs do
+    drives: bool = True
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how it was read: the up axis where that was guessed, and the warnings."""
+        """What a user should know of how it was read: the up axis where that was
+        guessed, and the warnings.
+        """
         guessed = (self.up.reason,) if self.up is not None and self.up.reason else ()
         return (*guessed, *self.warnings)
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentAsset:
-    """A light from everywhere: an equirectangular map. Row 0 looks straight up, and columns run as in a photograph (a
-    file's own order). Raises InputError: a texel is negative, NaN or infinite."""
+    """A light from everywhere: an equirectangular map. Row 0 looks straight up, and
+    columns run as in a photograph (a file's own order). Raises InputError: a texel is
+    negative, NaN or infinite.
+    """
 
     name: str  # short, used in paths
     radiance: Floats  # (H, W, 3) linear radiance
     source: str = ""  # where it came from
-    warnings: tuple[str, ...] = ()  # what the importer had to repair or leave out, one sentence each
-    photographed: bool = False  # it shows the floor of a real place: the ground that things stand on is that by itself
-    ground: str | None = None  # the kind of ground (`settings.GROUND_KINDS`) that belongs to it; None for the usual one
-    candelas: float | None = None  # luminance of a radiance of 1, cd/m2; None where its brightness means nothing
-    place: Any = None  # `parts.Place`: what stands around the object, from a file of the user's
+    # what the importer had to repair or leave out, one sentence each
+    warnings: tuple[str, ...] = ()
+    # it shows the floor of a real place: the ground that things stand on is that by
+    # itself
+    photographed: bool = False
+    # the kind of ground (`settings.GROUND_KINDS`) that belongs to it; None for the
+    # usual one
+    ground: str | None = None
+    # luminance of a radiance of 1, cd/m2; None where its brightness means nothing
+    candelas: float | None = None
+    # `parts.Place`: what stands around the object, from a file of the user's
+    place: Any = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
         if bad.any():
             row, column = np.unravel_index(int(bad.argmax()), bad.shape)
-            found = f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or infinite"
+            found = (
+                f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or "
+                "infinite"
+            )
             raise InputError(
-                f"environment {self.name!r}: expected finite radiance of at least 0, got {found} (the first in row "
+                f"environment {self.name!r}: expected finite radiance of at least 0, "
+                f"got {found} (the first in row "
                 f"{row}, column {column}); clamp them"
             )
 
 
 def face_vectors(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3), twice as long as their areas, out of triangles (F, 3, 3), counter-clockwise."""
+    """Return vectors (F, 3), twice as long as their areas, out of triangles (F, 3, 3),
+    counter-clockwise.
+    """
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,)."""
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place
+    (3,).
+    """
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = linear, place
     return pose
 
 
 def footing(points: Doubles) -> tuple[Doubles, float]:
-    """Return the place (3,) in the middle below some points (N, 3), and their largest extent."""
-    low, high = points.min(axis=0), points.max(axis=0)
+    """Return the place (3,) in the middle below some points (N, 3), and their largest
+    extent.
+    """
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
 
 
 def grouped(numbers: Ints) -> list[Ints]:
-    """Return, for each number from 0 to the largest of some (N,), the places at which it stands, rising."""
-    return np.split(np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1])
+    """Return, for each number from 0 to the largest of some (N,), the places at which
+    it stands, rising.
+    """
+    return np.split(
+        np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1]
+    )
 
 
 def normalised(mesh: Mesh) -> Mesh:
-    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and centred in x and y. Raises
-    InputError: all vertices coincide, so there is no size to normalise."""
+    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and
+    centred in x and y. Raises InputError: all vertices coincide, so there is no size to
+    normalise.
+    """
     vertices = mesh.vertices.astype(np.float64)
     origin, size = footing(vertices)
     if not size > 0.0:
-        raise InputError("mesh has no extent: all its vertices coincide; export the mesh again")
+        raise InputError(
+            "mesh has no extent: all its vertices coincide; export the mesh again"
+        )
     return replace(mesh, vertices=((vertices - origin) / size).astype(np.float32))
 
 
-GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)  # cells along the mesh's largest extent, tried in turn
-TEXTURE_CELLS = 32  # of the texture along each side: vertices of one place in different ones stay apart, as at seams
+# cells along the mesh's largest extent, tried in turn
+GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
+# of the texture along each side: vertices of one place in different ones stay apart, as
+# at seams
+TEXTURE_CELLS = 32
 
 
 def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
-    """Return what leaves at most `most` faces of a mesh, or of one that stands elsewhere, or the fewest of a coarse
-    grid; None: it has no more. After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
-    complex scenes"): vertices are clustered by a grid, and a face of which two corners meet is left out. Both sides of
-    a seam of the texture move together, so that no gap opens."""
+    """Return what leaves at most `most` faces of a mesh, or of one that stands
+    elsewhere, or the fewest of a coarse grid; None: it has no more. After Rossignac and
+    Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"):
+    vertices are clustered by a grid, and a face of which two corners meet is left out.
+    Both sides of a seam of the texture move together, so that no gap opens.
+    """
     if len(mesh.faces) <= most:
         return None
     low = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - low).max()), 1e-12)
     chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
     for grid in GRIDS:
-        cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(np.int64)
+        cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(
+            np.int64
+        )
         places = np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
         together = _key(np.column_stack([places, chart]))
         _, kept, left = np.unique(together, return_index=True, return_inverse=True)
@@ -231,11 +323,23 @@ def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
         faces = faces[(first != second) & (second != third) & (third != first)]
         if len(faces) <= most:
             break
-    rest, counts = np.unique(faces, axis=0).astype(np.uint32), np.bincount(places)
+    rest = np.unique(faces, axis=0).astype(np.uint32)
+    counts = np.bincount(places)
 
     def fewer(whole: Mesh) -> Mesh:
-        mean = np.stack([np.bincount(places, whole.vertices[:, axis]) / counts for axis in range(3)], axis=1)
-        return Mesh(mean[places[kept]].astype(np.float32), rest, whole.normals[kept], whole.uvs[kept])
+        mean = np.stack(
+            [
+                np.bincount(places, whole.vertices[:, axis]) / counts
+                for axis in range(3)
+            ],
+            axis=1,
+        )
+        return Mesh(
+            mean[places[kept]].astype(np.float32),
+            rest,
+            whole.normals[kept],
+            whole.uvs[kept],
+        )
 
     return fewer
 
@@ -251,15 +355,20 @@ def _key(rows: Ints) -> Ints:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How large things really are: an object's longest side in metres, from what is said of it or from its file.
+# How large things really are: an object's longest side in metres, from what is said of
+# it or from its file.
 #
-# A scene is as large as its object is 1. `ObjectAsset.metres` is the one number that makes metres of it: whatever
-# speaks of metres (distances of the camera, the road, what stands beside the object) divides by
-# `SceneDescription.metres`.
+# A scene is as large as its object is 1. `ObjectAsset.metres` is the one number that
+# makes metres of it: whatever speaks of metres (distances of the camera, the road, what
+# stands beside the object) divides by `SceneDescription.metres`.
 
-UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}  # metres of the units that a mesh may be in
-TRIPOD = 1.6  # metres above the floor from which photographed environments are taken, where nobody says it
-SMALLEST, LARGEST = 1e-4, 1e4  # metres of an object's longest side
+# metres of the units that a mesh may be in
+UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
+# metres above the floor from which photographed environments are taken, where nobody
+# says it
+TRIPOD = 1.6
+SMALLEST = 1e-4  # metres of an object's longest side
+LARGEST = 1e4
 USUAL = {
     "airplane": (6.0, 75.0), "apple": (0.05, 0.12), "backpack": (0.3, 0.8), "ball": (0.03, 0.4),
     "banana": (0.12, 0.3), "bed": (1.6, 2.4), "bench": (1.0, 2.5), "bicycle": (1.3, 2.0), "bike": (1.3, 2.3),
@@ -272,10 +381,16 @@ USUAL = {
     "teapot": (0.12, 0.4), "tractor": (2.5, 8.0), "train": (15.0, 400.0), "truck": (4.5, 20.0), "van": (3.8, 7.5),
     "vase": (0.1, 0.9), "vehicle": (2.0, 20.0), "woman": (1.3, 2.0),
 }  # fmt: skip
-"""Metres that the longest side of a thing lies between, by the word for it in the name of a file: wide, to tell one
-unit from another."""
-ROAD_VEHICLES = frozenset("bicycle bike bus car lorry motorcycle pickup sedan suv tractor truck van vehicle".split())
-"""Words for what is seen from the height of other road users, in the name or the label of an object."""
+"""Metres that the longest side of a thing lies between, by the word for it in the name
+of a file: wide, to tell one unit from another.
+"""
+ROAD_VEHICLES = frozenset(
+    "bicycle bike bus car lorry motorcycle pickup sedan suv "
+    "tractor truck van vehicle".split()
+)
+"""Words for what is seen from the height of other road users, in the name or the label
+of an object.
+"""
 
 
 def on_roads(asset: ObjectAsset) -> bool:
@@ -285,45 +400,78 @@ def on_roads(asset: ObjectAsset) -> bool:
 
 
 def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with its size in metres, where it is told: by `size`, of its longest side in metres, by `unit`,
-    one of `UNITS`, of its file, or by itself. Raises InputError: both are given, `size` is out of range, or the object
-    comes from no file that could have a unit."""
+    """Return an object with its size in metres, where it is told: by `size`, of its
+    longest side in metres, by `unit`, one of `UNITS`, of its file, or by itself. Raises
+    InputError: both are given, `size` is out of range, or the object comes from no file
+    that could have a unit.
+    """
     if size is None and unit is None:
         return asset
     if size is not None and unit is not None:
-        raise InputError("size and unit: both say how large the object is; leave one of them out")
+        raise InputError(
+            "size and unit: both say how large the object is; leave one of them out"
+        )
     if unit is not None and unit not in UNITS:
         raise InputError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     if unit is not None and asset.extent is None:
-        raise InputError(f"unit: {asset.name} is no mesh file; give its longest side in metres, such as size=0.1")
-    metres = float(size) if size is not None else (asset.extent or 0.0) * UNITS[unit or "m"]
-    if not SMALLEST <= metres <= LARGEST:
-        said = f"size={size:g}" if size is not None else f"unit={unit} for a mesh of {asset.extent:.4g}"
         raise InputError(
-            f"{said}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, got {metres:.4g}; give it in "
+            f"unit: {asset.name} is no mesh file; give its longest side "
+            "in metres, such as size=0.1"
+        )
+    metres = (
+        float(size) if size is not None else (asset.extent or 0.0) * UNITS[unit or "m"]
+    )
+    if not SMALLEST <= metres <= LARGEST:
+        said = (
+            f"size={size:g}"
+            if size is not None
+            else (f"unit={unit} for a mesh of {asset.extent:.4g}")
+        )
+        raise InputError(
+            f"{said}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
+            f"got {metres:.4g}; give it in "
             "metres, such as size=4.9"
         )
     return replace(asset, metres=metres)
 
 
 def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
-    """Return what is said where an object's size is unlike that of a thing of its name, or is not known: `asked` tells
-    that its user gave its size, `laid` that something in the scene has one in metres, such as the road."""
-    kind = next((word for word in reversed(re.split(r"[^a-z]+", asset.name.lower())) if word in USUAL), None)
+    """Return what is said where an object's size is unlike that of a thing of its name,
+    or is not known: `asked` tells that its user gave its size, `laid` that something in
+    the scene has one in metres, such as the road.
+    """
+    kind = next(
+        (
+            word
+            for word in reversed(re.split(r"[^a-z]+", asset.name.lower()))
+            if word in USUAL
+        ),
+        None,
+    )
     low, high = (0.005, 100.0) if kind is None else USUAL[kind]
     strange = asset.metres is not None and not low <= asset.metres <= high
-    missing = asset.metres is None and (laid or (kind is not None and asset.extent is not None))
+    missing = asset.metres is None and (
+        laid or (kind is not None and asset.extent is not None)
+    )
     if asked or not (strange or missing):
         return ()
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
     fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
     what = [
-        f"its longest side is {rounded(asset.metres or 0.0)} m" if strange else "its size in metres is not known",
+        f"its longest side is {rounded(asset.metres or 0.0)} m"
+        if strange
+        else "its size in metres is not known",
         f"it is {rounded(extent)} in its file" if missing and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
         "it is taken for 1 m, as the road is in metres" if missing and laid else "",
     ]
     give = f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
     if fits:
-        give += f", or `unit={fits[0]}`, which makes it {rounded(extent * UNITS[fits[0]])} m"
-    return (f"{asset.name}: {'; '.join(filter(None, what))}. {'If that is wrong, g' if strange else 'G'}{give[1:]}",)
+        give += (
+            f", or `unit={fits[0]}`, which makes it "
+            f"{rounded(extent * UNITS[fits[0]])} m"
+        )
+    return (
+        f"{asset.name}: {'; '.join(filter(None, what))}. "
+        f"{'If that is wrong, g' if strange else 'G'}{give[1:]}",
+    )

@@ -1,8 +1,9 @@
-"""Camera files of other tools, as the entries that OpenCV's have, and the names of those that are not read.
+"""Camera files of other tools, as the entries that OpenCV's have, and the names of
+those that are not read.
 
-Read, as the mapping is exact: ORB-SLAM and stella_vslam, KITTI's calibration, RealSense, OpenSfM and
-OpenDroneMap, and Metashape's `<calibration>`. Principal points come out from the centre of the first
-pixel, as OpenCV counts them.
+Read, as the mapping is exact: ORB-SLAM and stella_vslam, KITTI's calibration,
+RealSense, OpenSfM and OpenDroneMap, and Metashape's `<calibration>`. Principal points
+come out from the centre of the first pixel, as OpenCV counts them.
 """
 
 from __future__ import annotations
@@ -16,16 +17,25 @@ from advsearch.scene.camera_entries import number, select_camera
 from advsearch.scene.importing.files import shown
 
 FIT_FISHEYE = (
-    "calibrate it as a fisheye of OpenCV (cv2.fisheye.calibrate, Kalibr's pinhole-equi), or undistort the pictures"
+    "calibrate it as a fisheye of OpenCV (cv2.fisheye.calibrate, Kalibr's "
+    "pinhole-equi), or undistort the pictures"
 )
 OTHER_PROJECTIONS: Mapping[str, str] = {
-    **dict.fromkeys(("omni", "mei", "omnidir", "omnidirectional", "unified", "ucm"), "the unified model with a mirror"),
+    **dict.fromkeys(
+        ("omni", "mei", "omnidir", "omnidirectional", "unified", "ucm"),
+        "the unified model with a mirror",
+    ),
     **dict.fromkeys(("ds", "double_sphere"), "the double sphere model"),
     **dict.fromkeys(("eucm", "extended_unified"), "the extended unified model"),
     **dict.fromkeys(("fov", "atan"), "the FOV model"),
-    **dict.fromkeys(("scaramuzza", "ocam", "omnicalib", "ocamcalib", "pinhole_full"), "a polynomial of an angle"),
+    **dict.fromkeys(
+        ("scaramuzza", "ocam", "omnicalib", "ocamcalib", "pinhole_full"),
+        "a polynomial of an angle",
+    ),
     **dict.fromkeys(("ftheta", "f_theta"), "a polynomial of an angle"),
-    **dict.fromkeys(("division", "simple_division", "radial_division"), "a division model"),
+    **dict.fromkeys(
+        ("division", "simple_division", "radial_division"), "a division model"
+    ),
     **dict.fromkeys(
         ("thin_prism_fisheye", "rad_tan_thin_prism_fisheye", "fisheye62", "fisheye624"),
         "a fisheye with tangential and thin prism terms",
@@ -42,7 +52,8 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
     (
         r"# ?Bundle file",
         "a Bundler reconstruction, which has no size of its pictures",
-        "write the f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 RADIAL WIDTH HEIGHT f WIDTH/2 "
+        "write the f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 "
+        "RADIAL WIDTH HEIGHT f WIDTH/2 "
         "HEIGHT/2 k1 k2",
     ),
     (
@@ -58,12 +69,14 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
     (
         r"extrinsic\s",
         "a camera of MVSNet, which has no size of its picture",
-        "write its intrinsic matrix as YAML: image_width, image_height and camera_matrix",
+        "write its intrinsic matrix as YAML: image_width, image_height and "
+        "camera_matrix",
     ),
     (
         r"\[[A-Za-z][\w ]*\]\s*\n\s*[A-Za-z]\w*\s*=",
         "sections of an INI file, as of a ZED's calibration",
-        "write one section as YAML: image_width, image_height, fx, fy, cx, cy, k1, k2, p1, p2, k3, each with a colon",
+        "write one section as YAML: image_width, image_height, fx, fy, cx, cy, k1, k2, "
+        "p1, p2, k3, each with a colon",
     ),
     (
         r"<\?xpacket|<x:xmpmeta",
@@ -71,39 +84,63 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
         "export the registration as COLMAP's text, and give cameras.txt",
     ),
 )
-"""Texts that are no camera files of ours: how they begin, what they are, and what to do."""
+"""Texts that are no camera files of ours: how they begin, what they are, and what to
+do.
+"""
 
 METASHAPE_FILE = "calibration"
 METASHAPE_PROJECT = ("document", "chunk", "sensors", "sensor")
 ORBSLAM = re.compile(r"(Camera\d?)\.fx")
-ORBSLAM_KINDS = {"pinhole": "radtan", "kannalabrandt8": "kannala_brandt", "rectified": "none"}
+ORBSLAM_KINDS = {
+    "pinhole": "radtan",
+    "kannalabrandt8": "kannala_brandt",
+    "rectified": "none",
+}
 ORBSLAM_OF_NO_LENS = re.compile(
     r"(ORBextractor|Viewer|IMU|System|Stereo|RGBD|LoopClosing|File|Initializer|Tracking|Mapping|Preprocessing)\..*"
     r"|Camera\d?\.(fps|RGB|bf|b|overlappingBegin|overlappingEnd|name|setup|color_order)|ThDepth|DepthMapFactor"
 )
-STELLA_KINDS = {"perspective": "radtan", "fisheye": "fisheye", "equirectangular": "equirectangular"}
-STELLA_NAMES = {"cols": "image_width", "rows": "image_height", "model": "distortion_model"}
+STELLA_KINDS = {
+    "perspective": "radtan",
+    "fisheye": "fisheye",
+    "equirectangular": "equirectangular",
+}
+STELLA_NAMES = {
+    "cols": "image_width",
+    "rows": "image_height",
+    "model": "distortion_model",
+}
 KITTI_PROJECTION = re.compile(r"P\d")
 KITTI_RAW = re.compile(r"K_(\d\d)")
 KITTI_RECTIFIED = re.compile(r"P_(rect_\d\d)")
-KITTI_OF_NO_LENS = re.compile(r"P\d|R0_rect|R_rect|Tr(_\w+)?|calib_time|corner_dist|(S|K|D|R|T|P)_(rect_)?\d\d")
+KITTI_OF_NO_LENS = re.compile(
+    r"P\d|R0_rect|R_rect|Tr(_\w+)?|calib_time|corner_dist|(S|K|D|R|T|P)_(rect_)?\d\d"
+)
 REALSENSE_NAMES = {"ppx": "cx", "ppy": "cy", "model": "distortion_model"}
 OPENSFM_KINDS = {
     **dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "radtan"),
     **dict.fromkeys(("fisheye", "fisheye_opencv"), "fisheye"),
     **dict.fromkeys(("spherical", "equirectangular"), "equirectangular"),
 }
-METASHAPE_KINDS = {"frame": "radtan", "fisheye": "fisheye", "spherical": "equirectangular"}
+METASHAPE_KINDS = {
+    "frame": "radtan",
+    "fisheye": "fisheye",
+    "spherical": "equirectangular",
+}
 
 
 def describe_projection(name: str) -> str:
-    """Return what a model is, and what to do, to follow its name in an error; empty where it is not known."""
+    """Return what a model is, and what to do, to follow its name in an error; empty
+    where it is not known.
+    """
     known = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
     return "" if known is None else f", {known}, another projection; {FIT_FISHEYE}"
 
 
 def check_text_format(path: str, text: str) -> None:
-    """Raise FileFormatError for a text in a known format that is not read: what it is, and what to do."""
+    """Raise FileFormatError for a text in a known format that is not read: what it is,
+    and what to do.
+    """
     start = text.lstrip()[:2000]
     for pattern, what, how in OTHER_FORMATS:
         if re.match(pattern, start):
@@ -111,19 +148,26 @@ def check_text_format(path: str, text: str) -> None:
 
 
 def check_xml_root(path: str, tag: str) -> None:
-    """Raise FileFormatError for the root of an XML file that has no camera by itself."""
+    """Raise FileFormatError for the root of an XML file that has no camera by
+    itself.
+    """
     if tag in METASHAPE_PROJECT:
         raise FileFormatError(
-            f"{path}: expected one camera, got Metashape's <{tag}>, with sensors and poses; save the lens alone: "
-            "Tools > Camera Calibration > Adjusted > Save, as Agisoft XML (<calibration>)"
+            f"{path}: expected one camera, got Metashape's <{tag}>, with sensors and "
+            "poses; save the lens alone: "
+            "Tools > Camera Calibration > Adjusted > Save, as Agisoft XML "
+            "(<calibration>)"
         )
 
 
-def translate_entries(path: str, which: str, data: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the entries of one camera as OpenCV's files name them, or None where the file is of no other tool here.
+def translate_entries(
+    path: str, which: str, data: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """Return the entries of one camera as OpenCV's files name them, or None where the
+    file is of no other tool here.
 
-    Raises FileFormatError: a projection that is none of ours, several cameras of which none is named, or numbers
-    that are missing.
+    Raises FileFormatError: a projection that is none of ours, several cameras of which
+    none is named, or numbers that are missing.
     """
     orbslam_cameras = [match[1] for name in data if (match := ORBSLAM.fullmatch(name))]
     if orbslam_cameras:
@@ -131,34 +175,56 @@ def translate_entries(path: str, which: str, data: Mapping[str, Any]) -> dict[st
     kitti_cameras = _find_kitti(data)
     if kitti_cameras:
         return _translate_kitti(path, which, data, kitti_cameras)
-    if data and all(isinstance(entry, dict) and "projection_type" in entry for entry in data.values()):
+    if data and all(
+        isinstance(entry, dict) and "projection_type" in entry
+        for entry in data.values()
+    ):
         return _translate_opensfm(path, select_camera(path, which, data))
     if which:
         return None
     stella = data.get("Camera")
     if isinstance(stella, dict) and "model" in stella:
-        entries = {STELLA_NAMES.get(str(name), str(name)): value for name, value in stella.items()}
+        entries = {
+            STELLA_NAMES.get(str(name), str(name)): value
+            for name, value in stella.items()
+        }
         kind = str(stella["model"])
         entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
-        return {name: value for name, value in entries.items() if not ORBSLAM_OF_NO_LENS.fullmatch(f"Camera.{name}")}
+        return {
+            name: value
+            for name, value in entries.items()
+            if not ORBSLAM_OF_NO_LENS.fullmatch(f"Camera.{name}")
+        }
     if "ppx" in data:
         return _translate_realsense(data)
-    if data.get("projection") in METASHAPE_KINDS or ("projection" in data and "f" in data):
+    if data.get("projection") in METASHAPE_KINDS or (
+        "projection" in data and "f" in data
+    ):
         return _translate_metashape(path, data)
     return None
 
 
-def _translate_orbslam(path: str, which: str, data: Mapping[str, Any], cameras: list[str]) -> dict[str, Any]:
+def _translate_orbslam(
+    path: str, which: str, data: Mapping[str, Any], cameras: list[str]
+) -> dict[str, Any]:
     camera = select_camera(path, which, dict(zip(cameras, cameras, strict=True)))
     stated = str(data.get("Camera.type", "PinHole"))
-    entries: dict[str, Any] = {"distortion_model": ORBSLAM_KINDS.get(stated.lower(), stated)}
+    entries: dict[str, Any] = {
+        "distortion_model": ORBSLAM_KINDS.get(stated.lower(), stated)
+    }
     others = {name for name in cameras if name != camera}
     for name, value in data.items():
         group, _, rest = name.partition(".")
-        if ORBSLAM_OF_NO_LENS.fullmatch(name) or group in others or name == "Camera.type":
+        if (
+            ORBSLAM_OF_NO_LENS.fullmatch(name)
+            or group in others
+            or name == "Camera.type"
+        ):
             continue
         if group in (camera, "Camera"):
-            entries[{"width": "image_width", "height": "image_height"}.get(rest, rest)] = value
+            entries[
+                {"width": "image_width", "height": "image_height"}.get(rest, rest)
+            ] = value
         else:
             entries[name] = value
     return entries
@@ -167,7 +233,8 @@ def _translate_orbslam(path: str, which: str, data: Mapping[str, Any], cameras: 
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     """Return the entries with the matrices of KITTI's cameras, by the cameras' names.
 
-    Its numbers have blanks between them, and so are text; a list is the P1 of a stereo pair of OpenCV's.
+    Its numbers have blanks between them, and so are text; a list is the P1 of a stereo
+    pair of OpenCV's.
     """
     cameras = dict[str, str]()
     for name, value in data.items():
@@ -180,22 +247,34 @@ def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     return cameras
 
 
-def _read_numbers(path: str, data: Mapping[str, Any], name: str, count: int) -> list[float]:
+def _read_numbers(
+    path: str, data: Mapping[str, Any], name: str, count: int
+) -> list[float]:
     words = str(data.get(name, "")).split()
     if len(words) != count:
-        raise FileFormatError(f"{path}: {name}: expected {count} numbers, got {shown(' '.join(words) or 'nothing')}")
+        raise FileFormatError(
+            f"{path}: {name}: expected {count} numbers, got "
+            f"{shown(' '.join(words) or 'nothing')}"
+        )
     return [number(path, name, word) for word in words]
 
 
-def _translate_kitti(path: str, which: str, data: Mapping[str, Any], cameras: Mapping[str, str]) -> dict[str, Any]:
+def _translate_kitti(
+    path: str, which: str, data: Mapping[str, Any], cameras: Mapping[str, str]
+) -> dict[str, Any]:
     matrix_name = select_camera(path, which, cameras)
-    entries = {name: value for name, value in data.items() if not KITTI_OF_NO_LENS.fullmatch(name)}
+    entries = {
+        name: value
+        for name, value in data.items()
+        if not KITTI_OF_NO_LENS.fullmatch(name)
+    }
     raw = KITTI_RAW.fullmatch(matrix_name)
     if raw:
         entries["camera_matrix"] = _read_numbers(path, data, matrix_name, 9)
         entries["distortion_coefficients"] = _read_numbers(path, data, f"D_{raw[1]}", 5)
     else:
-        # a rectified camera: K [R | t] with R = 1, so that the first three columns are K
+        # a rectified camera: K [R | t] with R = 1, so that the first three columns are
+        # K
         rows = _read_numbers(path, data, matrix_name, 12)
         entries["camera_matrix"] = [*rows[0:3], *rows[4:7], *rows[8:11]]
     size_name = re.sub(r"^[KP]_", "S_", matrix_name)
@@ -203,7 +282,8 @@ def _translate_kitti(path: str, which: str, data: Mapping[str, Any], cameras: Ma
         entries["image_size"] = _read_numbers(path, data, size_name, 2)
     elif "image_width" not in data or "image_height" not in data:
         raise FileFormatError(
-            f"{path}: KITTI's calibration has no size of the pictures; add it in two lines, as in image_width: 1242 "
+            f"{path}: KITTI's calibration has no size of the pictures; add it in two "
+            "lines, as in image_width: 1242 "
             "and image_height: 375 (also 1241 x 376, 1226 x 370, 1224 x 370)"
         )
     return entries
@@ -211,14 +291,21 @@ def _translate_kitti(path: str, which: str, data: Mapping[str, Any], cameras: Ma
 
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
-    kind = re.sub(r"[-\s]+", "_", str(data.get("model", "none")).rpartition(".")[2].strip().lower())
+    kind = re.sub(
+        r"[-\s]+",
+        "_",
+        str(data.get("model", "none")).rpartition(".")[2].strip().lower(),
+    )
     coefficients = data.get("coeffs")
     is_zero = isinstance(coefficients, list) and not any(coefficients)
     if kind in ("kannala_brandt4", "kannala_brandt"):
         kind = "kannala_brandt"
-        entries["coeffs"] = coefficients[:4] if isinstance(coefficients, list) else coefficients
+        entries["coeffs"] = (
+            coefficients[:4] if isinstance(coefficients, list) else coefficients
+        )
     elif is_zero and kind in ("inverse_brown_conrady", "modified_brown_conrady"):
-        kind = "none"  # all of Brown's polynomials are the same where their coefficients are 0
+        # all of Brown's polynomials are the same where their coefficients are 0
+        kind = "none"
     entries["distortion_model"] = kind
     return entries
 
@@ -228,28 +315,57 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     entries = {
         name: value
         for name, value in camera.items()
-        if name not in ("projection_type", "width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y")
+        if name
+        not in (
+            "projection_type",
+            "width",
+            "height",
+            "focal",
+            "focal_x",
+            "focal_y",
+            "c_x",
+            "c_y",
+        )
     }
-    width, height = (number(path, side, camera.get(side)) for side in ("width", "height"))
-    entries |= {"distortion_model": OPENSFM_KINDS.get(stated, stated), "image_width": width, "image_height": height}
+    width, height = (
+        number(path, side, camera.get(side)) for side in ("width", "height")
+    )
+    entries |= {
+        "distortion_model": OPENSFM_KINDS.get(stated, stated),
+        "image_width": width,
+        "image_height": height,
+    }
     if OPENSFM_KINDS.get(stated) in (None, "equirectangular"):
         return entries
     side = max(width, height)  # lengths are in this
     focal_x = number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
     entries["fx"] = side * focal_x
     entries["fy"] = side * number(path, "focal_y", camera.get("focal_y", focal_x))
-    entries["cx"] = (width - 1.0) / 2.0 + side * number(path, "c_x", camera.get("c_x", 0.0))
-    entries["cy"] = (height - 1.0) / 2.0 + side * number(path, "c_y", camera.get("c_y", 0.0))
+    entries["cx"] = (width - 1.0) / 2.0 + side * number(
+        path, "c_x", camera.get("c_x", 0.0)
+    )
+    entries["cy"] = (height - 1.0) / 2.0 + side * number(
+        path, "c_y", camera.get("c_y", 0.0)
+    )
     return entries
 
 
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Agisoft Metashape's manual, appendix "Camera models": offsets are from the middle of the picture, p1 and p2 stand
-    the other way round than OpenCV's, and k4 is the fourth of a polynomial."""
+    """Agisoft Metashape's manual, appendix "Camera models": offsets are from the middle
+    of the picture, p1 and p2 stand the other way round than OpenCV's, and k4 is the
+    fourth of a polynomial.
+    """
     stated = str(data.get("projection", "frame"))
-    value = {name: number(path, name, data.get(name, 0.0)) for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")}
+    value = {
+        name: number(path, name, data.get(name, 0.0))
+        for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")
+    }
     width, height = (number(path, side, data.get(side)) for side in ("width", "height"))
-    entries = {name: given for name, given in data.items() if name not in (*value, "projection", "width", "height")}
+    entries = {
+        name: given
+        for name, given in data.items()
+        if name not in (*value, "projection", "width", "height")
+    }
     kind = METASHAPE_KINDS.get(stated, stated)
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":
@@ -272,7 +388,8 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
         entries["k4"] = value["k4"]
     elif value["k4"]:
         raise FileFormatError(
-            f"{path}: k4: expected 0, got {value['k4']:g}: the fourth radial term of Metashape is not OpenCV's; leave "
+            f"{path}: k4: expected 0, got {value['k4']:g}: the fourth radial term of "
+            "Metashape is not OpenCV's; leave "
             "k4 out of the fit and optimize the cameras again"
         )
     return entries

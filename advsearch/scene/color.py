@@ -1,4 +1,6 @@
-"""The sRGB encoding and its inverse, for numpy arrays and torch tensors (IEC 61966-2-1), and its 8-bit levels."""
+"""The sRGB encoding and its inverse, for numpy arrays and torch tensors (IEC
+61966-2-1), and its 8-bit levels.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,11 @@ LOW_END = 0.0031308  # linear values up to which the encoding is straight
 
 
 def srgb_to_linear(display: Values) -> Values:
-    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32; differentiable everywhere."""
-    low_end, low = display <= 0.04045, display / 12.92
+    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32;
+    differentiable everywhere.
+    """
+    low_end = display <= 0.04045
+    low = display / 12.92
     curve = ((display.clip(0.04045, None) + 0.055) / 1.055) ** 2.4
     if isinstance(display, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
@@ -27,9 +32,12 @@ def srgb_to_linear(display: Values) -> Values:
 
 
 def linear_to_srgb(linear: Values) -> Values:
-    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32; differentiable."""
+    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape,
+    float32; differentiable.
+    """
     clipped = linear.clip(0.0, 1.0)
-    low_end, low = clipped <= LOW_END, clipped * 12.92
+    low_end = clipped <= LOW_END
+    low = clipped * 12.92
     curve = 1.055 * clipped.clip(LOW_END, None) ** (1.0 / 2.4) - 0.055
     if isinstance(linear, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
@@ -37,17 +45,23 @@ def linear_to_srgb(linear: Values) -> Values:
 
 
 def levels_of(display: Tensor) -> Tensor:
-    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not differentiable."""
+    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not
+    differentiable.
+    """
     return (display.detach() * 255.0).round().byte()
 
 
 def to_8_bit(display: Tensor) -> Tensor:
-    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
+    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not
+    differentiable.
+    """
     return (display.detach() * 255.0).round() / 255.0
 
 
 def combine_channels(values: Mapping[str, Tensor]) -> Tensor:
-    """Return the linear color (3,) of the display-referred numbers red, green and blue; differentiable."""
+    """Return the linear color (3,) of the display-referred numbers red, green and blue;
+    differentiable.
+    """
     import torch  # whoever has tensors has it already
 
     return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))

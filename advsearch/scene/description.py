@@ -1,8 +1,10 @@
-"""A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
+"""A scene as data: meshes, of which one is the object, lamps, an environment and the
+settings; nothing of Mitsuba.
 
-Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. Lengths of the camera and of a photograph's floor and paths of files are in metres where the object has a
-size in metres. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is
+1 before `pose.scale`), angles in degrees. Lengths of the camera and of a photograph's
+floor and paths of files are in metres where the object has a size in metres. The camera
+at azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -18,7 +20,15 @@ import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import geometry, library, settings
-from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, sized
+from advsearch.scene.assets import (
+    TRIPOD,
+    Doubles,
+    EnvironmentAsset,
+    Material,
+    ObjectAsset,
+    doubts,
+    sized,
+)
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
@@ -35,7 +45,12 @@ from advsearch.scene.grounds import (
 )
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
+from advsearch.scene.importing.scenes import (
+    MITSUBA_FILE,
+    ImportedScene,
+    import_scene,
+    split_node,
+)
 from advsearch.scene.parts import (
     CAMERA,
     BeamLamp,
@@ -52,16 +67,23 @@ from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.things import ThingPart, ground_height, with_solids_checked, with_things
+from advsearch.scene.things import (
+    ThingPart,
+    ground_height,
+    with_solids_checked,
+    with_things,
+)
 from advsearch.trust.stored_files import reading
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"  # the name of the mesh under test
-ENVIRONMENT = "environment"  # what stands for the environment among the settings that were asked for
+# what stands for the environment among the settings that were asked for
+ENVIRONMENT = "environment"
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"  # what the environment of a scene without a map is called
-OWN_MAP = "own"  # what the scene's own environment is called where another may be chosen
+# what the scene's own environment is called where another may be chosen
+OWN_MAP = "own"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,29 +91,46 @@ class SceneDescription:
     """Everything that fixes a scene except what a control varies."""
 
     object: ObjectAsset  # the thing to recognise
-    environment: EnvironmentAsset | None  # the map that lights it; None where only lamps do
-    # every setting of `advsearch.scene.settings` by name; None where the scene works the value out. Those of meshes
-    # around the object, `pose:chair.yaw`, only where they were given
+    # the map that lights it; None where only lamps do
+    environment: EnvironmentAsset | None
+    # every setting of `advsearch.scene.settings` by name; None where the scene works
+    # the value out. Those of meshes around the object, `pose:chair.yaw`, only where
+    # they were given
     values: Mapping[str, float | None] = field(default_factory=dict)
-    object_spec: str = ""  # how the object was asked for: a bundled name, a path, or an asset's own name
+    # how the object was asked for: a bundled name, a path, or an asset's own name
+    object_spec: str = ""
     environment_spec: str = ""  # how the environment was asked for, likewise
     up: str | None = None  # the up axis that was given for a mesh file
     facing: str | None = None  # the axis of a mesh file that was given for its front
     size: float | None = None  # the object's longest side in metres that was given
-    unit: str | None = None  # of the object's file, that was given (`advsearch.scene.assets.UNITS`)
-    given: frozenset[str] = frozenset()  # what was asked for: names of settings, and "environment"
-    parts: tuple[ScenePart, ...] = ()  # beside object, environment and ground: further meshes, lamps, haze
+    # of the object's file, that was given (`advsearch.scene.assets.UNITS`)
+    unit: str | None = None
+    # what was asked for: names of settings, and "environment"
+    given: frozenset[str] = frozenset()
+    # beside object, environment and ground: further meshes, lamps, haze
+    parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False  # the camera has an aperture and a focus distance
-    backdrop: bool = False  # the environment may be hidden behind a plain colour (`backdrop.color`)
+    # the environment may be hidden behind a plain colour (`backdrop.color`)
+    backdrop: bool = False
     aspect: float = 1.0  # width over height of the picture
-    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)  # those with poses of their own, by name
-    camera: str = ORBIT_CAMERA  # name of the one in use; `ORBIT_CAMERA` for that of the settings
-    preset: str = ""  # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for none
-    camera_model: CameraModel | None = None  # of the camera around the object; None for a pinhole
-    rig: tuple[Mount, ...] = ()  # cameras that take pictures at the same time, this one first; empty where it is alone
+    # those with poses of their own, by name
+    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
+    # name of the one in use; `ORBIT_CAMERA` for that of the settings
+    camera: str = ORBIT_CAMERA
+    # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for
+    # none
+    preset: str = ""
+    # of the camera around the object; None for a pinhole
+    camera_model: CameraModel | None = None
+    # cameras that take pictures at the same time, this one first; empty where it is
+    # alone
+    rig: tuple[Mount, ...] = ()
     rig_spec: str = ""  # how they were asked for
-    metered: bool = True  # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it
-    remarks: tuple[str, ...] = ()  # for users: of further files that controls have read, of things in each other
+    # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
+    # shows it
+    metered: bool = True
+    # for users: of further files that controls have read, of things in each other
+    remarks: tuple[str, ...] = ()
     things_spec: str = ""  # how the things beside the object were asked for
 
     def with_part(self, part: ScenePart) -> SceneDescription:
@@ -99,16 +138,29 @@ class SceneDescription:
         taken = {own.name: own for own in self.parts}
         if part.name in (OBJECT, "environment", "ground", "camera", *taken):
             plugin = isinstance(taken.get(part.name), PluginPart)
-            instead = f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]" if plugin else ""
+            instead = (
+                f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]"
+                if plugin
+                else ""
+            )
             raise InputError(
-                f"`controls` {part.name}: the scene has something of that name already; choose another name, as in "
+                f"`controls` {part.name}: the scene has something of that name "
+                "already; choose another name, as in "
                 f"light:{part.name}-2{instead}"
             )
         return replace(self, parts=(*self.parts, part))
 
     def with_values(self, **given: float | None) -> SceneDescription:
-        """Return the scene with some settings replaced; dots in their names are written as two underscores."""
-        return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
+        """Return the scene with some settings replaced; dots in their names are written
+        as two underscores.
+        """
+        return replace(
+            self,
+            values={
+                **self.values,
+                **{name.replace("__", "."): v for name, v in given.items()},
+            },
+        )
 
     def without_ground(self) -> SceneDescription:
         """Return the scene without a table, a road or a place."""
@@ -116,14 +168,18 @@ class SceneDescription:
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
-        """Return a bundled object or one from a mesh file. Raises InputError: there is none, or it can't be used."""
+        """Return a bundled object or one from a mesh file. Raises InputError: there is
+        none, or it can't be used.
+        """
         return _object(spec, None, None)
 
     def seen_by(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens: by
-        a path to a camera file, the name of a bundled camera model, or that of a mounted camera. Raises
-        UnknownNameError: it has no such camera. Raises InputError: a setting of the camera around the object was given,
-        and another is to see it; or a file cannot be used."""
+        """Return the scene as one of its cameras sees it, or as the camera around the
+        object does with another lens: by a path to a camera file, the name of a bundled
+        camera model, or that of a mounted camera. Raises UnknownNameError: it has no
+        such camera. Raises InputError: a setting of the camera around the object was
+        given, and another is to see it; or a file cannot be used.
+        """
         if camera in PRESETS and camera not in self.cameras:
             return self._mounted(camera)
         seen = replace(self, camera=ORBIT_CAMERA, camera_model=None)
@@ -131,11 +187,15 @@ class SceneDescription:
             if not is_path(camera) and camera not in bundled():
                 known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
                 raise UnknownNameError(
-                    "camera", camera, known, "Or give the path of a camera file, such as calib.yaml."
+                    "camera",
+                    camera,
+                    known,
+                    "Or give the path of a camera file, such as calib.yaml.",
                 )
             model = bundled().get(camera)
             if is_path(camera) and (rig := read_rig(camera)):
-                model, fov = rig[0].model, rig[0].fov
+                model = rig[0].model
+                fov = rig[0].fov
                 seen = replace(seen, rig=rig, rig_spec=camera)
                 seen = seen if fov is None else seen.with_values(camera__fov=fov)
             elif is_path(camera):
@@ -144,22 +204,33 @@ class SceneDescription:
             if model is not None:
                 model.check_given(self.given)
             return replace(seen, camera_model=model)
-        idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
+        idle = sorted(
+            name
+            for name in self.given
+            if name.startswith("camera.") and name != "camera.exposure"
+        )
         if camera != ORBIT_CAMERA and idle:
             raise InputError(
-                f"`camera={camera}` and `set` {idle[0]} contradict each other: the camera of the file has a place and "
+                f"`camera={camera}` and `set` {idle[0]} contradict each other: the "
+                "camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
         return replace(seen, camera=camera)
 
     def _mounted(self, name: str) -> SceneDescription:
-        preset, own = PRESETS[name], {"camera.fov": PRESETS[name].fov}
+        preset = PRESETS[name]
+        own = {"camera.fov": PRESETS[name].fov}
         if self.object.metres is None:
             raise InputError(
-                f"`camera={name}` is {preset.height:g} m high, and how large {self.object.name} is is not known; give "
+                f"`camera={name}` is {preset.height:g} m high, and how large "
+                f"{self.object.name} is is not known; give "
                 "its longest side in metres, such as `size=0.1`"
             )
-        on_plane = self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
+        on_plane = (
+            self.number("ground.size") > 0.0
+            and self.photograph is None
+            and not paved(self)
+        )
         on_table = on_plane and self.object.metres <= ON_TABLES
         if "camera.elevation" not in self.given:
             place = find_place(self)
@@ -169,8 +240,17 @@ class SceneDescription:
             own["camera.azimuth"] = 0.0
         if on_table:
             own["ground.size"] = TABLE_SIDE / self.metres
-        values = {**self.values, **{setting: value for setting, value in own.items() if setting not in self.given}}
-        seen = replace(self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values)
+        values = {
+            **self.values,
+            **{
+                setting: value
+                for setting, value in own.items()
+                if setting not in self.given
+            },
+        }
+        seen = replace(
+            self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values
+        )
         if "camera.distance" in self.given:
             return seen
         fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
@@ -179,7 +259,9 @@ class SceneDescription:
 
     @property
     def azimuth_zero(self) -> float:
-        """The direction from the object, in degrees from +x, in which the camera of azimuth 0 stands."""
+        """The direction from the object, in degrees from +x, in which the camera of
+        azimuth 0 stands.
+        """
         return 180.0 if self.is_in_lane and self.object.drives else 0.0
 
     @property
@@ -189,12 +271,24 @@ class SceneDescription:
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
-        around = {name: geometry.moved_part(part, self.values) for name, part in self.around.items()}
-        object_part = mesh_part(OBJECT, self.object, geometry.object_to_world(self), self.material)
+        """Every mesh by name, as the settings have it; the one under test is
+        `OBJECT`.
+        """
+        around = {
+            name: geometry.moved_part(part, self.values)
+            for name, part in self.around.items()
+        }
+        object_part = mesh_part(
+            OBJECT, self.object, geometry.object_to_world(self), self.material
+        )
         meshes = {OBJECT: object_part, **around}
-        glasses = {name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)}
-        return meshes | {name: replace(one, to_world=meshes[one.carrier].to_world) for name, one in glasses.items()}
+        glasses = {
+            name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
+        }
+        return meshes | {
+            name: replace(one, to_world=meshes[one.carrier].to_world)
+            for name, one in glasses.items()
+        }
 
     @cached_property
     def around(self) -> Mapping[str, MeshPart]:
@@ -208,16 +302,26 @@ class SceneDescription:
 
     @property
     def cut_out(self) -> bool:
-        return any(mesh.opacity is not None for mesh in self.meshes.values()) or self._has("mask")
+        return any(
+            mesh.opacity is not None for mesh in self.meshes.values()
+        ) or self._has("mask")
 
     @property
     def normal_mapped(self) -> bool:
-        return any(mesh.normal_map is not None for mesh in self.meshes.values()) or self._has("normalmap", "bumpmap")
+        return any(
+            mesh.normal_map is not None for mesh in self.meshes.values()
+        ) or self._has("normalmap", "bumpmap")
 
     def _has(self, *kinds: str) -> bool:
-        surfaces = [mesh.surface for mesh in self.meshes.values() if mesh.surface is not None]
+        surfaces = [
+            mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
+        ]
         plugins = [part.plugin for part in self.parts if isinstance(part, PluginPart)]
-        return any(inner.get("type") in kinds for plugin in (*surfaces, *plugins) for inner in plugins_in(plugin))
+        return any(
+            inner.get("type") in kinds
+            for plugin in (*surfaces, *plugins)
+            for inner in plugins_in(plugin)
+        )
 
     @property
     def emits(self) -> bool:
@@ -226,7 +330,11 @@ class SceneDescription:
     @property
     def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
-        return {part.name: self.placed(part) for part in self.parts if isinstance(part, Lamp)}
+        return {
+            part.name: self.placed(part)
+            for part in self.parts
+            if isinstance(part, Lamp)
+        }
 
     def placed(self, part: ScenePart) -> Any:
         """Return one of the parts as the settings and the camera have it."""
@@ -236,17 +344,23 @@ class SceneDescription:
             carrier = geometry.driving(torch.from_numpy(geometry.camera_to_world(self)))
         else:
             carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
-        return replace(part, to_world=geometry.seated(carrier, torch.from_numpy(part.seat)).numpy())
+        return replace(
+            part, to_world=geometry.seated(carrier, torch.from_numpy(part.seat)).numpy()
+        )
 
     @property
     def lit(self) -> bool:
         """Whether there is anything that shines."""
-        shining = any(part.shines for part in self.parts if isinstance(part, PluginPart))
+        shining = any(
+            part.shines for part in self.parts if isinstance(part, PluginPart)
+        )
         return self.environment is not None or bool(self.lamps) or shining or self.emits
 
     @property
     def metres(self) -> float:
-        """What lengths in metres are to be divided by to be in object sizes: the object's size in metres, or 1."""
+        """What lengths in metres are to be divided by to be in object sizes: the
+        object's size in metres, or 1.
+        """
         return self.object.metres or 1.0
 
     @property
@@ -256,30 +370,47 @@ class SceneDescription:
 
     @property
     def environment_name(self) -> str:
-        """How the environment was asked for, or else its own name; `NO_MAP` where there is none."""
-        return self.environment_spec or (NO_MAP if self.environment is None else self.environment.name)
+        """How the environment was asked for, or else its own name; `NO_MAP` where there
+        is none.
+        """
+        return self.environment_spec or (
+            NO_MAP if self.environment is None else self.environment.name
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how object and environment were read, and what controls name."""
+        """What a user should know of how object and environment were read, and what
+        controls name.
+        """
         lit = () if self.environment is None else self.environment.warnings
         seen = () if self.camera_model is None else self.camera_model.notes
         size = doubts(self.object, asked=self.size is not None, laid=paved(self))
         front = self.object.front
-        faces = (front.reason,) if front is not None and (self.is_in_lane or has_lanes(self)) else ()
+        faces = (
+            (front.reason,)
+            if front is not None and (self.is_in_lane or has_lanes(self))
+            else ()
+        )
         drives = (traffic_remark(self),) if self._meets_traffic else ()
         notes = (*self.object.notes, *faces, *size, *lit, *seen, *drives, *self.remarks)
         return tuple(dict.fromkeys(note for note in notes if note))
 
     @property
     def _meets_traffic(self) -> bool:
-        return self.is_seen_from_orbit and is_against_traffic(self, geometry.camera_to_world(self))
+        return self.is_seen_from_orbit and is_against_traffic(
+            self, geometry.camera_to_world(self)
+        )
 
     def environment_for(self, who: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map. Raises InputError: the scene has none."""
+        """Return the environment for what cannot do without a map. Raises InputError:
+        the scene has none.
+        """
         if self.environment is None:
             check_one_environment(self.parts, who)
-            raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
+            raise InputError(
+                f"{who}: the scene has no environment map; give it one, "
+                f"or leave {who} out"
+            )
         return self.environment
 
     @property
@@ -289,15 +420,21 @@ class SceneDescription:
 
     @property
     def metered_irradiance(self) -> float:
-        """Irradiance for which the exposure of its images is metered, in scene units."""
+        """Irradiance for which the exposure of its images is metered, in scene
+        units.
+        """
         return METERED_WHITE * math.pi / (WHITE * metered_gain(self))
 
     def list_environment_light(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Return unit directions (N, 3) to the environment's light, solid angles (N,), and radiance times these."""
+        """Return unit directions (N, 3) to the environment's light, solid angles (N,),
+        and radiance times these.
+        """
         return arriving(self)
 
     def ground_height(self, place: Doubles) -> float:
-        """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
+        """Return how high the ground lies at a place (2,), object sizes: road,
+        pavement, table or floor; or 0.
+        """
         return ground_height(self, place)
 
     @property
@@ -306,7 +443,9 @@ class SceneDescription:
         return geometry.standing(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
-        """Return a setting that always has a value; of the field of view, that of the camera in use."""
+        """Return a setting that always has a value; of the field of view, that of the
+        camera in use.
+        """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
             return self.cameras[self.camera].larger_fov(self.aspect)
         value = self.values[name]
@@ -316,31 +455,51 @@ class SceneDescription:
 
     @property
     def given_values(self) -> dict[str, float | str]:
-        """The settings that were asked for, as they are written: a choice by its name."""
+        """The settings that were asked for, as they are written: a choice by its
+        name.
+        """
         asked: dict[str, float | str] = {}
         for name in self.given & self.values.keys():
-            value, setting = self.values[name], settings.parameter_of(name)
+            value = self.values[name]
+            setting = settings.parameter_of(name)
             if value is not None:
-                asked[name] = setting.options[int(value)] if setting is not None and setting.options else value
+                asked[name] = (
+                    setting.options[int(value)]
+                    if setting is not None and setting.options
+                    else value
+                )
         return asked
 
     @property
     def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table, or nothing. Where `ground.kind`
-        is not given, it does so for a photographed environment, unless a table is described or the environment may be
-        hidden behind a colour, which would hide everything above the horizon alone."""
-        own, kind = self.environment, self.values.get("ground.kind")
+        """The ground that shows the environment's photograph; None where it is a table,
+        or nothing. Where `ground.kind` is not given, it does so for a photographed
+        environment, unless a table is described or the environment may be hidden behind
+        a colour, which would hide everything above the horizon alone.
+        """
+        own = self.environment
+        kind = self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
         if kind is not None:
             shows = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
         else:
-            shows = own.photographed and not self.backdrop and self.given.isdisjoint(settings.TABLE_SETTINGS)
-        return photograph_of(own, self.capture_height, self.number("environment.rotation")) if shows else None
+            shows = (
+                own.photographed
+                and not self.backdrop
+                and self.given.isdisjoint(settings.TABLE_SETTINGS)
+            )
+        return (
+            photograph_of(own, self.capture_height, self.number("environment.rotation"))
+            if shows
+            else None
+        )
 
     @property
     def capture_height(self) -> float:
-        """Height above the floor from which the environment's photograph was taken, object sizes."""
+        """Height above the floor from which the environment's photograph was taken,
+        object sizes.
+        """
         height = self.values.get("ground.height")
         if height is None and self.object.metres is None:
             return settings.PHOTOGRAPHED_FROM
@@ -358,13 +517,17 @@ class SceneDescription:
 
     @property
     def gain(self) -> float:
-        """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        stops, unit = self.values.get("camera.ev"), None if self.environment is None else self.environment.candelas
+        """Factor from scene radiance to display-linear values: the metered exposure
+        times `camera.exposure`.
+        """
+        stops = self.values.get("camera.ev")
+        unit = None if self.environment is None else self.environment.candelas
         if stops is None:
             exposure = metered_gain(self) if self.metered else 1.0
         elif unit is None:
             raise InputError(
-                "`set` camera.ev: the brightness of this environment has no unit; take one of the avenue, or leave "
+                "`set` camera.ev: the brightness of this environment has no unit; take "
+                "one of the avenue, or leave "
                 "camera.ev out, and exposure is metered"
             )
         else:  # saturation (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)
@@ -384,21 +547,36 @@ def describe(
     plugins: Mapping[str, object] | None = None,
     things: str | None = None,
 ) -> SceneDescription:
-    """Find and read an object and an environment, bundled or from a file; arguments and errors as of
-    `advsearch.load_scene`. What stands around a node of a glTF scene or a shape of a Mitsuba scene stays there, without
-    the ground plane, and without a map if it has lights of its own; `plugins` are a Mitsuba scene as its loader takes
-    it, in which `object_spec` is the id of a shape; an environment of `NO_MAP` is no map at all."""
+    """Find and read an object and an environment, bundled or from a file; arguments and
+    errors as of `advsearch.load_scene`. What stands around a node of a glTF scene or a
+    shape of a Mitsuba scene stays there, without the ground plane, and without a map if
+    it has lights of its own; `plugins` are a Mitsuba scene as its loader takes it, in
+    which `object_spec` is the id of a shape; an environment of `NO_MAP` is no map at
+    all.
+    """
     given = given or {}
     values = settings.resolve(given)
-    file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
-    mitsuba = plugins is not None or (node is not None and str(file).lower().endswith(MITSUBA_FILE))
+    file, node = (
+        split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
+    )
+    mitsuba = plugins is not None or (
+        node is not None and str(file).lower().endswith(MITSUBA_FILE)
+    )
     if up is not None and (mitsuba or node is not None):
-        why = "the first camera of a Mitsuba scene says which way is up" if mitsuba else "glTF files have y up"
+        why = (
+            "the first camera of a Mitsuba scene says which way is up"
+            if mitsuba
+            else "glTF files have y up"
+        )
         raise InputError(f"up: {why}; leave `up` out")
     if facing is not None and (mitsuba or node is not None):
-        raise InputError("facing: a scene file stays as it is; leave `facing` out, or turn the object: `set` pose.yaw")
+        raise InputError(
+            "facing: a scene file stays as it is; leave `facing` out, or "
+            "turn the object: `set` pose.yaw"
+        )
     if mitsuba:
-        from advsearch.scene.mitsuba_backend.scene_files import import_plugins  # a circle: it takes descriptions
+        # a circle: it takes descriptions
+        from advsearch.scene.mitsuba_backend.scene_files import import_plugins
     if plugins is not None:
         around = import_plugins(plugins, node or str(object_spec))
     elif node is None:
@@ -407,13 +585,18 @@ def describe(
         with reading(path := Path(str(file))):
             around = import_plugins(path, node) if mitsuba else import_scene(path, node)
     around = replace(around, object=sized(around.object, size, unit))
-    shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
+    shining = (
+        isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines)
+        for part in around.surroundings
+    )
     alone = any(shining) or (mitsuba and around.object.emission is not None)
     lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
     check_ground(given, lit_by)
     if lit_by != NO_MAP:
         check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
-    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given):
+    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(
+        given
+    ):
         values["ground.size"] = 0.0
     if isinstance(lit_by, EnvironmentAsset) or lit_by == NO_MAP:
         environment = lit_by if isinstance(lit_by, EnvironmentAsset) else None
@@ -424,7 +607,9 @@ def describe(
             environment = library.import_environment(Path(lit_by))
     else:
         environment = library.load_environment(str(lit_by))
-    orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given)
+    orbits = any(
+        name.startswith("camera.") and name != "camera.exposure" for name in given
+    )
     described = SceneDescription(
         around.object, environment, values, _spec(object_spec), _spec(lit_by), up, facing, size, unit,
         given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
@@ -438,44 +623,64 @@ def describe(
     check_meshes(described, values)
     idle = [name for name in given if name.startswith("material.")]
     if described.object.surface is not None and idle:
-        whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
-        raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
+        whose = (
+            "several materials"
+            if described.object.finishes
+            else "a surface of Mitsuba's own"
+        )
+        raise InputError(
+            f"`set` {idle[0]}: the object has {whose}, without it; leave it out"
+        )
     return described
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named. Raises UnknownNameError: it has not."""
+    """Check that a scene has the meshes whose settings are named. Raises
+    UnknownNameError: it has not.
+    """
     for name in names:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
-            raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
+            raise UnknownNameError(
+                "mesh around the object",
+                mesh,
+                scene.around,
+                f"It stands in `set` {name}.",
+            )
 
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
-    """Refuse an environment, or what needs one that is a map of ours, asked for by `who`, as it is written, beside one
-    that a Mitsuba scene has of its own among its parts. Raises InputError: there are two."""
+    """Refuse an environment, or what needs one that is a map of ours, asked for by
+    `who`, as it is written, beside one that a Mitsuba scene has of its own among its
+    parts. Raises InputError: there are two.
+    """
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
-                f"{who}: the Mitsuba scene has an environment of its own, {part.name} (a {part.plugin['type']}), and "
-                f"there can be one only; leave {who} out, or take {part.name} out of the scene"
+                f"{who}: the Mitsuba scene has an environment of its own, {part.name} "
+                f"(a {part.plugin['type']}), and "
+                f"there can be one only; leave {who} out, or take {part.name} out of "
+                "the scene"
             )
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
-    """Refuse what contradicts a ground that shows the environment's photograph. Raises InputError: there is no
-    photograph, or a table is described beside it."""
+    """Refuse what contradicts a ground that shows the environment's photograph. Raises
+    InputError: there is no photograph, or a table is described beside it.
+    """
     kind = given.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(
-            "`set` ground.kind=photograph: the scene has no environment map to show; give it one, or leave it out"
+            "`set` ground.kind=photograph: the scene has no environment map to show; "
+            "give it one, or leave it out"
         )
     described = [name for name in settings.TABLE_SETTINGS if name in given]
     if described:
         raise InputError(
-            f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: only a table has that; "
+            f"`set` ground.kind={kind} and `set` {described[0]} contradict each other: "
+            "only a table has that; "
             f"leave one of the two out"
         )
 
@@ -488,21 +693,35 @@ def _load_thing(spec: str, facing: str | None) -> ObjectAsset:
     return _object(spec, None, facing)
 
 
-def _object(spec: str | Path | ObjectAsset, up: str | None, facing: str | None) -> ObjectAsset:
+def _object(
+    spec: str | Path | ObjectAsset, up: str | None, facing: str | None
+) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
         with reading(spec):
-            return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None, facing=facing)
+            return import_object(
+                Path(spec),
+                up="y" if up == "y" else "z" if up == "z" else None,
+                facing=facing,
+            )
     if up is not None:
         raise InputError(
-            f"up: bundled objects stand upright already; leave `up` out, or give a file instead of {spec!r}"
+            "up: bundled objects stand upright already; leave `up` out, or give a "
+            f"file instead of {spec!r}"
         )
     if facing is not None:
-        raise InputError(f"facing: {spec} is bundled and faces +x; leave `facing` out, or turn it: `set` pose.yaw")
+        raise InputError(
+            f"facing: {spec} is bundled and faces +x; leave `facing` out, "
+            "or turn it: `set` pose.yaw"
+        )
     return library.load_object(str(spec))
 
 
 def is_path(spec: str | Path) -> bool:
-    """A spec with a folder or a file ending is a path; a bare word is a bundled name."""
-    return isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""
+    """A spec with a folder or a file ending is a path; a bare word is a bundled
+    name.
+    """
+    return (
+        isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""
+    )

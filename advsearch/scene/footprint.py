@@ -8,7 +8,9 @@ from advsearch.scene.assets import Doubles
 
 
 class Footprint(NamedTuple):
-    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
+    """What something takes up: its convex outline on the ground, corners (K, 2), and
+    between which heights.
+    """
 
     outline: Doubles
     low: float

@@ -1,16 +1,20 @@
-"""Where things stand: the object's pose and the camera's place, as 4 x 4 matrices in numpy (column vectors, z up).
+"""Where things stand: the object's pose and the camera's place, as 4 x 4 matrices in
+numpy (column vectors, z up).
 
-Framing is how far from the object the camera stands where nobody says so. The distance depends on the object, the field
-of view and the shape of the picture alone, never on where the camera is moved to: a configuration is one picture,
-whether its azimuth is a setting, a fixed value or a point of a grid. It is the smallest distance at which
+Framing is how far from the object the camera stands where nobody says so. The distance
+depends on the object, the field of view and the shape of the picture alone, never on
+where the camera is moved to: a configuration is one picture, whether its azimuth is a
+setting, a fixed value or a point of a grid. It is the smallest distance at which
 
-- from the default direction the object reaches at most `FRAME_FILL` of the way to the edge of the picture,
-- from every azimuth at the default elevation all of it is in the picture, so that no search turns the end of a long
-  object out of it, and
+- from the default direction the object reaches at most `FRAME_FILL` of the way to the
+edge of the picture,
+- from every azimuth at the default elevation all of it is in the picture, so that no
+  search turns the end of a long object out of it, and
 - the camera stays outside the sphere around the object.
 
-A vertex at offset `o` from the middle projects at `(o.left, o.up) / (distance - o.outwards)`, so that each vertex asks
-for `distance >= o.outwards + max(|o.left| / tx, |o.up| / ty)`, where tx and ty are the tangents of half the picture.
+A vertex at offset `o` from the middle projects at `(o.left, o.up) / (distance -
+o.outwards)`, so that each vertex asks for `distance >= o.outwards + max(|o.left| / tx,
+|o.up| / ty)`, where tx and ty are the tangents of half the picture.
 """
 
 from __future__ import annotations
@@ -38,9 +42,12 @@ from advsearch.scene.skeleton import entries_of_turn as entries_of_turn
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FRAME_FILL = 0.86  # share of the picture's half-width that the object may reach when the distance is worked out
+# share of the picture's half-width that the object may reach when the distance is
+# worked out
+FRAME_FILL = 0.86
 CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the object
-STEEPEST = math.sin(math.radians(89.0))  # sine of the largest elevation, for a height that would need a steeper one
+# sine of the largest elevation, for a height that would need a steeper one
+STEEPEST = math.sin(math.radians(89.0))
 NEAREST = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
@@ -55,66 +62,103 @@ class Frame:
     high: float
 
     @staticmethod
-    def of(fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Frame:
-        """Return the frame of a camera with a field of view along the larger side, degrees, an aspect of width over
-        height, and a shift of the picture to the right in its widths and downwards in its heights: what it shows moves
-        the other way."""
+    def of(
+        fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)
+    ) -> Frame:
+        """Return the frame of a camera with a field of view along the larger side,
+        degrees, an aspect of width over height, and a shift of the picture to the right
+        in its widths and downwards in its heights: what it shows moves the other way.
+        """
         larger = math.tan(math.radians(fov) / 2.0)
-        x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
-        right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
+        x = larger * min(1.0, aspect)
+        y = larger * min(1.0, 1.0 / aspect)
+        right = 2.0 * x * shift[0]
+        down = 2.0 * y * shift[1]
         return Frame(-x + right, x + right, -y - down, y - down)
 
     def corners(self) -> Doubles:
         """Unit directions (4, 3) to the corners."""
-        tangents = [(x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)]
+        tangents = [
+            (x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)
+        ]
         corners = np.array(tangents)
         return np.asarray(corners / np.linalg.norm(corners, axis=-1, keepdims=True))
 
 
-def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
-    """Return the distance of the camera to the middle of a scene's object, () float64 in object sizes, for a field of
-    view () along the larger side of the picture, degrees, and its width over height; differentiable in the first."""
-    offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description)).to(fov.device)
+def framing_distance(
+    description: SceneDescription, fov: Tensor, aspect: float
+) -> Tensor:
+    """Return the distance of the camera to the middle of a scene's object, () float64
+    in object sizes, for a field of view () along the larger side of the picture,
+    degrees, and its width over height; differentiable in the first.
+    """
+    offsets = torch.from_numpy(
+        description.object.mesh.vertices.astype(np.float64) - middle(description)
+    ).to(fov.device)
     model = description.camera_model
     if model is not None and model.name:  # of what it shows, a rectangle
         edge = torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
     else:
-        shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
+        shape = torch.tensor(
+            [min(1.0, aspect), min(1.0, 1.0 / aspect)],
+            dtype=torch.float64,
+            device=fov.device,
+        )
         edge = torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
-    azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
+    azimuth, elevation, roll = (
+        float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW
+    )
     axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
-    (left, up, outwards), (wide, high) = offsets.matmul(axes).unbind(dim=1), edge * FRAME_FILL
+    (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
+    (wide, high) = edge * FRAME_FILL
     fits = (outwards + torch.maximum(left.abs() / wide, up.abs() / high)).max()
     whole = _from_all_around(offsets, elevation, edge)
-    return torch.maximum(fits, whole).clamp_min(float(offsets.norm(dim=1).max()) + CLEARANCE)
+    return torch.maximum(fits, whole).clamp_min(
+        float(offsets.norm(dim=1).max()) + CLEARANCE
+    )
 
 
 def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
-    """Return the unit vectors to the left and upwards in the picture and from the object to the camera: rows, (3, 3);
-    for the camera's direction around the object, its height above the ground plane, and the picture's rotation,
-    counter-clockwise, all in degrees."""
-    azimuth, elevation, roll = math.radians(azimuth), math.radians(elevation), math.radians(roll)
-    level, up = math.cos(elevation), math.sin(elevation)
+    """Return the unit vectors to the left and upwards in the picture and from the
+    object to the camera: rows, (3, 3); for the camera's direction around the object,
+    its height above the ground plane, and the picture's rotation, counter-clockwise,
+    all in degrees.
+    """
+    azimuth = math.radians(azimuth)
+    elevation = math.radians(elevation)
+    roll = math.radians(roll)
+    level = math.cos(elevation)
+    up = math.sin(elevation)
     outwards = np.array([level * math.cos(azimuth), level * math.sin(azimuth), up])
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     upright = np.cross(-outwards, left)
-    turned = math.cos(roll) * left + math.sin(roll) * upright, math.cos(roll) * upright - math.sin(roll) * left
+    turned = (
+        math.cos(roll) * left + math.sin(roll) * upright,
+        math.cos(roll) * upright - math.sin(roll) * left,
+    )
     return np.stack([*turned, outwards])
 
 
 def middle(description: SceneDescription) -> Doubles:
-    """Return what the camera looks at: the middle (3,) of the object's bounding box in its default pose."""
+    """Return what the camera looks at: the middle (3,) of the object's bounding box in
+    its default pose.
+    """
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
 def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
-    """The distance at which every vertex projects inside the tangents, from every azimuth at one elevation. Seen from
-    all around, a vertex runs through a circle of radius rho at height z: what it asks for is a sine of the azimuth plus
-    a constant for each edge of the picture, whose largest value is known in closed form."""
-    rho, z = offsets[:, :2].norm(dim=1), offsets[:, 2]
-    cosine, sine = math.cos(math.radians(elevation)), math.sin(math.radians(elevation))
-    across, along = 1.0 / tangents[0], 1.0 / tangents[1]
+    """The distance at which every vertex projects inside the tangents, from every
+    azimuth at one elevation. Seen from all around, a vertex runs through a circle of
+    radius rho at height z: what it asks for is a sine of the azimuth plus a constant
+    for each edge of the picture, whose largest value is known in closed form.
+    """
+    rho = offsets[:, :2].norm(dim=1)
+    z = offsets[:, 2]
+    cosine = math.cos(math.radians(elevation))
+    sine = math.sin(math.radians(elevation))
+    across = 1.0 / tangents[0]
+    along = 1.0 / tangents[1]
     aside = rho * torch.sqrt(across**2 + cosine**2) + z * sine
     above = rho * (cosine - sine * along).abs() + z * (sine + cosine * along)
     below = rho * (cosine + sine * along).abs() + z * (sine - cosine * along)
@@ -123,7 +167,10 @@ def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Ten
 
 def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix."""
-    (cz, sz), (cy, sy), (cx, sx) = ((math.cos(math.radians(a)), math.sin(math.radians(a))) for a in (yaw, pitch, roll))
+    (cz, sz), (cy, sy), (cx, sx) = (
+        (math.cos(math.radians(a)), math.sin(math.radians(a)))
+        for a in (yaw, pitch, roll)
+    )
     rz = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
     ry = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     rx = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
@@ -131,50 +178,78 @@ def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
 
 
 def affine(linear: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,); differentiable."""
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,);
+    differentiable.
+    """
     top = torch.cat([linear, place[:, None]], dim=1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
 
 
 def object_to_world(description: SceneDescription) -> Doubles:
-    """Return the object's pose: scale and rotate about the middle of its bounding box, keep it on the ground, shift.
-    "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added, whatever the rotation."""
+    """Return the object's pose: scale and rotate about the middle of its bounding box,
+    keep it on the ground, shift. "On the ground" means that the lowest vertex is at z =
+    0 before `pose.z` is added, whatever the rotation.
+    """
     vertices = description.object.mesh.vertices.astype(np.float64)
-    pose = {parameter.name: description.number(f"pose.{parameter.name}") for parameter in POSE}
+    pose = {
+        parameter.name: description.number(f"pose.{parameter.name}")
+        for parameter in POSE
+    }
     return _posed(vertices, 0.0, pose)
 
 
 def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
-    """Return a mesh around the object, as it came, as the settings have it: posed about its own middle, where it
-    stands, by those that are called `pose:NAME.yaw` and so on."""
-    pose = {own.name: value for own in POSE if (value := values.get(f"pose:{part.name}.{own.name}")) is not None}
+    """Return a mesh around the object, as it came, as the settings have it: posed about
+    its own middle, where it stands, by those that are called `pose:NAME.yaw` and so on.
+    """
+    pose = {
+        own.name: value
+        for own in POSE
+        if (value := values.get(f"pose:{part.name}.{own.name}")) is not None
+    }
     if pose:
-        places, pose = standing(part), {**{own.name: float(own.default) for own in POSE}, **pose}
-        part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
-    return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
+        places = standing(part)
+        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
+        part = replace(
+            part,
+            to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world,
+        )
+    return replace(
+        part, material=part.material.with_values(values, f"material:{part.name}.")
+    )
 
 
 def standing(part: MeshPart) -> Doubles:
     """Return where the vertices (V, 3) of a mesh are in its base pose."""
-    return np.asarray(part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T + part.to_world[:3, 3])
+    return np.asarray(
+        part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
+        + part.to_world[:3, 3]
+    )
 
 
 def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
-    """Scale and rotate places (V, 3) about the middle of their bounding box by parameters of `settings.POSE`, put the
-    lowest at `floor`, and shift; returns (4, 4)."""
+    """Scale and rotate places (V, 3) about the middle of their bounding box by
+    parameters of `settings.POSE`, put the lowest at `floor`, and shift; returns (4, 4).
+    """
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
     lowest = float(((places - middle) @ linear.T)[:, 2].min())
-    place = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
+    place = (
+        np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
+    )
     place[:2] += middle[:2]
     return pose_of(linear, place)
 
 
-def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
-    """Return the pose of the camera in use, for a picture of an aspect (width over height; None for the description's):
-    by default on an orbit around the middle of the object, looking at it. The camera looks along its own +z with +y up
-    and +x to the left, as Mitsuba's sensors do. It frames the object in its default pose, so that a shifted or scaled
-    object moves in the picture."""
+def camera_to_world(
+    description: SceneDescription, aspect: float | None = None
+) -> Doubles:
+    """Return the pose of the camera in use, for a picture of an aspect (width over
+    height; None for the description's): by default on an orbit around the middle of the
+    object, looking at it. The camera looks along its own +z with +y up and +x to the
+    left, as Mitsuba's sensors do. It frames the object in its default pose, so that a
+    shifted or scaled object moves in the picture.
+    """
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
@@ -182,30 +257,54 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     if (asked := description.values["camera.distance"]) is not None:
         distance = asked / description.metres
     else:
-        distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
-    elevation, height = number("camera.elevation"), description.values.get("camera.height")
+        distance = float(
+            framing_distance(
+                description,
+                torch.tensor(number("camera.fov"), dtype=torch.float64),
+                aspect,
+            )
+        )
+    elevation = number("camera.elevation")
+    height = description.values.get("camera.height")
     if height is not None:
         above = (height / description.metres - float(middle(description)[2])) / distance
         elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
     azimuth = description.azimuth_zero + number("camera.azimuth")
     axes = camera_axes(azimuth, elevation, number("camera.roll"))
-    return pose_of(np.stack([axes[0], axes[1], -axes[2]], axis=1), middle(description) + distance * axes[2])
+    return pose_of(
+        np.stack([axes[0], axes[1], -axes[2]], axis=1),
+        middle(description) + distance * axes[2],
+    )
 
 
 def projected(
-    description: SceneDescription, inputs: Mapping[str, Tensor], points: Tensor, size: tuple[int, int]
+    description: SceneDescription,
+    inputs: Mapping[str, Tensor],
+    points: Tensor,
+    size: tuple[int, int],
 ) -> tuple[Tensor, Tensor]:
-    """Return where points (N, 3) float64 in the camera's coordinates are seen by scene inputs, (N, 2) pixels to the
-    right and down from the middle of a picture of a size (height, width), and which are before the camera, (N,) bool.
+    """Return where points (N, 3) float64 in the camera's coordinates are seen by scene
+    inputs, (N, 2) pixels to the right and down from the middle of a picture of a size
+    (height, width), and which are before the camera, (N,) bool.
     """
     sides = torch.tensor(size[::-1], dtype=torch.float64)
-    points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)  # to the right, down and ahead
+    # to the right, down and ahead
+    points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)
     if (model := description.camera_model) is not None:
-        model = model.with_numbers(inputs["camera.lens"].detach()) if "camera.lens" in inputs else model
+        model = (
+            model.with_numbers(inputs["camera.lens"].detach())
+            if "camera.lens" in inputs
+            else model
+        )
         places, seen = model.project(points)
         return (places - 0.5) * sides, seen
-    fov = inputs.get("camera.fov", torch.tensor(description.number("camera.fov"))).double().reshape(())
-    focal, depth = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0), points[:, 2]
+    fov = (
+        inputs.get("camera.fov", torch.tensor(description.number("camera.fov")))
+        .double()
+        .reshape(())
+    )
+    focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
+    depth = points[:, 2]
     places = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
@@ -214,39 +313,62 @@ def projected(
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4), which may be scaled."""
+    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4),
+    which may be scaled.
+    """
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
-    return affine(carrier[:3, :3] / scale @ seat[:3, :3], carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3])
+    return affine(
+        carrier[:3, :3] / scale @ seat[:3, :3],
+        carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3],
+    )
 
 
 def driving(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of a car that a camera with the pose (4, 4) looks ahead from: level, with its +x ahead,
-    on the ground below the camera; differentiable."""
+    """Return the pose (4, 4) of a car that a camera with the pose (4, 4) looks ahead
+    from: level, with its +x ahead, on the ground below the camera; differentiable.
+    """
     ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    none, along = torch.zeros_like(ahead[0]), torch.ones_like(ahead[0])
-    axes = torch.stack([ahead[0], -ahead[1], none, ahead[1], ahead[0], none, none, none, along]).reshape(3, 3)
+    none = torch.zeros_like(ahead[0])
+    along = torch.ones_like(ahead[0])
+    axes = torch.stack(
+        [ahead[0], -ahead[1], none, ahead[1], ahead[0], none, none, none, along]
+    ).reshape(3, 3)
     return affine(axes, torch.cat([camera[:2, 3], none[None]]))
 
 
 @lru_cache(maxsize=4)
 def real_harmonics(height: int, width: int) -> Tensor:
-    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9). Each
-    has root mean square 1 over the sphere (Ramamoorthi and Hanrahan 2001, section 3)."""
+    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal
+    angles: (height, width, 9). Each has root mean square 1 over the sphere (Ramamoorthi
+    and Hanrahan 2001, section 3).
+    """
     theta = (torch.arange(height) + 0.5) * math.pi / height
     phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
     x = theta.sin()[:, None] * phi.cos()[None]
     y = theta.sin()[:, None] * phi.sin()[None]
     z = theta.cos()[:, None].expand(height, width)
-    root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
+    root3 = math.sqrt(3.0)
+    root15 = math.sqrt(15.0)
+    root5 = math.sqrt(5.0)
     first = [torch.ones_like(z), root3 * y, root3 * z, root3 * x]
-    second = [root15 * x * y, root15 * y * z, root5 / 2.0 * (3.0 * z * z - 1.0), root15 * x * z]
+    second = [
+        root15 * x * y,
+        root15 * y * z,
+        root5 / 2.0 * (3.0 * z * z - 1.0),
+        root15 * x * z,
+    ]
     return torch.stack([*first, *second, root15 / 2.0 * (x * x - y * y)], dim=-1)
 
 
 def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix; differentiable."""
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    (cz, sz), (cy, sy), (cx, sx) = ((torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll)))
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix;
+    differentiable.
+    """
+    zero = torch.zeros_like(yaw)
+    one = torch.ones_like(yaw)
+    (cz, sz), (cy, sy), (cx, sx) = (
+        (torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll))
+    )
     about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, one]).reshape(3, 3)
     about_y = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
     about_x = torch.stack([one, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)
@@ -254,17 +376,20 @@ def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
 
 
 def rotation_vector(degrees: Tensor) -> Tensor:
-    """Return the rotation about the axis of a vector by its length in degrees, (3,) to (3, 3).
+    """Return the rotation about the axis of a vector by its length in degrees, (3,) to
+    (3, 3).
 
-    Rodrigues' formula with guarded series, so that value and derivative are right at zero, where the plain formula is
-    NaN.
+    Rodrigues' formula with guarded series, so that value and derivative are right at
+    zero, where the plain formula is NaN.
     """
     vector = degrees * (math.pi / 180.0)
     square = vector.square().sum()
     small = square < 1e-6
     angle = torch.sqrt(torch.where(small, torch.ones_like(square), square))
     sine = torch.where(small, 1.0 - square / 6.0, torch.sin(angle) / angle)
-    cosine = torch.where(small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / angle.square())
+    cosine = torch.where(
+        small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / angle.square()
+    )
     x, y, z = vector
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -272,7 +397,14 @@ def rotation_vector(degrees: Tensor) -> Tensor:
 
 
 PARKED = 1e-3  # size of an occluder that is put away, behind the camera
-SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
+SURROUNDINGS = (
+    "camera.to_world",
+    "camera.fov",
+    "camera.shift",
+    "camera.lens",
+    "object.to_world",
+    "object.offsets",
+)
 """Inputs of other controls that an occluder goes by."""
 
 
@@ -282,14 +414,18 @@ def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
 
 
 def put_away(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose (4, 4)."""
+    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose
+    (4, 4).
+    """
     return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
 
 
 def footprint(points: Doubles) -> Footprint:
     """Return what a cloud of points (N, 3) takes up."""
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
-    return Footprint(points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max()))
+    return Footprint(
+        points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max())
+    )
 
 
 def overlapping(one: Footprint, other: Footprint) -> bool:
@@ -299,18 +435,30 @@ def overlapping(one: Footprint, other: Footprint) -> bool:
 
 
 def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
-    """Return from where to where one thing overlaps with another as it is shifted along a way (2,), in lengths of that;
-    (inf, -inf) where it never does. By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
-    each of which says so of a stretch."""
+    """Return from where to where one thing overlaps with another as it is shifted along
+    a way (2,), in lengths of that; (inf, -inf) where it never does. By separating axes
+    (Ericson 2005, Real-Time Collision Detection, section 5.2.1), each of which says so
+    of a stretch.
+    """
     if min(one.high, other.high) <= max(one.low, other.low):
         return math.inf, -math.inf
-    edges = np.concatenate([np.roll(points, -1, axis=0) - points for points in (one.outline, other.outline)])
+    edges = np.concatenate(
+        [
+            np.roll(points, -1, axis=0) - points
+            for points in (one.outline, other.outline)
+        ]
+    )
     across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    first, second, speed = one.outline @ across.T, other.outline @ across.T, across @ way
-    reach = np.stack([second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)])
+    first = one.outline @ across.T
+    second = other.outline @ across.T
+    speed = across @ way
+    reach = np.stack(
+        [second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)]
+    )
     still = speed == 0.0
     if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
         return math.inf, -math.inf
     stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
-    begin, end = float(stretches[0].max()), float(stretches[1].min())
+    begin = float(stretches[0].max())
+    end = float(stretches[1].min())
     return (begin, end) if begin < end else (math.inf, -math.inf)

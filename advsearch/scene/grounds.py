@@ -1,4 +1,6 @@
-"""What things stand on beside a plain table: the floor of the environment's photograph, a road, or a place."""
+"""What things stand on beside a plain table: the floor of the environment's photograph,
+a road, or a place.
+"""
 
 from __future__ import annotations
 
@@ -21,79 +23,110 @@ from advsearch.scene.places.place_file import lay_place, load_bundled_place
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)
+# shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)
+LUMINANCE = (0.2126, 0.7152, 0.0722)
 SECTORS = 128
 RINGS = 64
-NEAREST, FARTHEST = 0.01, 1000.0
-"""Radii of the innermost and the outermost ring of vertices, in heights of the camera. Beyond, the map itself is seen,
-less than 0.06 degrees below the horizon."""
+NEAREST = 0.01
+FARTHEST = 1000.0
+"""Radii of the innermost and the outermost ring of vertices, in heights of the camera.
+Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
+"""
 
 
 class Photograph:
-    """The ground that shows an equirectangular map's photograph and catches what the scene does to its light.
+    """The ground that shows an equirectangular map's photograph and catches what the
+    scene does to its light.
 
-    A photographed environment shows the floor that its camera stood on. That part of the map is projected from the
-    height of the camera onto the plane z = 0, and the plane gets the reflectance that shows the photograph where
+    A photographed environment shows the floor that its camera stood on. That part of
+    the map is projected from the height of the camera onto the plane z = 0, and the
+    plane gets the reflectance that shows the photograph where
     nothing is in the way of the light:
 
         reflectance(p) = pi map(from (0, 0, height) to p) / E,   E = irradiance of the map's upper half on the plane
 
-    A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' / E`: the photograph times what
-    the scene leaves of the light, and adds to it. That is the quotient form of differential rendering (Debevec,
-    Rendering synthetic objects into real scenes, SIGGRAPH 1998, section 5) in one render instead of two, and an
+    A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' /
+    E`: the photograph times what the scene leaves of the light, and adds to it. That is
+    the quotient form of differential rendering (Debevec, Rendering synthetic objects
+    into real scenes, SIGGRAPH 1998, section 5) in one render instead of two, and an
     ordinary scene: every derivative, guide and mask is that of a plane with a texture.
 
-    Where the photograph shows what is brighter than a white floor in this light, a lamp, a window low down or its
-    reflection, the reflectance is above 1. Such texels still look as photographed.
+    Where the photograph shows what is brighter than a white floor in this light, a
+    lamp, a window low down or its reflection, the reflectance is above 1. Such texels
+    still look as photographed.
 
-    It is made of linear radiance (H, W, 3), row 0 straight up, the camera's height above the ground in object sizes,
-    and the map's rotation about the vertical in degrees.
+    It is made of linear radiance (H, W, 3), row 0 straight up, the camera's height
+    above the ground in object sizes, and the map's rotation about the vertical in
+    degrees.
     """
 
     def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
         self._rows = radiance.shape[0]
         self._first = (self._rows - 1) // 2
-        # rings around the point below the camera, with the map's own coordinates as texture coordinates
+        # rings around the point below the camera, with the map's own coordinates as
+        # texture coordinates
         radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
         turns = np.linspace(0.0, 1.0, SECTORS + 1)
         radius, turn = np.meshgrid(radii, turns, indexing="ij")
         azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
         polar = math.pi - np.arctan(radius)
-        vertices = height * np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1)
+        vertices = height * np.stack(
+            [radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1
+        )
         texels = self._rows - self._first
         row = polar / math.pi * (self._rows - 1) - self._first
         uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
         inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
         outer = inner + SECTORS + 1
         further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
-        faces = np.concatenate([np.stack([outer, inner, outer + 1], axis=1), further]).astype(np.uint32)
-        normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1))
-        places, texture = vertices.reshape(-1, 3).astype(np.float32), uvs.reshape(-1, 2).astype(np.float32)
+        faces = np.concatenate(
+            [np.stack([outer, inner, outer + 1], axis=1), further]
+        ).astype(np.uint32)
+        normals = np.tile(
+            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
+        )
+        places = vertices.reshape(-1, 3).astype(np.float32)
+        texture = uvs.reshape(-1, 2).astype(np.float32)
         self.mesh = Mesh(places, faces, normals, texture)
-        self.base = self.reflectance(torch.from_numpy(np.asarray(radiance, dtype=np.float32)))
+        self.base = self.reflectance(
+            torch.from_numpy(np.asarray(radiance, dtype=np.float32))
+        )
 
     def reflectance(self, radiance: Tensor) -> Tensor:
-        """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light comes from above.
-        Differentiable; row 0 is the horizon, the last one is straight down, and columns are those of the map."""
+        """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light
+        comes from above. Differentiable; row 0 is the horizon, the last one is straight
+        down, and columns are those of the map.
+        """
         rows = radiance.shape[0]
-        at = torch.arange(self._first, self._rows, device=radiance.device) * ((rows - 1) / (self._rows - 1))
+        at = torch.arange(self._first, self._rows, device=radiance.device) * (
+            (rows - 1) / (self._rows - 1)
+        )
         upper = at.floor().long().clamp_max(rows - 2)
         share = (at - upper)[:, None, None].to(radiance.dtype)
         lower_half = radiance[upper] + share * (radiance[upper + 1] - radiance[upper])
         arriving = irradiance(radiance)
-        return torch.where(arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0)
+        return torch.where(
+            arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
+        )
 
 
 @lru_cache(maxsize=4)
-def photograph_of(environment: EnvironmentAsset, height: float, rotation: float) -> Photograph:
+def photograph_of(
+    environment: EnvironmentAsset, height: float, rotation: float
+) -> Photograph:
     return Photograph(environment.radiance, height, rotation)
 
 
 def irradiance(radiance: Tensor) -> Tensor:
-    """Return the irradiance (3,) of a map (H, W, 3) on an unshadowed horizontal surface; differentiable."""
+    """Return the irradiance (3,) of a map (H, W, 3) on an unshadowed horizontal
+    surface; differentiable.
+    """
     rows, columns = radiance.shape[:2]
-    edges = (torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5) * (math.pi / (rows - 1))
-    within = edges.clamp(0.0, math.pi / 2.0).sin().square() / 2.0  # the integral of cos sin
+    edges = (
+        torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
+    ) * (math.pi / (rows - 1))
+    # the integral of cos sin
+    within = edges.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
     weights = (within.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
     return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)
 
@@ -110,17 +143,24 @@ def has_lanes(scene: SceneDescription) -> bool:
 
 
 LANE_WIDTH = 3.5  # metres, of the lane that the object stands in where no place says it
-CAR_CAMERA = 2.5  # metres above the road up to which a camera in the lane may be that of a car
+# metres above the road up to which a camera in the lane may be that of a car
+CAR_CAMERA = 2.5
 
 
 def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
-    """Tell whether a camera of a pose (4, 4) drives in the object's lane towards its front."""
+    """Tell whether a camera of a pose (4, 4) drives in the object's lane towards its
+    front.
+    """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
     ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
     height = float(camera[2, 3]) * scene.metres
     place = find_place(scene)
-    width = LANE_WIDTH if place is None or place.file.lane_width is None else place.file.lane_width
+    width = (
+        LANE_WIDTH
+        if place is None or place.file.lane_width is None
+        else place.file.lane_width
+    )
     return bool(ahead > 0.0 and abs(aside) <= width / 2.0 and height <= CAR_CAMERA)
 
 
@@ -128,13 +168,16 @@ def traffic_remark(scene: SceneDescription) -> str:
     """Return what users are told of a camera that drives against the traffic."""
     behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
-        f"The camera is in the lane of {scene.object.name} and looks at its front, against the traffic; behind it is "
+        f"The camera is in the lane of {scene.object.name} and looks at its front, "
+        "against the traffic; behind it is "
         f"`set` camera.azimuth={behind:g}"
     )
 
 
 def enclosed(scene: SceneDescription) -> bool:
-    """Tell whether so much stands around the object that light paths seldom leave the scene."""
+    """Tell whether so much stands around the object that light paths seldom leave the
+    scene.
+    """
     return any(part.laid and not part.is_ground for part in scene.around.values())
 
 
@@ -153,7 +196,9 @@ PLACES: Mapping[str, tuple[str, str | None]] = {
 
 
 def find_ground_kind(scene: SceneDescription) -> str | None:
-    """Return the kind of ground that a scene's environment and its settings ask for; None where they name none."""
+    """Return the kind of ground that a scene's environment and its settings ask for;
+    None where they name none.
+    """
     requested = scene.values.get("ground.kind")
     if scene.number("ground.size") <= 0.0:
         return None
@@ -166,22 +211,32 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
 
 def find_place(scene: SceneDescription) -> Place | None:
     """Return the place that a scene has around its object; None where it has none."""
-    return next((part.place for part in scene.around.values() if part.place is not None), None)
+    return next(
+        (part.place for part in scene.around.values() if part.place is not None), None
+    )
 
 
 def load_requested_place(scene: SceneDescription) -> Place | None:
-    """Return the place that a scene's environment and its settings ask for; None where they ask for none."""
+    """Return the place that a scene's environment and its settings ask for; None where
+    they ask for none.
+    """
     kind = find_ground_kind(scene)
     if kind is not None:
         return load_bundled_place(*PLACES[kind]) if kind in PLACES else None
     light = scene.environment
-    is_described = scene.number("ground.size") <= 0.0 or not scene.given.isdisjoint(settings.TABLE_SETTINGS)
+    is_described = scene.number("ground.size") <= 0.0 or not scene.given.isdisjoint(
+        settings.TABLE_SETTINGS
+    )
     return None if light is None or is_described else light.place
 
 
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
-    others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
+    """Return the scene with the road or the place that its environment and its settings
+    ask for, and no other.
+    """
+    others = tuple(
+        part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid)
+    )
     place = load_requested_place(scene)
     if place is not None:
         light = scene.environment
@@ -190,7 +245,10 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
         if light is not None and unit is not None and place.file.lamps:
             arriving = irradiance(torch.from_numpy(light.radiance.copy()))
             is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-        return replace(scene, parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)))
+        return replace(
+            scene,
+            parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)),
+        )
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
 
 
@@ -198,39 +256,56 @@ DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How far and how high a camera may go before the picture around a scene no longer fits the ground that is laid in it.
+# How far and how high a camera may go before the picture around a scene no longer fits
+# the ground that is laid in it.
 #
-# The map of a street, or a photograph of your own, is one picture, taken from a height h0 above the place of the
-# object. The renderer shows it as if it were infinitely far away; only the ground is laid as a plane. From elsewhere:
+# The map of a street, or a photograph of your own, is one picture, taken from a height
+# h0 above the place of the object. The renderer shows it as if it were infinitely far
+# away; only the ground is laid as a plane. From elsewhere:
 #
-# - What stands at a distance R behind the object is seen as large as from there, and would be seen R / (R + d) times as
+# - What stands at a distance R behind the object is seen as large as from there, and
+# would be seen R / (R + d) times as
 #   large from a camera that is d away. Up to d = R it is at most twice too large.
-# - Where the ground ends at a distance G from the object, on the side of the camera, the picture shows ground of its
-#   own nearer than that end, and the feet of what stands around below it. A camera of height h whose picture ends b
-#   degrees below the horizon sees nothing nearer than h / tan(b): up to d = G + h / tan(b) the end is out of sight.
-# - From a height h, the foot of what stands at R is h / R below the horizon, and is shown h0 / R below it. Up to
+# - Where the ground ends at a distance G from the object, on the side of the camera,
+# the picture shows ground of its
+#   own nearer than that end, and the feet of what stands around below it. A camera of
+# height h whose picture ends b
+#   degrees below the horizon sees nothing nearer than h / tan(b): up to d = G + h /
+# tan(b) the end is out of sight.
+# - From a height h, the foot of what stands at R is h / R below the horizon, and is
+# shown h0 / R below it. Up to
 #   h = 2 h0 it is at most twice too high.
 
 FACTOR = 2.0  # how much too large, or too high, what stands around may be
-RADIUS = 5.0  # how far from a photograph's camera its floor is empty, in heights of it, where nothing says so
-TURNED = 2.0  # degrees that a street's map may be turned by: its houses then stand beside its road
+# how far from a photograph's camera its floor is empty, in heights of it, where nothing
+# says so
+RADIUS = 5.0
+# degrees that a street's map may be turned by: its houses then stand beside its road
+TURNED = 2.0
 Box = tuple[float, float, float, float]
-"""From and to in x, from and to in y, metres or object sizes, with the object at (0, 0)."""
+"""From and to in x, from and to in y, metres or object sizes, with the object at (0,
+0).
+"""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of the place in an environment's picture, in the lengths of the camera's distance."""
+    """What is known of the place in an environment's picture, in the lengths of the
+    camera's distance.
+    """
 
-    height: float  # above the ground from which it was taken; infinite where nothing near is shown
+    # above the ground from which it was taken; infinite where nothing near is shown
+    height: float
     stands: Box | float  # how far away what stands around is
     laid: Box | float  # how far the ground reaches that is laid under the object
     turned: float = 0.0  # degrees that the picture is turned by against the ground
 
 
 class CameraView(NamedTuple):
-    """How a camera looks: its place around the object and where it looks to, degrees of azimuth; its horizontal
-    distance and its height above the ground; and how far below the horizon its picture ends, degrees."""
+    """How a camera looks: its place around the object and where it looks to, degrees of
+    azimuth; its horizontal distance and its height above the ground; and how far below
+    the horizon its picture ends, degrees.
+    """
 
     azimuth: float
     towards: float
@@ -240,28 +315,40 @@ class CameraView(NamedTuple):
 
 
 def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
-    """Return up to which horizontal distance from the object, and up to which height above the ground, an environment's
-    picture fits a camera that looks as this one does (its own distance does not count): in the lengths of
-    `environment`, infinite without a bound, 0 where it fits nowhere. See above."""
+    """Return up to which horizontal distance from the object, and up to which height
+    above the ground, an environment's picture fits a camera that looks as this one does
+    (its own distance does not count): in the lengths of `environment`, infinite without
+    a bound, 0 where it fits nowhere. See above.
+    """
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
     behind = (FACTOR - 1.0) * _reach(environment.stands, camera.towards)
-    unseen = math.inf if camera.lowest <= 0.0 else camera.height / math.tan(math.radians(min(camera.lowest, 179.0)))
-    return max(0.0, min(behind, _reach(environment.laid, camera.azimuth) + unseen)), FACTOR * environment.height
+    unseen = (
+        math.inf
+        if camera.lowest <= 0.0
+        else camera.height / math.tan(math.radians(min(camera.lowest, 179.0)))
+    )
+    return max(
+        0.0, min(behind, _reach(environment.laid, camera.azimuth) + unseen)
+    ), FACTOR * environment.height
 
 
 def _reach(area: Box | float, azimuth: float) -> float:
     if isinstance(area, float):
         return area
-    x, y = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+    x = math.cos(math.radians(azimuth))
+    y = math.sin(math.radians(azimuth))
     across = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
     return min(across, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
 
 
 def surroundings_of(scene: SceneDescription) -> Surroundings | None:
-    """Return what is known of the place in a scene's environment; None where nothing of it has to fit a ground."""
+    """Return what is known of the place in a scene's environment; None where nothing of
+    it has to fit a ground.
+    """
     lit = scene.environment
-    if lit is None or scene.backdrop or enclosed(scene):  # what encloses the object is geometry, true from everywhere
+    # what encloses the object is geometry, true from everywhere
+    if lit is None or scene.backdrop or enclosed(scene):
         return None
     place = find_place(scene)
     laid: Box | float = math.inf if place is None else bound_ground(place)
@@ -269,22 +356,37 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     shown = lit.place if bundled is None else load_bundled_place(*bundled)
     if place is not None and shown is not None and shown.file.picture is not None:
         picture = shown.file.picture
-        return Surroundings(picture.height, (*picture.x, *picture.y), laid, scene.number("environment.rotation"))
+        return Surroundings(
+            picture.height,
+            (*picture.x, *picture.y),
+            laid,
+            scene.number("environment.rotation"),
+        )
     if lit.photographed and (paved(scene) or scene.photograph is not None):
-        height, radius = scene.capture_height * scene.metres, scene.values.get("ground.radius")
+        height = scene.capture_height * scene.metres
+        radius = scene.values.get("ground.radius")
         return Surroundings(height, RADIUS * height if radius is None else radius, laid)
     return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
 
 
 def bound_ground(place: Place) -> Box:
-    """Return from where to where the ground of a place reaches in x and in y, metres."""
-    vertices = np.concatenate([part.mesh.vertices for part in place.parts if part.is_ground])
-    (x0, y0), (x1, y1) = vertices[:, :2].min(axis=0).tolist(), vertices[:, :2].max(axis=0).tolist()
+    """Return from where to where the ground of a place reaches in x and in y,
+    metres.
+    """
+    vertices = np.concatenate(
+        [part.mesh.vertices for part in place.parts if part.is_ground]
+    )
+    (x0, y0) = vertices[:, :2].min(axis=0).tolist()
+    (x1, y1) = vertices[:, :2].max(axis=0).tolist()
     return x0, x1, y0, y1
 
 
-def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None) -> CameraView:
-    """Return how a scene is looked at: by its own camera, or by one with another pose (4, 4) or field of view."""
+def view_of(
+    scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None
+) -> CameraView:
+    """Return how a scene is looked at: by its own camera, or by one with another pose
+    (4, 4) or field of view.
+    """
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
     ahead = pose[:3, 2]
@@ -294,7 +396,11 @@ def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float
         below = 90.0
     azimuth = math.degrees(math.atan2(y, x))
     level = math.hypot(ahead[0], ahead[1])
-    towards = math.degrees(math.atan2(ahead[1], ahead[0])) if level > 1e-6 else azimuth + 180.0
+    towards = (
+        math.degrees(math.atan2(ahead[1], ahead[0]))
+        if level > 1e-6
+        else azimuth + 180.0
+    )
     lowest = below - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
     return CameraView(azimuth, towards, math.hypot(x, y), float(z), lowest)
 
@@ -302,42 +408,75 @@ def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float
 def place_of(view: CameraView) -> Doubles:
     """Return where a camera is, (3,) metres, with the object at the origin."""
     azimuth = math.radians(view.azimuth)
-    return np.array([view.distance * math.cos(azimuth), view.distance * math.sin(azimuth), view.height])
+    return np.array(
+        [
+            view.distance * math.cos(azimuth),
+            view.distance * math.sin(azimuth),
+            view.height,
+        ]
+    )
 
 
-def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, go past what its environment's picture is valid for;
-    `turns`: that is turned from view to view."""
-    around, place = surroundings_of(scene), find_place(scene)
+def past(
+    scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False
+) -> tuple[str, ...]:
+    """Return what is said where views of a scene, at least one, go past what its
+    environment's picture is valid for; `turns`: that is turned from view to view.
+    """
+    around = surroundings_of(scene)
+    place = find_place(scene)
     outside = () if place is None else remark_outside(scene, place, views)
     if outside or around is None:
         return outside
-    name, unit = scene.environment_name, "m" if scene.object.metres is not None else "object sizes"
-    if valid(around, views[0]) == (0.0, 0.0) or (turns and isinstance(around.stands, tuple)):
+    name = scene.environment_name
+    unit = "m" if scene.object.metres is not None else "object sizes"
+    if valid(around, views[0]) == (0.0, 0.0) or (
+        turns and isinstance(around.stands, tuple)
+    ):
         return (
-            f"{name}: its houses are a picture, which `environment.rotation` turns against the road: they then stand "
+            f"{name}: its houses are a picture, which `environment.rotation` turns "
+            "against the road: they then stand "
             "across it; leave the rotation out",
         )
     limits = [valid(around, view) for view in views]
     each = zip(views, limits, strict=True)
-    beyond = [view for view, (far, high) in each if view.distance > far or view.height > high]
+    beyond = [
+        view for view, (far, high) in each if view.distance > far or view.height > high
+    ]
     if not beyond:
         return ()
-    near, far = min(limits)[0], max(limits)[0]
-    which = f"{near:.3g} {unit}" if far < 1.05 * near else f"{near:.3g} to {far:.3g} {unit} (by where it looks)"
+    near = min(limits)[0]
+    far = max(limits)[0]
+    which = (
+        f"{near:.3g} {unit}"
+        if far < 1.05 * near
+        else (f"{near:.3g} to {far:.3g} {unit} (by where it looks)")
+    )
     high = f" and {limits[0][1]:.3g} {unit} high" if math.isfinite(limits[0][1]) else ""
-    reach, top = max(view.distance for view in beyond), max(view.height for view in beyond)
+    reach = max(view.distance for view in beyond)
+    top = max(view.height for view in beyond)
     share = len(beyond) / len(views)
-    there = "the camera is" if len(views) == 1 else f"{100.0 * share:.0f} % of the views are past that, up to"
+    there = (
+        "the camera is"
+        if len(views) == 1
+        else (f"{100.0 * share:.0f} % of the views are past that, up to")
+    )
     return (
-        f"{name}: the place around the object is a picture, which fits a camera up to {which} away{high}; {there} "
-        f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around is more than twice too large or "
-        "too high, or the ground ends in sight: predictions from there are about the picture, not about a real place",
+        f"{name}: the place around the object is a picture, which fits a camera up to "
+        f"{which} away{high}; {there} "
+        f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around "
+        "is more than twice too large or "
+        "too high, or the ground ends in sight: predictions from there are about the "
+        "picture, not about a real place",
     )
 
 
-def remark_outside(scene: SceneDescription, place: Place, views: Sequence[CameraView]) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, are outside of what its place holds for."""
+def remark_outside(
+    scene: SceneDescription, place: Place, views: Sequence[CameraView]
+) -> tuple[str, ...]:
+    """Return what is said where views of a scene, at least one, are outside of what its
+    place holds for.
+    """
     bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
     positions = np.array([place_of(view) for view in views])
     is_outside = np.zeros(len(views), bool)
@@ -351,8 +490,12 @@ def remark_outside(scene: SceneDescription, place: Place, views: Sequence[Camera
     first = f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
     which = f"the camera is outside, at {first}"
     if len(views) > 1:
-        which = f"{100.0 * is_outside.mean():.0f} % of the views are outside, the first at {first}"
+        which = (
+            f"{100.0 * is_outside.mean():.0f} % of the views are outside, the "
+            f"first at {first}"
+        )
     return (
-        f"{scene.environment_name}: the place holds for a camera at {box} from the object; {which}. Predictions from "
+        f"{scene.environment_name}: the place holds for a camera at {box} from the "
+        f"object; {which}. Predictions from "
         "there are not about a real place",
     )

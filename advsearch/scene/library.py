@@ -1,6 +1,8 @@
-"""The bundled scene library: reads what the scripts in `scenes/` have built; makes nothing itself.
+"""The bundled scene library: reads what the scripts in `scenes/` have built; makes
+nothing itself.
 
-The files travel inside the package (`advsearch.bundled`, its `data` folder) and are read through `importlib.resources`.
+The files travel inside the package (`advsearch.bundled`, its `data` folder) and are
+read through `importlib.resources`.
 """
 
 from __future__ import annotations
@@ -18,7 +20,14 @@ import numpy as np
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import MESHES, either
-from advsearch.scene.assets import Bools, EnvironmentAsset, Floats, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import (
+    Bools,
+    EnvironmentAsset,
+    Floats,
+    Material,
+    Mesh,
+    ObjectAsset,
+)
 from advsearch.scene.importing.files import Notes, read_bytes, safe_name
 from advsearch.scene.importing.hdr import Plane, linear, read_exr, read_radiance
 from advsearch.scene.importing.pictures import area_average, banded_average
@@ -29,10 +38,16 @@ from advsearch.scene.raster import rasterised
 SIDE = 256  # texels along the maps of roughness, metal and clear coat
 
 
-def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it: some materials of the mesh as
-    `finishes` say, and all other faces like `main`, whose `specular` holds for all."""
-    faces = np.tile([main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1))
+def finished(
+    mesh: Mesh, finishes: Mapping[str, Material], main: Material
+) -> dict[str, object]:
+    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it:
+    some materials of the mesh as `finishes` say, and all other faces like `main`, whose
+    `specular` holds for all.
+    """
+    faces = np.tile(
+        [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
+    )
     for name, one in finishes.items():
         faces[mesh.materials[name]] = one.roughness, one.metallic, one.clearcoat
     maps = faces[rasterised(mesh, SIDE).face].astype(np.float32)
@@ -44,7 +59,12 @@ def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> di
     }
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
         picture = maps[:, :, channel : channel + 1]
-        surface[name] = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "nearest"}
+        surface[name] = {
+            "type": "bitmap",
+            "bitmap": picture,
+            "raw": True,
+            "filter_type": "nearest",
+        }
     return {"type": "twosided", "bsdf": surface}
 
 
@@ -53,7 +73,8 @@ if TYPE_CHECKING:
 
     from advsearch.scene.people import Person
 
-BUNDLED_OBJECT = "bundled object"  # source of an object that is bundled, or another member of its family
+# source of an object that is bundled, or another member of its family
+BUNDLED_OBJECT = "bundled object"
 BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
 MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, works too."
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
@@ -64,13 +85,23 @@ def _data() -> Traversable:
 
 
 def list_objects() -> tuple[str, ...]:
-    return tuple(sorted(p.name for p in (_data() / "objects").iterdir() if (p / "mesh.ply").is_file()))
+    return tuple(
+        sorted(
+            p.name
+            for p in (_data() / "objects").iterdir()
+            if (p / "mesh.ply").is_file()
+        )
+    )
 
 
 def list_environments(split: str | None = None) -> tuple[str, ...]:
-    """Return the names of bundled environments, sorted; of the half "train" or "heldout", "street" or "place"."""
+    """Return the names of bundled environments, sorted; of the half "train" or
+    "heldout", "street" or "place".
+    """
     facts = _environments().items()
-    return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
+    return tuple(
+        sorted(name for name, fact in facts if split is None or fact["split"] == split)
+    )
 
 
 def _environments() -> dict[str, dict[str, Any]]:
@@ -80,8 +111,10 @@ def _environments() -> dict[str, dict[str, Any]]:
 
 
 def load_object(name: str) -> ObjectAsset:
-    """Return a bundled object, its largest extent 1, standing on z = 0. Raises UnknownNameError: there is no such
-    object. Raises FileFormatError: the installation is damaged."""
+    """Return a bundled object, its largest extent 1, standing on z = 0. Raises
+    UnknownNameError: there is no such object. Raises FileFormatError: the installation
+    is damaged.
+    """
     import imageio.v3 as iio  # most scenes need no such file
 
     known = list_objects()
@@ -92,19 +125,33 @@ def load_object(name: str) -> ObjectAsset:
         facts = json.loads((folder / "object.json").read_text("utf-8"))
         runs = facts.get("faces", ())  # how many faces in a row have which material
         names = np.repeat([name for name, _ in runs], [count for _, count in runs])
-        materials = {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
+        materials = {
+            str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)
+        }
         elements, _ = read_elements((folder / "mesh.ply").read_bytes(), Notes(name))
-        vertex, faces = elements["vertex"].scalars, elements["face"].listed["vertex_indices"].values
+        vertex = elements["vertex"].scalars
+        faces = elements["face"].listed["vertex_indices"].values
         places, normals, uvs = (
             np.stack([vertex[number] for number in numbers], axis=1).astype(np.float32)
             for numbers in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
         )
-        mesh = Mesh(places, faces.reshape(-1, 3).astype(np.uint32), normals, uvs, materials=materials)
+        mesh = Mesh(
+            places,
+            faces.reshape(-1, 3).astype(np.uint32),
+            normals,
+            uvs,
+            materials=materials,
+        )
         if (folder / "body.npz").is_file():
             mesh = replace(mesh, rig=make_person())
-        levels = np.asarray(iio.imread((folder / "base_color.png").read_bytes(), extension=".png"))[..., :3]
+        levels = np.asarray(
+            iio.imread((folder / "base_color.png").read_bytes(), extension=".png")
+        )[..., :3]
         material = Material(**facts["material"])
-        finishes = {finish: Material(**numbers) for finish, numbers in facts.get("finishes", {}).items()}
+        finishes = {
+            finish: Material(**numbers)
+            for finish, numbers in facts.get("finishes", {}).items()
+        }
         return ObjectAsset(
             name=name,
             mesh=mesh,
@@ -118,42 +165,65 @@ def load_object(name: str) -> ObjectAsset:
             drives=facts.get("drives", False),
         )
     except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
-        raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error
+        raise FileFormatError(
+            f"bundled object {name!r} cannot be read ({error}); reinstall advsearch"
+        ) from error
 
 
 def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
-    """Return the bundled body, with other defaults of the control `body` such as ``{"height": 1.8}``."""
-    from advsearch.scene.people import Person, body_data  # torch takes seconds, and most objects have no body
+    """Return the bundled body, with other defaults of the control `body` such as
+    ``{"height": 1.8}``.
+    """
+    # torch takes seconds, and most objects have no body
+    from advsearch.scene.people import Person, body_data
 
     return Person(body_data(), defaults)
 
 
 def load_environment(name: str) -> EnvironmentAsset:
-    """Return a bundled environment. Raises UnknownNameError; FileFormatError: the installation is damaged."""
+    """Return a bundled environment. Raises UnknownNameError; FileFormatError: the
+    installation is damaged.
+    """
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
     facts = _environments()[name]
     try:
-        content = (_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes()
-        radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(np.float32)
+        content = (
+            _data() / "environments" / f"{facts.get('map', name)}.exr"
+        ).read_bytes()
+        radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(
+            np.float32
+        )
     except (OSError, FileFormatError) as error:
-        raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    ground, candelas = facts.get("ground"), facts.get("candelas")
-    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas)
+        raise FileFormatError(
+            f"bundled environment {name!r} cannot be read ({error}); "
+            "reinstall advsearch"
+        ) from error
+    ground = facts.get("ground")
+    candelas = facts.get("candelas")
+    return EnvironmentAsset(
+        name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas
+    )
 
 
-# ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps in linear radiance -----------
+# ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps
+# in linear radiance -----------
 
 SUFFIXES = (".hdr", ".exr")  # the pictures that can be imported
-LARGEST = (512, 1024)  # rows and columns of the largest environment kept; larger ones are averaged down
-SMALLEST = (4, 8)  # rows and columns that a smaller one is brought up to by repeating its texels; renderers need a few
+# rows and columns of the largest environment kept; larger ones are averaged down
+LARGEST = (512, 1024)
+# rows and columns that a smaller one is brought up to by repeating its texels;
+# renderers need a few
+SMALLEST = (4, 8)
 
 
 @dataclass(frozen=True, eq=False)
 class LightPicture:
-    """A picture in linear radiance: its size in rows and columns; `band`, which returns the rows from its first
-    argument to before its second, (n, W, 3) float32; and clauses about what is left out."""
+    """A picture in linear radiance: its size in rows and columns; `band`, which returns
+    the rows from its first argument to before its second, (n, W, 3) float32; and
+    clauses about what is left out.
+    """
 
     size: tuple[int, int]
     band: Callable[[int, int], Floats]
@@ -161,15 +231,25 @@ class LightPicture:
 
 
 def read_light(path: Path, what: str = "environment") -> LightPicture:
-    """Read an ``.hdr`` or ``.exr`` picture of any shape; errors as for `import_environment`."""
+    """Read an ``.hdr`` or ``.exr`` picture of any shape; errors as for
+    `import_environment`.
+    """
     data = read_bytes(path, what, SUFFIXES)
     if path.suffix.lower() == ".hdr":
         pixels, scale, notes = read_radiance(path, data)
-        return LightPicture(pixels.shape[:2], lambda top, end: linear(pixels[top:end]) * scale, tuple(notes))
+        return LightPicture(
+            pixels.shape[:2],
+            lambda top, end: linear(pixels[top:end]) * scale,
+            tuple(notes),
+        )
     planes, notes = read_exr(path, data)
     kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
-        ("infinite", np.isinf, "clamp them, or save the map in 32-bit floats if half floats overflowed"),
+        (
+            "infinite",
+            np.isinf,
+            "clamp them, or save the map in 32-bit floats if half floats overflowed",
+        ),
         ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
     )
     for kind, bad, remedy in kinds:
@@ -178,7 +258,8 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
             row, column = np.unravel_index(int(texels.argmax()), texels.shape)
             value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
             raise InputError(
-                f"{path}: expected finite radiance of at least 0, got {int(texels.sum())} of {texels.size} texels"
+                f"{path}: expected finite radiance of at least 0, got "
+                f"{int(texels.sum())} of {texels.size} texels"
                 f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
             )
 
@@ -189,37 +270,65 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
-    """Read an equirectangular environment map: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or
-    Y alone (grey), in half or float; see `advsearch.scene.importing.hdr`.
+    """Read an equirectangular environment map: a Radiance ``.hdr`` (RGBE), or an
+    ``.exr`` with channels R, G and B, or Y alone (grey), in half or float; see
+    `advsearch.scene.importing.hdr`.
 
-    Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle that it covers, so that the
-    light from each direction stays the same in the mean. Row 0 is up; columns stay in the file's order. Raises
-    FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it. Raises
-    InputError: values that are negative, NaN or infinite; the message counts them and gives the first position.
+    Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle
+    that it covers, so that the light from each direction stays the same in the mean.
+    Row 0 is up; columns stay in the file's order. Raises FileFormatError: the file is
+    missing, of another kind, damaged, or lacks channels; the message names it. Raises
+    InputError: values that are negative, NaN or infinite; the message counts them and
+    gives the first position.
     """
     file = Path(path)
     picture = read_light(file)
     notes = [f"{file.name}: {note}" for note in picture.notes]
     height, width = picture.size
     if abs(width / (2 * height) - 1.0) > 0.01:
-        notes.append(f"{file.name}: expected a map twice as wide as high, got {width} x {height}; it appears stretched")
+        notes.append(
+            f"{file.name}: expected a map twice as wide as high, got {width} "
+            f"x {height}; it appears stretched"
+        )
     radiance = _sized(picture.band, picture.size)
     if not radiance.any():
-        notes.append(f"{file.name}: the environment is black everywhere; it lights nothing")
-    return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
+        notes.append(
+            f"{file.name}: the environment is black everywhere; it lights nothing"
+        )
+    return EnvironmentAsset(
+        safe_name(file),
+        radiance,
+        source=str(file),
+        warnings=tuple(notes),
+        photographed=True,
+    )
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`; see `LightPicture`."""
+    """Average a map down to at most `LARGEST`, and repeat its texels up to at least
+    `SMALLEST`; see `LightPicture`.
+    """
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:
         texels = band(0, height)
     else:
         target = max(1, round(height * scale)), max(1, round(width * scale))
-        polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
+        polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
+            np.pi / height
+        )
         angle = np.sin(polar)[:, None, None]
         covered = area_average(angle, target[0], 1)
-        texels = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
-    down, across = (-(-least // extent) for least, extent in zip(SMALLEST, texels.shape[:2], strict=True))
-    return np.asarray(texels.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)
+        texels = (
+            banded_average(
+                lambda top, end: band(top, end) * angle[top:end], size, target
+            )
+            / covered
+        )
+    down, across = (
+        -(-least // extent)
+        for least, extent in zip(SMALLEST, texels.shape[:2], strict=True)
+    )
+    return np.asarray(
+        texels.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32
+    )

@@ -1,8 +1,9 @@
-"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each under a name. And
-cameras.
+"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each
+under a name. And cameras.
 
-A part says what it is and which scene inputs it takes, torch tensors under names of ours; `mitsuba_backend` translates
-it. A part of another kind is a subclass, with a translation registered in `mitsuba_backend.parts.translation`.
+A part says what it is and which scene inputs it takes, torch tensors under names of
+ours; `mitsuba_backend` translates it. A part of another kind is a subclass, with a
+translation registered in `mitsuba_backend.parts.translation`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from advsearch.scene.footprint import Solid as Solid
 from advsearch.scene.places.schema import PlaceFile
 
 Triple = tuple[float, float, float]
-BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
+# the type that stands for the texture in a surface in Mitsuba's words
+BASE_COLOR = "base color"
 
 
 def plugins_in(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
@@ -52,16 +54,19 @@ class ScenePart:
 class MeshPart(Shape, ScenePart):
     """A shape in the scene; "object" is the object itself.
 
-    Takes `NAME.vertices` and `NAME.normals` (V, 3) in world space, `NAME.base_color` (h, w, 3) linear reflectance with
-    row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1], but for what a
-    `surface` lacks of these; where it emits light, `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world` (4, 4)
-    and `NAME.offsets` (V, 3) are turned into vertices and normals by `advsearch.scene.assembly`.
+    Takes `NAME.vertices` and `NAME.normals` (V, 3) in world space, `NAME.base_color`
+    (h, w, 3) linear reflectance with row 0 at v = 1, and `NAME.roughness`, `.metallic`,
+    `.specular`, `.clearcoat` (1,) in [0, 1], but for what a `surface` lacks of these;
+    where it emits light, `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world`
+    (4, 4) and `NAME.offsets` (V, 3) are turned into vertices and normals by
+    `advsearch.scene.assembly`.
     """
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
     place: Place | None = None  # which it belongs to, and goes with
     is_ground: bool = False  # of a place: things stand on it
-    solids: tuple[Solid, ...] = ()  # of a place: what nothing else can be in, in object sizes
+    # of a place: what nothing else can be in, in object sizes
+    solids: tuple[Solid, ...] = ()
 
     @property
     def laid(self) -> bool:
@@ -81,15 +86,19 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class LampGlass(MeshPart):
-    """The glass of a car's lamps, which shines; it stands in the car's own coordinates, and belongs to it: to the mesh
-    that carries it, with whose vertices (V,) its own go, and on whose faces (F,) its own lie."""
+    """The glass of a car's lamps, which shines; it stands in the car's own coordinates,
+    and belongs to it: to the mesh that carries it, with whose vertices (V,) its own go,
+    and on whose faces (F,) its own lie.
+    """
 
     carrier: str = ""
     follows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     lies_on: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
-def mesh_part(name: str, shape: Shape, to_world: Doubles, material: Material) -> MeshPart:
+def mesh_part(
+    name: str, shape: Shape, to_world: Doubles, material: Material
+) -> MeshPart:
     """Return a shape with another name and material under a pose (4, 4)."""
     looks = {look.name: getattr(shape, look.name) for look in fields(Shape)}
     return MeshPart(**{**looks, "name": name, "material": material}, to_world=to_world)
@@ -101,32 +110,45 @@ class _Point(ScenePart):
 
     dark: bool = False  # its intensity stays 0
     position: Triple = (0.0, 0.0, 2.0)  # base value, object sizes
-    intensity: Triple = (0.0, 0.0, 0.0)  # base value, linear radiant intensity for each colour channel
+    # base value, linear radiant intensity for each colour channel
+    intensity: Triple = (0.0, 0.0, 0.0)
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the way from a place (3,) to the lamp, and the irradiance (3,) where that is faced; base values."""
+        """Return the way from a place (3,) to the lamp, and the irradiance (3,) where
+        that is faced; base values.
+        """
         way = np.array(self.position) - place
         return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
 
 
 class PointLamp(_Point):
-    """A point that shines equally in all directions. Takes `NAME.position` (3,) in object sizes and `NAME.intensity`
-    (3,) linear radiant intensity. The interior adjoint is right for the intensity; for a position Mitsuba raises."""
+    """A point that shines equally in all directions. Takes `NAME.position` (3,) in
+    object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior
+    adjoint is right for the intensity; for a position Mitsuba raises.
+    """
 
 
-WIDEST, NARROWEST = 89.9, 0.1  # angles of a spot's edge, degrees
+WIDEST = 89.9  # angles of a spot's edge, degrees
+NARROWEST = 0.1
 SOFTEST = 0.99  # largest share of that angle at which the light begins to fall off
 
 
 @dataclass(frozen=True, eq=False)
 class SpotLamp(_Point):
-    """A point that shines in a cone, as Mitsuba's `spot`. Up to `beam` from its axis it shines evenly, and from there
-    to `cutoff` its intensity, which is that on the axis, falls off linearly with the angle. Takes `NAME.intensity` (3,)
-    linear radiant intensity, for which the interior adjoint is right."""
+    """A point that shines in a cone, as Mitsuba's `spot`. Up to `beam` from its axis it
+    shines evenly, and from there to `cutoff` its intensity, which is that on the axis,
+    falls off linearly with the angle. Takes `NAME.intensity` (3,) linear radiant
+    intensity, for which the interior adjoint is right.
+    """
 
-    direction: Triple = (0.0, 0.0, -1.0)  # unit vector along its axis; z down where that is 0
-    cutoff: float = 45.0  # angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to `WIDEST`
-    beam: float = 0.0  # angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the other one
+    # unit vector along its axis; z down where that is 0
+    direction: Triple = (0.0, 0.0, -1.0)
+    # angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to
+    # `WIDEST`
+    cutoff: float = 45.0
+    # angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the
+    # other one
+    beam: float = 0.0
 
     @property
     def cone(self) -> tuple[float, float]:
@@ -137,10 +159,16 @@ class SpotLamp(_Point):
     @property
     def to_world(self) -> Doubles:
         """(4, 4) pose of the lamp, which shines along its own +z."""
-        ahead = np.array(self.direction) if any(self.direction) else np.array([0.0, 0.0, -1.0])
+        ahead = (
+            np.array(self.direction)
+            if any(self.direction)
+            else np.array([0.0, 0.0, -1.0])
+        )
         aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
         aside /= np.linalg.norm(aside)
-        return pose_of(np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position)
+        return pose_of(
+            np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position
+        )
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         way, faced = super().lighting(place)
@@ -152,13 +180,16 @@ class SpotLamp(_Point):
 
 @dataclass(frozen=True, eq=False)
 class BallLamp(ScenePart):
-    """A ball that shines outwards with the same radiance everywhere; the camera sees it where it is in view.
+    """A ball that shines outwards with the same radiance everywhere; the camera sees it
+    where it is in view.
 
-    A ball needs no orientation, and the cone under which it is seen is sampled: as quiet as a disk, and simpler. Light
-    of others passes through it, so that a lamp of power 0 changes nothing, wherever it stands.
+    A ball needs no orientation, and the cone under which it is seen is sampled: as
+    quiet as a disk, and simpler. Light of others passes through it, so that a lamp of
+    power 0 changes nothing, wherever it stands.
 
-    Takes `NAME.ball` (4, 4), the pose of the unit ball (a shift and one scale for all axes), and `NAME.radiance` (3,)
-    linear radiance. The interior adjoint is right for the radiance; for the pose it is silently 0.
+    Takes `NAME.ball` (4, 4), the pose of the unit ball (a shift and one scale for all
+    axes), and `NAME.radiance` (3,) linear radiance. The interior adjoint is right for
+    the radiance; for the pose it is silently 0.
     """
 
     dark: bool = False  # its radiance stays 0
@@ -167,9 +198,15 @@ class BallLamp(ScenePart):
     radiance: Triple = (0.0, 0.0, 0.0)  # base value, linear, for each colour channel
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control)."""
-        red, green, blue = (math.pi * self.radius**2 * channel for channel in self.radiance)
-        return PointLamp(self.name, position=self.place, intensity=(red, green, blue)).lighting(place)
+        """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the
+        `light` control).
+        """
+        red, green, blue = (
+            math.pi * self.radius**2 * channel for channel in self.radiance
+        )
+        return PointLamp(
+            self.name, position=self.place, intensity=(red, green, blue)
+        ).lighting(place)
 
 
 CAMERA = "camera"  # what carries the lamps of the car that the camera is in
@@ -177,14 +214,21 @@ CAMERA = "camera"  # what carries the lamps of the car that the camera is in
 
 @dataclass(frozen=True, eq=False)
 class BeamLamp(ScenePart):
-    """A point on a mesh, or before the camera, that shines by a table, such as a headlamp; the camera does not see it.
-    Takes `NAME.to_world` (4, 4), its pose, which it has once what carries it stands there; its brightness stays."""
+    """A point on a mesh, or before the camera, that shines by a table, such as a
+    headlamp; the camera does not see it. Takes `NAME.to_world` (4, 4), its pose, which
+    it has once what carries it stands there; its brightness stays.
+    """
 
     carrier: str  # the mesh that carries it, or `CAMERA`
-    seat: Doubles  # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and has +y up
-    table: Floats  # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to either side
+    # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and
+    # has +y up
+    seat: Doubles
+    # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to
+    # either side
+    table: Floats
     tint: Triple  # radiant intensity for each colour channel where the table has 1
-    weight: float = 1.0  # how often its light is sampled, where that of the environment has 1
+    # how often its light is sampled, where that of the environment has 1
+    weight: float = 1.0
     to_world: Doubles = field(default_factory=lambda: np.eye(4))
     dark: ClassVar[bool] = False
 
@@ -196,18 +240,23 @@ class BeamLamp(ScenePart):
         row = math.floor((1.0 - up / max(ahead, 1e-9) * width / height) / 2.0 * height)
         if ahead <= 0.0 or not (0 <= column < width and 0 <= row < height):
             return way, np.zeros(3)
-        return way, self.table[row, column] * np.array(self.tint) / max(float(way @ way), 1e-12)
+        return way, self.table[row, column] * np.array(self.tint) / max(
+            float(way @ way), 1e-12
+        )
 
 
 Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
-PATTERN = ".pattern"  # what the name of an input ends in that is the picture of a projector
+# what the name of an input ends in that is the picture of a projector
+PATTERN = ".pattern"
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorPart(ScenePart):
-    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that the camera does not see. Takes
-    `NAME.pose` (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows that faces it at
-    distance 1, linear radiance. The interior adjoint is right for the pattern."""
+    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that
+    the camera does not see. Takes `NAME.pose` (4, 4), as a camera's, and `NAME.pattern`
+    (h, w, 3): what a white matt screen shows that faces it at distance 1, linear
+    radiance. The interior adjoint is right for the pattern.
+    """
 
     fov: float = 30.0  # angle of the picture's width, degrees
     sides: tuple[int, int] = (2, 2)  # rows and columns of the picture
@@ -226,22 +275,32 @@ class ProjectorPart(ScenePart):
 class PlacedCamera:
     """A camera with a pose of its own."""
 
-    to_world: Doubles  # (4, 4) its pose: it looks along its own +z with +y up and +x to the left
-    fov: float  # field of view along the larger side of the picture, or if `upright` along its height, degrees
-    upright: bool = False  # whether it is the height that it is along, whatever the picture's shape
+    # (4, 4) its pose: it looks along its own +z with +y up and +x to the left
+    to_world: Doubles
+    # field of view along the larger side of the picture, or if `upright` along its
+    # height, degrees
+    fov: float
+    # whether it is the height that it is along, whatever the picture's shape
+    upright: bool = False
 
     def larger_fov(self, aspect: float) -> float:
-        """Return the field of view, degrees, along the larger side of a picture of width / height `aspect`."""
+        """Return the field of view, degrees, along the larger side of a picture of
+        width / height `aspect`.
+        """
         if not self.upright or aspect <= 1.0:
             return self.fov
-        return math.degrees(2.0 * math.atan(math.tan(math.radians(self.fov) / 2.0) * aspect))
+        return math.degrees(
+            2.0 * math.atan(math.tan(math.radians(self.fov) / 2.0) * aspect)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class HazePart(ScenePart):
-    """One grey medium in a ball around the origin that camera and object stand in; it scatters evenly in all
-    directions. Takes `NAME.density` (1,), the extinction per object size, and `NAME.albedo` (3,), the share of the
-    light that is scattered and not absorbed."""
+    """One grey medium in a ball around the origin that camera and object stand in; it
+    scatters evenly in all directions. Takes `NAME.density` (1,), the extinction per
+    object size, and `NAME.albedo` (3,), the share of the light that is scattered and
+    not absorbed.
+    """
 
     radius: float  # of the ball that it fills, object sizes
     density: float = 0.0  # by itself; none by default, for a control to fill
@@ -256,13 +315,17 @@ class PluginNumber:
     key: str  # that name: "red.reflectance.value"
     values: tuple[float, ...]  # its one or three numbers in the scene as it is
     input: str  # the scene input that sets it
-    valid: tuple[str, ...] = ("differences",)  # the valid ways to differentiate it, preferred first
-    plain: bool = False  # Mitsuba has it as a plain number, which light paths are traced anew for
+    # the valid ways to differentiate it, preferred first
+    valid: tuple[str, ...] = ("differences",)
+    # Mitsuba has it as a plain number, which light paths are traced anew for
+    plain: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class PluginNumbers(ScenePart):
-    """Numbers and colours of what is in the scene already. Takes their inputs, which begin with `NAME.`."""
+    """Numbers and colours of what is in the scene already. Takes their inputs, which
+    begin with `NAME.`.
+    """
 
     numbers: tuple[PluginNumber, ...] = ()  # some of the scene
 
@@ -271,7 +334,8 @@ class PluginNumbers(ScenePart):
 class PluginPart(ScenePart):
     """A shape, light or material of a Mitsuba scene as it is."""
 
-    plugin: Mapping[str, object] = field(default_factory=dict)  # transforms are (4, 4) arrays, pictures (H, W, C) ones
+    # transforms are (4, 4) arrays, pictures (H, W, C) ones
+    plugin: Mapping[str, object] = field(default_factory=dict)
     shines: bool = False  # it sends out light
 
 
@@ -284,26 +348,46 @@ class MediumPart(PluginPart):
 
 @lru_cache(maxsize=8)
 def polygon(corners: int) -> Mesh:
-    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z: its middle, then its corners."""
+    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z: its
+    middle, then its corners.
+    """
     turns = 2.0 * np.pi * np.arange(corners) / corners
     rim = np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
     vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
     first = np.arange(corners)
-    faces = np.stack([np.zeros(corners, np.int64), first + 1, (first + 1) % corners + 1], axis=1).astype(np.uint32)
+    faces = np.stack(
+        [np.zeros(corners, np.int64), first + 1, (first + 1) % corners + 1], axis=1
+    ).astype(np.uint32)
     normals = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (corners + 1, 1))
     return Mesh(vertices, faces, normals, vertices[:, :2] / 2.0 + np.float32(0.5))
 
 
 def sphere(rows: int, columns: int) -> Mesh:
-    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole, 2 (rows - 1) columns faces."""
+    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole,
+    2 (rows - 1) columns faces.
+    """
     v, u = (
-        one.ravel() for one in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+        one.ravel()
+        for one in np.meshgrid(
+            np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij"
+        )
     )
-    theta, phi = math.pi * (1.0 - v), 2.0 * math.pi * u
-    normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
-    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
+    theta = math.pi * (1.0 - v)
+    phi = 2.0 * math.pi * u
+    normals = np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
+        axis=1,
+    )
+    corner = (
+        np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]
+    ).ravel()
     above = corner + columns + 1
-    lower, upper = np.stack([corner, corner + 1, above + 1], 1), np.stack([corner, above + 1, above], 1)
-    faces = np.concatenate([lower[columns:], upper[:-columns]])  # without those that are points at the poles
-    vertices, outwards, uvs = (one.astype(np.float32) for one in (0.5 * normals, normals, np.stack([u, v], axis=1)))
+    lower = np.stack([corner, corner + 1, above + 1], 1)
+    upper = np.stack([corner, above + 1, above], 1)
+    # without those that are points at the poles
+    faces = np.concatenate([lower[columns:], upper[:-columns]])
+    vertices, outwards, uvs = (
+        one.astype(np.float32)
+        for one in (0.5 * normals, normals, np.stack([u, v], axis=1))
+    )
     return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)

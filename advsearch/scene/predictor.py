@@ -15,7 +15,9 @@ from advsearch.scene.renderer import Renderer
 
 
 class RefusalCause(Enum):
-    """Why a predictor does not make the images of a search, as far as code has to know it."""
+    """Why a predictor does not make the images of a search, as far as code has to know
+    it.
+    """
 
     UNSUITABLE = "the scene, the space or the policy"
     TOO_FEW_STEPS = "it does not pay for so few images"
@@ -28,7 +30,9 @@ class RefusalCause(Enum):
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why images are rendered and not predicted: a text that completes "rendered: ...", and its cause."""
+    """Why images are rendered and not predicted: a text that completes "rendered: ...",
+    and its cause.
+    """
 
     text: str
     cause: RefusalCause = RefusalCause.UNSUITABLE
@@ -37,16 +41,23 @@ class Refusal:
         return self.text
 
 
-NOTHING_MOVES = Refusal("nothing that varies is what it predicts", RefusalCause.NOTHING_MOVES)
+NOTHING_MOVES = Refusal(
+    "nothing that varies is what it predicts", RefusalCause.NOTHING_MOVES
+)
 NOISE = Refusal("noise is part of the picture without the denoiser", RefusalCause.NOISE)
-"""A refusal that stands alone: with the denoiser, the same images could be predicted."""
-BETWEEN = (0.02, 0.29, 0.61, 0.97)  # places in the range of a parameter at which its effect on the inputs is looked up
+"""A refusal that stands alone: with the denoiser, the same images could be
+predicted.
+"""
+# places in the range of a parameter at which its effect on the inputs is looked up
+BETWEEN = (0.02, 0.29, 0.61, 0.97)
 MOST_BYTES = 2**30  # memory of what one predictor keeps, times `ADVSEARCH_LIMITS`
 
 
 class Predictor(ABC):
-    """Predicts the pictures of the space of a renderer, which traces paths, without noise; differentiable. `non_finite`
-    values were not finite while it was made, and were set to zero."""
+    """Predicts the pictures of the space of a renderer, which traces paths, without
+    noise; differentiable. `non_finite` values were not finite while it was made, and
+    were set to zero.
+    """
 
     non_finite: int = 0
 
@@ -56,7 +67,8 @@ class Predictor(ABC):
     @property
     def renderer(self) -> Renderer:
         """A renderer of the same space whose pictures are the predicted ones."""
-        # made each time: two objects that hold each other are freed late, and matrices are large
+        # made each time: two objects that hold each other are freed late, and matrices
+        # are large
         return self.traced.like(predict=self.radiance)
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -68,7 +80,9 @@ class Predictor(ABC):
 
     @abstractmethod
     def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """Return the linear radiance of scene inputs; see `advsearch.scene.renderer.Predict`."""
+        """Return the linear radiance of scene inputs; see
+        `advsearch.scene.renderer.Predict`.
+        """
 
     @property
     @abstractmethod
@@ -88,15 +102,25 @@ class Predictor(ABC):
 
 def differs(one: Tensor | None, other: Tensor | None) -> bool:
     """Whether two inputs of a scene are not the same, bit for bit."""
-    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)
+    return (
+        one is None
+        or other is None
+        or one.shape != other.shape
+        or not torch.equal(one, other)
+    )
 
 
 class LinearMap(torch.autograd.Function):
-    """A linear map as a torch operation: `times`, with its transpose as the derivative, any number of times."""
+    """A linear map as a torch operation: `times`, with its transpose as the derivative,
+    any number of times.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, times: Callable[[Tensor], Tensor], transposed_times: Callable[[Tensor], Tensor], values: Tensor
+        ctx: Any,
+        times: Callable[[Tensor], Tensor],
+        transposed_times: Callable[[Tensor], Tensor],
+        values: Tensor,
     ) -> Tensor:
         ctx.back = transposed_times, times
         return times(values.detach())

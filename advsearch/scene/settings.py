@@ -1,6 +1,8 @@
-"""The parameters that every scene has: `--set` fixes them, and the control of the same family searches them.
+"""The parameters that every scene has: `--set` fixes them, and the control of the same
+family searches them.
 
-A control takes its declarations from here (`POSE`, `CAMERA`, ...) and adds those that only it knows.
+A control takes its declarations from here (`POSE`, `CAMERA`, ...) and adds those that
+only it knows.
 """
 
 from __future__ import annotations
@@ -17,34 +19,51 @@ CHANNELS = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One coordinate of a search: a named, bounded number, tensor or choice. Settings of a scene and parameters of
-    controls are both this, so that what `--set` fixes today a control can search tomorrow under the same name."""
+    """One coordinate of a search: a named, bounded number, tensor or choice. Settings
+    of a scene and parameters of controls are both this, so that what `--set` fixes
+    today a control can search tomorrow under the same name.
+    """
 
     name: str  # short; `control.name` addresses it everywhere
-    shape: tuple[int | None, ...]  # of its value; () for a number, None where it depends on the scene or a choice
-    unit: str  # "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1"
+    # of its value; () for a number, None where it depends on the scene or a choice
+    shape: tuple[int | None, ...]
+    # "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1"
+    unit: str
     low: float  # smallest allowed value (0 for a choice among names)
     high: float  # largest allowed value (number of names - 1 for a choice among names)
-    default: float | str  # the value that leaves the scene as it is, in words if it depends on the scene
+    # the value that leaves the scene as it is, in words if it depends on the scene
+    default: float | str
     description: str  # one sentence
-    periodic: bool = False  # the value and the value plus 360 degrees (`high - low` of a full turn) are the same
-    moves_silhouettes: bool = False  # it can move an outline in the picture, so interior adjoints miss a term
-    search: tuple[float, float] | None = None  # range that is searched by default; None: it stays at its default
-    log: bool = False  # the unit interval runs over the logarithm of the value (scales, powers, distances)
-    options: tuple[str, ...] = ()  # the names of a discrete choice, which has no derivative; empty for numbers
-    estimators: tuple[str, ...] = ("differences",)  # valid ways to differentiate it, preferred first
+    # the value and the value plus 360 degrees (`high - low` of a full turn) are the
+    # same
+    periodic: bool = False
+    # it can move an outline in the picture, so interior adjoints miss a term
+    moves_silhouettes: bool = False
+    # range that is searched by default; None: it stays at its default
+    search: tuple[float, float] | None = None
+    # the unit interval runs over the logarithm of the value (scales, powers, distances)
+    log: bool = False
+    # the names of a discrete choice, which has no derivative; empty for numbers
+    options: tuple[str, ...] = ()
+    # valid ways to differentiate it, preferred first
+    estimators: tuple[str, ...] = ("differences",)
 
-    LARGEST: ClassVar[float] = 1e30  # no quantity of a scene is larger; the square of one that is has no float32
+    # no quantity of a scene is larger; the square of one that is has no float32
+    LARGEST: ClassVar[float] = 1e30
     GEOMETRIC: ClassVar[tuple[str, ...]] = ("secant", "differences", "material")
     """Valid estimators for what moves a mesh."""
     ORBIT: ClassVar[tuple[str, ...]] = ("secant", "differences")
-    """Of a camera, which is differentiated by differences: Mitsuba has no derivative of sensors."""
+    """Of a camera, which is differentiated by differences: Mitsuba has no derivative of
+    sensors.
+    """
     LIT: ClassVar[tuple[str, ...]] = ("adjoint", "differences")
     """Of what changes only light and colors."""
 
     @staticmethod
     def is_number(value: object) -> TypeGuard[float]:
-        """Return whether a value is a number that float32 has: no truth value, not NaN, and at most `LARGEST`."""
+        """Return whether a value is a number that float32 has: no truth value, not NaN,
+        and at most `LARGEST`.
+        """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.LARGEST  # type: ignore[arg-type]
 
@@ -54,7 +73,20 @@ class Parameter:
         text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
     ) -> Parameter:  # fmt: skip
         """Make a number that moves no outlines; see `moving` for one that does."""
-        return cls(name, (), unit, low, high, default, text, periodic, False, search, log, estimators=estimators)
+        return cls(
+            name,
+            (),
+            unit,
+            low,
+            high,
+            default,
+            text,
+            periodic,
+            False,
+            search,
+            log,
+            estimators=estimators,
+        )
 
     @classmethod
     def moving(
@@ -62,7 +94,20 @@ class Parameter:
         text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
     ) -> Parameter:  # fmt: skip
         """Make a number that can move an outline in the image."""
-        return cls(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
+        return cls(
+            name,
+            (),
+            unit,
+            low,
+            high,
+            default,
+            text,
+            periodic,
+            True,
+            search,
+            log,
+            estimators=estimators,
+        )
 
     @classmethod
     def named(
@@ -85,62 +130,171 @@ class Parameter:
         defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
         estimators: tuple[str, ...] = LIT,
     ) -> tuple[Parameter, ...]:
-        """Make the three numbers of a color, display-referred sRGB; the text goes on behind "Red", "Green", "Blue"."""
+        """Make the three numbers of a color, display-referred sRGB; the text goes on
+        behind "Red", "Green", "Blue".
+        """
         texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
-            cls(name, (), "sRGB", low, 1.0, default, words, search=search, estimators=estimators)
+            cls(
+                name,
+                (),
+                "sRGB",
+                low,
+                1.0,
+                default,
+                words,
+                search=search,
+                estimators=estimators,
+            )
             for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
         )
 
 
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
-    return Parameter(name, (), "1", 0.0, 1.0, "the material's own", text, search=search, estimators=Parameter.LIT)
+    return Parameter(
+        name,
+        (),
+        "1",
+        0.0,
+        1.0,
+        "the material's own",
+        text,
+        search=search,
+        estimators=Parameter.LIT,
+    )
 
 
-_pose, _camera = partial(Parameter.moving, Parameter.GEOMETRIC), partial(Parameter.moving, Parameter.ORBIT)
+_pose = partial(Parameter.moving, Parameter.GEOMETRIC)
+_camera = partial(Parameter.moving, Parameter.ORBIT)
 
 POSE = (
-    _pose("yaw", "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", (0.0, 360.0), periodic=True),
-    _pose("pitch", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's y axis.", (-15.0, 15.0), periodic=True),
-    _pose("roll", "degrees", -360.0, 360.0, 0.0, "Rotation about the object's x axis.", (-15.0, 15.0), periodic=True),
-    _pose("x", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along x.", (-0.15, 0.15)),
-    _pose("y", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along y.", (-0.15, 0.15)),
-    _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
-    _pose("scale", "1", 0.01, 100.0, 1.0, "Size relative to the default.", (0.8, 1.25), log=True),
+    _pose(
+        "yaw",
+        "degrees",
+        -3600.0,
+        3600.0,
+        0.0,
+        "Rotation about the vertical.",
+        (0.0, 360.0),
+        periodic=True,
+    ),
+    _pose(
+        "pitch",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation about the object's y axis.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _pose(
+        "roll",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation about the object's x axis.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _pose(
+        "x",
+        "object sizes",
+        -1e4,
+        1e4,
+        0.0,
+        "Shift of the object along x.",
+        (-0.15, 0.15),
+    ),
+    _pose(
+        "y",
+        "object sizes",
+        -1e4,
+        1e4,
+        0.0,
+        "Shift of the object along y.",
+        (-0.15, 0.15),
+    ),
+    _pose(
+        "z",
+        "object sizes",
+        -1e4,
+        1e4,
+        0.0,
+        "Height of the lowest point above the ground.",
+    ),
+    _pose(
+        "scale",
+        "1",
+        0.01,
+        100.0,
+        1.0,
+        "Size relative to the default.",
+        (0.8, 1.25),
+        log=True,
+    ),
 )
-ORBIT_CAMERA = "orbit"  # the camera that the settings `camera.*` describe: on a sphere around the object, looking at it
+# the camera that the settings `camera.*` describe: on a sphere around the object,
+# looking at it
+ORBIT_CAMERA = "orbit"
 
 CAMERA = (
-    _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera around the object.", (0.0, 360.0),
+    _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera "
+                                                         "around the object.", (0.0, 360.0),
             periodic=True),
-    _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the ground plane.", (5.0, 60.0)),
-    _camera("roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, counter-clockwise.", (-15.0, 15.0),
+    _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the "
+                                                       "ground plane.", (5.0, 60.0)),
+    _camera("roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, "
+                                                   "counter-clockwise.", (-15.0, 15.0),
             periodic=True),
     _camera("distance", "metres", 1e-4, 1e5, "fits the object",
-            "Distance to the object's middle; in object sizes where its size in metres is not known.", (0.8, 1.5),
+            "Distance to the object's middle; in object sizes where its size in metres "
+            "is not known.", (0.8, 1.5),
             log=True),
     _camera("height", "metres", -1e4, 1e5, "as the elevation says",
-            "Height of the lens above the ground, in place of `elevation`; in object sizes as `distance`."),
-    _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
-    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.",
+            "Height of the lens above the ground, in place of `elevation`; in object "
+            "sizes as `distance`."),
+    _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side "
+                                                "of the picture."),
+    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered "
+                                                         "exposure.",
               estimators=("image",)),
 )  # fmt: skip
 EV = Parameter(
     "ev", (), "EV at ISO 100", -10.0, 24.0, "metered",
-    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.", estimators=(),
+    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
+    "for lit streets.", estimators=(),
 )  # fmt: skip
 DROPS = (
-    Parameter("drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm before the camera.",
+    Parameter("drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm "
+                                                  "before the camera.",
               estimators=()),
-    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these drops.", estimators=()),
-    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a whole number.", estimators=()),
+    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these "
+                                                     "drops.", estimators=()),
+    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a "
+                                                   "whole number.", estimators=()),
 )  # fmt: skip
-LAMPS = ("off", "low", "high")  # what the lamps of a car may be: with either beam its tail lamps shine too
+# what the lamps of a car may be: with either beam its tail lamps shine too
+LAMPS = ("off", "low", "high")
 
 
 def _lamps(whose: str) -> Parameter:
-    text = f"Headlamps of {whose}, with its tail lamps: the low beam, or the high beam; in the avenue."
-    return Parameter("lamps", (), "name", 0.0, len(LAMPS) - 1.0, LAMPS[0], text, options=LAMPS, estimators=())
+    text = (
+        f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
+        "beam; in the avenue."
+    )
+    return Parameter(
+        "lamps",
+        (),
+        "name",
+        0.0,
+        len(LAMPS) - 1.0,
+        LAMPS[0],
+        text,
+        options=LAMPS,
+        estimators=(),
+    )
 
 
 ENVIRONMENT = (
@@ -155,26 +309,43 @@ GROUND_KINDS = (
     "table", "photograph", "road", "wet-road", "avenue", "wet-avenue", "crossing", "car-park", "room", "lit-room",
     "snow-avenue",
 )  # fmt: skip
-ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
-PHOTOGRAPHED_FROM = 3.0  # height above the floor of the camera of a photograph, where sizes are not known
-TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))  # settings that only a table has
+ROADS = (DRY_ROAD, WET_ROAD)
+PLACES = (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
+# height above the floor of the camera of a photograph, where sizes are not known
+PHOTOGRAPHED_FROM = 3.0
+# settings that only a table has
+TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 GROUND = (
     Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
-              "what the environment has: photograph where the map is a file, a road in a street, else table",
-              "What the object stands on: a square table, the floor that the environment's photograph shows, a road, "
-              "or a place with all that stands in it: an avenue, a crossing, a car park or a room.",
+              "what the environment has: photograph where the map is a file, a road in "
+              "a street, else table",
+              "What the object stands on: a square table, the floor that the "
+              "environment's photograph shows, a road, "
+              "or a place with all that stands in it: an avenue, a crossing, a car "
+              "park or a room.",
               options=GROUND_KINDS),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *Parameter.colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
-    Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
-              "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`."),
+    Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} "
+                                                    "object sizes",
+              "Height above the floor from which the photograph was taken; in object "
+              "sizes as `camera.distance`."),
     Parameter("radius", (), "metres", 1e-3, 1e5, "5 heights",
-              "How far from the photograph's camera its floor is empty; in object sizes as `camera.distance`."),
+              "How far from the photograph's camera its floor is empty; in object "
+              "sizes as `camera.distance`."),
 )  # fmt: skip
 MATERIAL = (
-    _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),
-    _surface("metallic", "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.", (0.0, 1.0)),
-    _surface("specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
+    _surface(
+        "roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)
+    ),
+    _surface(
+        "metallic",
+        "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.",
+        (0.0, 1.0),
+    ),
+    _surface(
+        "specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)
+    ),
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
@@ -183,15 +354,21 @@ FAMILIES = {
 }  # fmt: skip
 
 SETTINGS: Mapping[str, Parameter] = {
-    f"{family}.{setting.name}": setting for family, parameters in FAMILIES.items() for setting in parameters
+    f"{family}.{setting.name}": setting
+    for family, parameters in FAMILIES.items()
+    for setting in parameters
 }
 """Every setting by `family.parameter`; of no other control's parameters."""
-OF_A_MESH = ("pose", "material")  # families that a scene has again for each mesh around the object: ``pose:chair.yaw``
-Given = Mapping[str, float | str | Sequence[float]]  # settings by name; `resolve` refuses what is no number
+# families that a scene has again for each mesh around the object: ``pose:chair.yaw``
+OF_A_MESH = ("pose", "material")
+# settings by name; `resolve` refuses what is no number
+Given = Mapping[str, float | str | Sequence[float]]
 
 
 def parameter_of(name: str) -> Parameter | None:
-    """Return the parameter that a setting's name means, also of a mesh around the object; None if there is none."""
+    """Return the parameter that a setting's name means, also of a mesh around the
+    object; None if there is none.
+    """
     family, _, rest = name.partition(":")
     if rest and family in OF_A_MESH:
         name = f"{family}.{rest.rpartition('.')[2]}"
@@ -199,30 +376,48 @@ def parameter_of(name: str) -> Parameter | None:
 
 
 def mesh_of(name: str) -> str | None:
-    """Return the mesh around the object whose setting it is: ``chair`` of ``pose:chair.yaw``; None for the scene's."""
+    """Return the mesh around the object whose setting it is: ``chair`` of
+    ``pose:chair.yaw``; None for the scene's.
+    """
     mesh, dot, _ = name.partition(":")[2].rpartition(".")
     return mesh if dot else None
 
 
 def resolve(given: Given) -> dict[str, float | None]:
-    """Return every setting's value: what was given, checked, over the defaults; None where the scene works it out.
-    Settings of meshes around the object are there where they were given. Raises UnknownNameError: a name is not a
-    setting. Raises InputError: a value is not a finite number inside its range."""
+    """Return every setting's value: what was given, checked, over the defaults; None
+    where the scene works it out. Settings of meshes around the object are there where
+    they were given. Raises UnknownNameError: a name is not a setting. Raises
+    InputError: a value is not a finite number inside its range.
+    """
     if "camera.elevation" in given and "camera.height" in given:
-        raise InputError("`set` camera.elevation and camera.height say the same thing; leave one of them out")
-    values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}
+        raise InputError(
+            "`set` camera.elevation and camera.height say the same thing; "
+            "leave one of them out"
+        )
+    values = {
+        name: None if isinstance(one.default, str) else one.default
+        for name, one in SETTINGS.items()
+    }
     for name, value in given.items():
         setting = parameter_of(name)
         if setting is None:
-            raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
+            raise UnknownNameError(
+                "scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE."
+            )
         if setting.options:
             if value not in setting.options:
-                raise UnknownNameError(name, str(value), setting.options, "Write it as `set` NAME=VALUE.")
+                raise UnknownNameError(
+                    name, str(value), setting.options, "Write it as `set` NAME=VALUE."
+                )
             value = setting.options.index(str(value))
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
+            raise InputError(
+                f"`set` {name}: expected a number in {setting.unit}, got {value!r}"
+            )
         values[name] = float(value)
         if not setting.low <= value <= setting.high:  # NaN is not, either
             inside = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
-            raise InputError(f"`set` {name}: expected a number from {inside}, got {value:g}")
+            raise InputError(
+                f"`set` {name}: expected a number from {inside}, got {value:g}"
+            )
     return values

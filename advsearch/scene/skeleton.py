@@ -1,4 +1,6 @@
-"""What moves in a glTF file, as plain arrays in its own axes and units: nodes, clips, and what hangs on the nodes."""
+"""What moves in a glTF file, as plain arrays in its own axes and units: nodes, clips,
+and what hangs on the nodes.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,13 @@ class Track:
     """What a clip makes of one property of a node."""
 
     node: int  # number of the node
-    path: str  # "translation", "rotation" (x, y, z, w), "scale" or "weights" (of morph targets)
+    # "translation", "rotation" (x, y, z, w), "scale" or "weights" (of morph targets)
+    path: str
     interpolation: str  # "LINEAR", "STEP" or "CUBICSPLINE"
     times: Doubles  # (K,) seconds that rise
-    values: Doubles  # (K, 1, W); of a cubic spline (K, 3, W): the tangent before, the value, the tangent after
+    # (K, 1, W); of a cubic spline (K, 3, W): the tangent before, the value, the tangent
+    # after
+    values: Doubles
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +60,9 @@ class Skeleton:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A morph target: its name, the numbers (n,) of the vertices that it moves, and how far it moves them, (n, 3)."""
+    """A morph target: its name, the numbers (n,) of the vertices that it moves, and how
+    far it moves them, (n, 3).
+    """
 
     name: str
     rows: Ints
@@ -78,8 +85,11 @@ class Movable:
 
 
 def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int]:
-    """Return nodes, and all on which they hang; `parents` are (N,) their numbers, -1 of a root."""
-    reached, level = set[int](), set(nodes)
+    """Return nodes, and all on which they hang; `parents` are (N,) their numbers, -1 of
+    a root.
+    """
+    reached = set[int]()
+    level = set(nodes)
     while level:
         reached |= level
         level = {int(parents[node]) for node in level} - {-1} - reached
@@ -87,7 +97,9 @@ def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int
 
 
 def entries_of_turn(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
-    """Return the nine entries, row by row, of the rotation of a unit quaternion with real part `w`."""
+    """Return the nine entries, row by row, of the rotation of a unit quaternion with
+    real part `w`.
+    """
     return [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),

@@ -1,9 +1,11 @@
-"""Things beside the object, which stand on the ground with it where they were asked for.
+"""Things beside the object, which stand on the ground with it where they were asked
+for.
 
     car@12,3.5,heading=180; person@6,-2; bike.glb@3,1,size=1.8,label=bicycle
 
-Places are in metres from where the object stands by itself: x forwards, the way that the object faces, and y to its
-left. A heading is in degrees counter-clockwise, seen from above; at 0 a thing faces where the object does.
+Places are in metres from where the object stands by itself: x forwards, the way that
+the object faces, and y to its left. A heading is in degrees counter-clockwise, seen
+from above; at 0 a thing faces where the object does.
 """
 
 from __future__ import annotations
@@ -18,7 +20,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
+from advsearch.scene.assets import (
+    LARGEST,
+    SMALLEST,
+    Doubles,
+    ObjectAsset,
+    doubts,
+    footing,
+    pose_of,
+    sized,
+)
 from advsearch.scene.geometry import footprint, middle, overlapping, rotation, standing
 from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import safe_name
@@ -34,7 +45,8 @@ EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
 LAID = ("road", "floor")  # what the ground of a bundled place is called
 ALL = "all"  # what stands for the object and every thing beside it
-TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
+# what a thing can't be called
+TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)
 
 
 @dataclass(frozen=True)
@@ -47,9 +59,11 @@ class AskedThing:
     heading: float = 0.0  # degrees
     size: float | None = None  # its longest side in metres; None for its own
     name: str = ""  # what it is called in the scene
-    label: str | None = None  # what a model should call it; None for what the object of that name is called
+    # what a model should call it; None for what the object of that name is called
+    label: str | None = None
     lamps: str = LAMPS[0]  # one of `settings.LAMPS`, of a car
-    facing: str | None = None  # the axis of its file that is its front; None for what its format says
+    # the axis of its file that is its front; None for what its format says
+    facing: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +75,23 @@ class ThingPart(MeshPart):
 
 
 def asked_things(text: str | None) -> tuple[AskedThing, ...]:
-    """Read things that are asked for in one text, see above. Raises InputError: it says something else."""
+    """Read things that are asked for in one text, see above. Raises InputError: it says
+    something else.
+    """
     things: list[AskedThing] = []
     for part in filter(None, map(str.strip, (text or "").split(";"))):
         thing = _asked(part)
         taken = [*TAKEN, *(other.name for other in things)]
         if thing.name in taken and "name=" in part:
-            raise InputError(f"things: {part}: another thing of the scene is called {thing.name}; choose another name")
+            raise InputError(
+                f"things: {part}: another thing of the scene is called "
+                f"{thing.name}; choose another name"
+            )
         number = 2
         while thing.name in taken:
-            thing = replace(thing, name=f"{thing.name.removesuffix(f'-{number - 1}')}-{number}")
+            thing = replace(
+                thing, name=f"{thing.name.removesuffix(f'-{number - 1}')}-{number}"
+            )
             number += 1
         things.append(thing)
     if len(things) > MOST:
@@ -82,19 +103,48 @@ def _asked(part: str) -> AskedThing:
     what, at, rest = part.rpartition("@")
     words = [word.strip() for word in rest.split(",")]
     options = dict(word.partition("=")[::2] for word in words[2:])
-    if not at or not what.strip() or len(words) < 2 or any("=" not in word for word in words[2:]):
-        raise InputError(f"things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got {part!r}")
+    if (
+        not at
+        or not what.strip()
+        or len(words) < 2
+        or any("=" not in word for word in words[2:])
+    ):
+        raise InputError(
+            "things: expected WHAT@X,Y in metres, such as "
+            f"car@12,3.5,heading=180, got {part!r}"
+        )
     for name in options:
         if name not in OPTIONS:
             raise UnknownNameError(f"option of things {part!r}:", name, OPTIONS)
     lamps = options.get("lamps", LAMPS[0])
     if lamps not in LAMPS:
         raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
-    x, y = (_number(part, name, word, -FARTHEST, FARTHEST) for name, word in zip("xy", words, strict=False))
-    heading = _number(part, "heading", options["heading"], -3600.0, 3600.0) if "heading" in options else 0.0
-    size = _number(part, "size", options["size"], SMALLEST, LARGEST) if "size" in options else None
+    x, y = (
+        _number(part, name, word, -FARTHEST, FARTHEST)
+        for name, word in zip("xy", words, strict=False)
+    )
+    heading = (
+        _number(part, "heading", options["heading"], -3600.0, 3600.0)
+        if "heading" in options
+        else 0.0
+    )
+    size = (
+        _number(part, "size", options["size"], SMALLEST, LARGEST)
+        if "size" in options
+        else None
+    )
     name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
-    return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"), lamps, options.get("facing"))
+    return AskedThing(
+        what.strip(),
+        x,
+        y,
+        heading,
+        size,
+        name,
+        options.get("label"),
+        lamps,
+        options.get("facing"),
+    )
 
 
 def _number(part: str, name: str, text: str, low: float, high: float) -> float:
@@ -103,81 +153,121 @@ def _number(part: str, name: str, text: str, low: float, high: float) -> float:
     except ValueError:
         value = math.nan
     if not low <= value <= high:
-        raise InputError(f"things: {part}: {name}: expected a number from {low:g} to {high:g}, got {text!r}")
+        raise InputError(
+            f"things: {part}: {name}: expected a number from {low:g} to "
+            f"{high:g}, got {text!r}"
+        )
     return value
 
 
 def with_things(
-    scene: SceneDescription, text: str | None, load: Callable[[str, str | None], ObjectAsset]
+    scene: SceneDescription,
+    text: str | None,
+    load: Callable[[str, str | None], ObjectAsset],
 ) -> SceneDescription:
-    """Return the scene with the things beside its object that a text asks for, each loaded by its name or file and the
-    axis that its front faces; what stands in another one is said in its remarks. Raises UnknownNameError: there is no
-    such object. Raises InputError: the text says something else, a name is taken, or sizes in metres are not known."""
+    """Return the scene with the things beside its object that a text asks for, each
+    loaded by its name or file and the axis that its front faces; what stands in another
+    one is said in its remarks. Raises UnknownNameError: there is no such object. Raises
+    InputError: the text says something else, a name is taken, or sizes in metres are
+    not known.
+    """
     asked = asked_things(text)
     if not asked:
         return scene
     if scene.object.metres is None:
         raise InputError(
-            f"things: they stand in metres beside {scene.object_name}, whose size in metres is not known; say it: its "
+            f"things: they stand in metres beside {scene.object_name}, whose size in "
+            "metres is not known; say it: its "
             "longest side, such as `size=0.1`"
         )
-    parts, remarks = list[ThingPart](), list[str]()
+    parts = list[ThingPart]()
+    remarks = list[str]()
     for thing in asked:
-        what, name = thing.what, thing.name
+        what = thing.what
+        name = thing.name
         asset = sized(load(what, thing.facing), thing.size, None)
         if asset.metres is None:
             example = f"{what}@{thing.x:g},{thing.y:g},size=METRES"
-            raise InputError(f"things: the size of {what} in metres is not known; say it: {example}")
+            raise InputError(
+                f"things: the size of {what} in metres is not known; say it: {example}"
+            )
         if name in {part.name for part in scene.parts}:
-            raise InputError(f"things: something of the scene is called {name} already; add name=NAME to it")
-        part = mesh_part(name, asset, _pose(scene, asset, thing, asset.metres), asset.material)
+            raise InputError(
+                f"things: something of the scene is called {name} "
+                "already; add name=NAME to it"
+            )
+        part = mesh_part(
+            name, asset, _pose(scene, asset, thing, asset.metres), asset.material
+        )
         looks = {**vars(part), "label": thing.label or asset.label}
         parts.append(ThingPart(**looks, metres=asset.metres, lamps=thing.lamps))
-        remarks += [*asset.notes, *doubts(asset, asked=thing.size is not None, laid=True)]
+        remarks += [
+            *asset.notes,
+            *doubts(asset, asked=thing.size is not None, laid=True),
+        ]
         if asset.front is not None and asset.front.reason and has_lanes(scene):
             remarks.append(asset.front.reason)
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
     places = {"the object": footprint(scene.base_vertices)} | {
-        name: footprint(standing(part)) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
+        name: footprint(standing(part))
+        for name, part in scene.meshes.items()
+        if isinstance(part, ThingPart)
     }
     remarks += [
-        f"{first[0].upper()}{first[1:]} and {other} stand in each other: their outlines on the ground overlap."
+        f"{first[0].upper()}{first[1:]} and {other} stand in each other: their "
+        "outlines on the ground overlap."
         for first, other in combinations(places, 2)
         if overlapping(places[first], places[other])
     ]
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
-def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float) -> Doubles:
+def _pose(
+    scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float
+) -> Doubles:
     foot, extent = footing(asset.mesh.vertices.astype(np.float64))
     linear = metres / scene.metres / extent * rotation(asked.heading, 0.0, 0.0)
     place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
-    return pose_of(linear, np.array([*place, ground_height(scene, place)]) - linear @ foot)
+    return pose_of(
+        linear, np.array([*place, ground_height(scene, place)]) - linear @ foot
+    )
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
+    """Return how high the ground lies at a place (2,), object sizes: road, pavement,
+    table or floor; or 0.
+    """
     ground = (part for part in scene.around.values() if part.is_ground)
     triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in ground)
-    return max((height for corners in triangles for height in heights_over(corners, place)), default=0.0)
+    return max(
+        (height for corners in triangles for height in heights_over(corners, place)),
+        default=0.0,
+    )
 
 
 def heights_over(corners: Doubles, place: Doubles) -> list[float]:
-    """Return how high the triangles (F, 3 corners, 3) lie that are above or below a place (2,)."""
+    """Return how high the triangles (F, 3 corners, 3) lie that are above or below a
+    place (2,).
+    """
     a, b, c = np.moveaxis(corners, 1, 0)
     sides = [
-        (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1]) - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
+        (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1])
+        - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
         for begin, end in ((b, c), (c, a), (a, b))
     ]
     whole = sides[0] + sides[1] + sides[2]
     shares = np.stack(sides) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
     under = (shares >= 0.0).all(axis=0)
-    heights: list[float] = (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+    heights: list[float] = (
+        (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+    )
     return heights
 
 
 def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
-    """Return which solid of the scene's place something overlaps with, such as "a house"; None where it stands free."""
+    """Return which solid of the scene's place something overlaps with, such as "a
+    house"; None where it stands free.
+    """
     for part in scene.around.values():
         for solid in part.solids:
             if overlapping(solid.footprint, taken):
@@ -186,7 +276,9 @@ def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
 
 
 def with_solids_checked(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with a remark on its object and each thing that stands in a house, a post or the like."""
+    """Return the scene with a remark on its object and each thing that stands in a
+    house, a post or the like.
+    """
     if not any(part.solids for part in scene.around.values()):
         return scene
     taken = {"the object": footprint(scene.base_vertices)}
@@ -195,26 +287,37 @@ def with_solids_checked(scene: SceneDescription) -> SceneDescription:
     for name, outline in taken.items():
         solid = solid_at(scene, outline)
         if solid is not None:
-            remarks.append(f"{name[0].upper()}{name[1:]} stands in {solid} of the place around it: put it elsewhere.")
+            remarks.append(
+                f"{name[0].upper()}{name[1:]} stands in {solid} of the "
+                "place around it: put it elsewhere."
+            )
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
 def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[str, ...]:
-    """Return what is said where cameras, at places (3,) in metres, are inside a solid of the scene's place."""
+    """Return what is said where cameras, at places (3,) in metres, are inside a solid
+    of the scene's place.
+    """
     inside = list[str]()
     for eye in eyes:
         x, y, z = eye / scene.metres
-        around = np.array([(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)])
+        around = np.array(
+            [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
+        )
         solid = solid_at(scene, Footprint(around, z - EYE_SIZE, z + EYE_SIZE))
         if solid is not None:
             inside.append(solid)
     if not inside:
         return ()
     if len(eyes) == 1:
-        return (f"The camera is inside {inside[0]} of the place: it sees no object from there; move it.",)
+        return (
+            f"The camera is inside {inside[0]} of the place: it sees no object "
+            "from there; move it.",
+        )
     solids = " or ".join(dict.fromkeys(inside))
     fraction = 100.0 * len(inside) / len(eyes)
     return (
-        f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: it sees no object from there; "
+        f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
+        "it sees no object from there; "
         "narrow where it goes.",
     )

@@ -1,4 +1,5 @@
-"""The machinery of a typed configuration: settings with one description each, read from YAML, flags and Python alike.
+"""The machinery of a typed configuration: settings with one description each, read from
+YAML, flags and Python alike.
 
 `config` declares the settings themselves.
 """

@@ -21,8 +21,8 @@ class Dip:
         seen: pictures that are right there, and how many there are.
         until: the farthest of the distances beyond it that are compared with it.
         beyond: pictures that are right at these, and how many there are.
-        p: how likely so large a difference is where the share falls with the distance; of all differences that were
-            looked at together.
+        p: how likely so large a difference is where the share falls with the distance;
+            of all differences that were looked at together.
     """
 
     distance: float
@@ -37,34 +37,46 @@ class Dip:
         return self.p <= FALSE_ALARMS
 
 
-def _fit_falling(right: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
+def _fit_falling(
+    right: NDArray[np.int64], counts: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Fit shares (m,) that do not rise, by isotonic regression."""
     from scipy.optimize import isotonic_regression  # takes a quarter of a second
 
-    fitted: NDArray[np.float64] = isotonic_regression(right / counts, weights=counts, increasing=False).x
+    fitted: NDArray[np.float64] = isotonic_regression(
+        right / counts, weights=counts, increasing=False
+    ).x
     return fitted
 
 
-def find_dips(distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]) -> tuple[Dip, ...]:
-    """Find distances, the nearest first, at which an object is seen less often than beyond them.
+def find_dips(
+    distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]
+) -> tuple[Dip, ...]:
+    """Find distances, the nearest first, at which an object is seen less often than
+    beyond them.
 
-    Each distance is compared with each run of distances right behind it by Fisher's exact test (one-sided), and the
-    p-values are multiplied by how many comparisons there are (Bonferroni). Where the shares fall, those beyond are
-    at most the nearer one, which makes large differences only rarer: so one falling curve in twenty has a dip that is
-    shown, at most (`benchmarks/first_seen.py --simulated`). Listed are those that are shown, and those that bring the
-    estimate's line below the shares beyond, which may be chance.
+    Each distance is compared with each run of distances right behind it by Fisher's
+    exact test (one-sided), and the p-values are multiplied by how many comparisons
+    there are (Bonferroni). Where the shares fall, those beyond are at most the nearer
+    one, which makes large differences only rarer: so one falling curve in twenty has a
+    dip that is shown, at most (`benchmarks/first_seen.py --simulated`). Listed are
+    those that are shown, and those that bring the estimate's line below the shares
+    beyond, which may be chance.
     """
     from scipy.stats import hypergeom  # takes half a second
 
     n_distances = len(distances)
     comparisons = n_distances * (n_distances - 1) / 2.0
-    right_before, counts_before = (np.concatenate([[0], np.cumsum(column)]) for column in (right, counts))
+    right_before, counts_before = (
+        np.concatenate([[0], np.cumsum(column)]) for column in (right, counts)
+    )
     dips = []
     for near in range(n_distances - 1):
         far = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[far] - right_before[near + 1]
         counts_beyond = counts_before[far] - counts_before[near + 1]
-        total_right, total = right_beyond + right[near], counts_beyond + counts[near]
+        total_right = right_beyond + right[near]
+        total = counts_beyond + counts[near]
         p = hypergeom.cdf(right[near], total, total_right, counts[near])
         lower = right[near] / counts[near] < right_beyond / counts_beyond
         if not lower.any():

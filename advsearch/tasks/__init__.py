@@ -1,4 +1,6 @@
-"""Tasks: what a model is asked to do, and how its output is judged against what is true of the scene."""
+"""Tasks: what a model is asked to do, and how its output is judged against what is true
+of the scene.
+"""
 
 from __future__ import annotations
 
@@ -25,25 +27,54 @@ from advsearch.options import (
     told,
 )
 from advsearch.registry import Registry, get_class
-from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Said, Sight, Task, Truth
-from advsearch.tasks.classification import NO, Classification, ClassTask, Labels, members, target_lead, wrong_lead
+from advsearch.tasks.base import (
+    Facts,
+    Judgement,
+    Mark,
+    Prediction,
+    Said,
+    Sight,
+    Task,
+    Truth,
+)
+from advsearch.tasks.classification import (
+    NO,
+    Classification,
+    ClassTask,
+    Labels,
+    members,
+    target_lead,
+    wrong_lead,
+)
 from advsearch.tasks.detection import Detection
-from advsearch.tasks.together import Joined, Outputs, Together, Truths, all_said, outcome_in
+from advsearch.tasks.together import (
+    Joined,
+    Outputs,
+    Together,
+    Truths,
+    all_said,
+    outcome_in,
+)
 
 MOST_NUMBERS = 4  # of an output that are said one by one
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnTask(Task):
-    """A task by one function, see `own_task`; its truth are the scene's facts in each configuration."""
+    """A task by one function, see `own_task`; its truth are the scene's facts in each
+    configuration.
+    """
 
     name = "own"
     varies = True
 
     function: Callable[[Any, Facts], Tensor]
-    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)  # empty where the model has no names
+    # empty where the model has no names
+    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
 
-    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> OwnTask:
+    def on(
+        self, model: Model, *, target: str | None = None, minimise: bool = False
+    ) -> OwnTask:
         asked = super().on(model, target=target, minimise=minimise)
         return replace(asked, labels=tuple(model.labels) if model.named else ())
 
@@ -51,28 +82,50 @@ class OwnTask(Task):
         return facts
 
     def loss(self, output: Any, truth: Facts) -> Tensor:
-        """Return what the function says, (N,). Raises InputError where it returns something else."""
-        found, count = self.function(copied(output), truth), len(output)
-        if isinstance(found, Tensor) and found.is_floating_point() and found.numel() == count:
+        """Return what the function says, (N,). Raises InputError where it returns
+        something else.
+        """
+        found = self.function(copied(output), truth)
+        count = len(output)
+        if (
+            isinstance(found, Tensor)
+            and found.is_floating_point()
+            and found.numel() == count
+        ):
             return found.reshape(count)
-        got = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+        got = (
+            f"{found.dtype} {tuple(found.shape)}"
+            if isinstance(found, Tensor)
+            else type(found).__name__
+        )
         raise InputError(
-            f"task {self.name}: expected how wrong each output is, a tensor of {count} floating-point number"
-            f"{'s' * (count != 1)}, over 0 where it is wrong, got {got}; a distance less what is allowed does, or a "
+            f"task {self.name}: expected how wrong each output is, a tensor of {count} "
+            "floating-point number"
+            f"{'s' * (count != 1)}, over 0 where it is wrong, got {got}; a distance "
+            "less what is allowed does, or a "
             "wrong logit less the right one"
         )
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
-        """Return the largest class of each output where classes have names, else its numbers."""
+        """Return the largest class of each output where classes have names, else its
+        numbers.
+        """
         found: list[tuple[Prediction, ...]] = []
         for one in output.detach():
-            index = int(one.argmax()) if one.ndim == 1 and len(one) == len(self.labels) else None
+            index = (
+                int(one.argmax())
+                if one.ndim == 1 and len(one) == len(self.labels)
+                else None
+            )
             if index is not None:
                 label = self.labels[index]
             elif one.numel() <= MOST_NUMBERS:
                 label = ", ".join(f"{value:.3g}" for value in one.flatten().tolist())
             else:
-                label = f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}"
+                label = (
+                    f"{' x '.join(map(str, one.shape))} numbers, mean "
+                    f"{float(one.double().mean()):.3g}"
+                )
             found.append((Prediction(label, index),))
         return found
 
@@ -84,9 +137,11 @@ def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
     """Return a task from a function, by whose name it is called.
 
     Args:
-        function: `judge(output, truth)`, with the outputs of the model for N pictures (N, ...), and `Facts`: what is
-            true of the scene in this configuration, such as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`.
-            It returns (N,), or a number for one picture: over 0 exactly where the output is wrong, differentiable.
+        function: `judge(output, truth)`, with the outputs of the model for N pictures
+            (N, ...), and `Facts`: what is true of the scene in this configuration, such
+            as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
+            (N,), or a number for one picture: over 0 exactly where the output is wrong,
+            differentiable.
 
     Raises:
         InputError: it takes other arguments.
@@ -107,28 +162,36 @@ TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
     list_built_ins("task"),
     "a subclass of Task whose name is that of the entry point",
-    lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
+    lambda name, entry: (
+        isinstance(entry, type) and issubclass(entry, Task) and entry.name == name
+    ),
 )
 """Every task that has a name."""
 
 
 AnyTask = str | Mapping[str, object] | Task | Callable[[Any, Facts], Tensor]
-"""A task: its name, a mapping with its `name` and options, the task itself, or a function `judge(output, truth)`."""
+"""A task: its name, a mapping with its `name` and options, the task itself, or a
+function `judge(output, truth)`.
+"""
 
 
 def make_task(task: AnyTask) -> Task:
-    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, the task
-    itself, or that of a function (`own_task`).
+    """Return the task of that name, of that `name` with these options, which are its
+    dataclass's fields, the task itself, or that of a function (`own_task`).
 
-    Of several tasks at once, "detection+depth", the options of each stand under its name. Raises UnknownNameError: no
-    such task, or it has no such option; InputError: an option's value is of another type, or outside its range.
+    Of several tasks at once, "detection+depth", the options of each stand under its
+    name. Raises UnknownNameError: no such task, or it has no such option; InputError:
+    an option's value is of another type, or outside its range.
     """
     if isinstance(task, Task):
         return task
     if callable(task) and not isinstance(task, type):
         return own_task(task)
     if not isinstance(task, (str, Mapping)):
-        raise InputError(f"task: expected a name, a mapping with a `name`, a Task or a function, got {told(task)}")
+        raise InputError(
+            "task: expected a name, a mapping with a `name`, a Task or a "
+            f"function, got {told(task)}"
+        )
     given = {"name": task} if isinstance(task, str) else task
     name = str(given.get("name", Classification.name))
     options: dict[str, Any] = {key: given[key] for key in given if key != "name"}
@@ -136,10 +199,19 @@ def make_task(task: AnyTask) -> Task:
         names = [part.strip() for part in name.split(JOINED)]
         for part, of_part in options.items():
             if part not in names:
-                raise UnknownNameError(f"option of task {JOINED.join(names)!r}:", part, names)
+                raise UnknownNameError(
+                    f"option of task {JOINED.join(names)!r}:", part, names
+                )
             if not isinstance(of_part, Mapping):
-                raise InputError(f"task {part}: expected its options as a mapping, got {of_part!r:.80}")
-        return Together(parts=tuple(make_task({**options.get(part, {}), "name": part}) for part in names))
+                raise InputError(
+                    f"task {part}: expected its options as a mapping, got "
+                    f"{of_part!r:.80}"
+                )
+        return Together(
+            parts=tuple(
+                make_task({**options.get(part, {}), "name": part}) for part in names
+            )
+        )
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)

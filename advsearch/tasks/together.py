@@ -1,5 +1,6 @@
-"""Tasks made of others: several models at once, each with a task of its own; every thing in a picture; and the pictures
-of a rig of cameras."""
+"""Tasks made of others: several models at once, each with a task of its own; every
+thing in a picture; and the pictures of a rig of cameras.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +19,28 @@ from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
 from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED, OUT_OF_VIEW, OUTCOME, get_outcome
-from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Said, Task, Truth, mean
+from advsearch.tasks.base import (
+    Facts,
+    Judgement,
+    Mark,
+    Output,
+    Prediction,
+    Said,
+    Task,
+    Truth,
+    mean,
+)
 
-Outputs = tuple[Any, ...]  # what each of several models returns for one picture, or one model for each picture of a rig
+# what each of several models returns for one picture, or one model for each picture of
+# a rig
+Outputs = tuple[Any, ...]
 
 
 @final
 class Ensemble:
-    """Asks several models, each of which resizes and normalises for itself; what `Model.module` is of `together`."""
+    """Asks several models, each of which resizes and normalises for itself; what
+    `Model.module` is of `together`.
+    """
 
     def __init__(self, models: Sequence[Model]) -> None:
         self.models = tuple(models)
@@ -36,8 +51,10 @@ class Ensemble:
 
 
 def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
-    """Return several models as one, whose output is a list with a tuple of the models' outputs for each picture. The
-    size of the pictures is (height, width) in pixels; None for the largest that a model takes."""
+    """Return several models as one, whose output is a list with a tuple of the models'
+    outputs for each picture. The size of the pictures is (height, width) in pixels;
+    None for the largest that a model takes.
+    """
     high, wide = (max(model.input_size[side] for model in models) for side in (0, 1))
     return Model(
         module=Ensemble(models),
@@ -64,7 +81,9 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Joined(Task):
-    """A task made of others, which are the `judges`: one for each of its truths in their order, or one for all."""
+    """A task made of others, which are the `judges`: one for each of its truths in
+    their order, or one for all.
+    """
 
     varies = True
 
@@ -79,7 +98,9 @@ class Joined(Task):
 
     @property
     def ambiguities(self) -> str:
-        return "; ".join(judge.ambiguities for judge in self.judges if judge.ambiguities)
+        return "; ".join(
+            judge.ambiguities for judge in self.judges if judge.ambiguities
+        )
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -100,7 +121,9 @@ def _distinct(texts: Iterable[Iterable[str]]) -> tuple[str, ...]:
 
 
 def outcome_in(judgement: Judgement) -> dict[str, JsonValue]:
-    """Return the outcome that a judgement states, as a part of a payload; empty where it states none."""
+    """Return the outcome that a judgement states, as a part of a payload; empty where
+    it states none.
+    """
     outcome = get_outcome(judgement.payload)
     return {} if outcome is None else {OUTCOME: outcome.value}
 
@@ -114,8 +137,9 @@ def all_said(predictions: Iterable[Prediction]) -> Prediction:
 class Together(Joined):
     """Several models, each of which judges by a task and labels of its own.
 
-    A prediction is right where all models are right, and a success where it is one for every model. So the loss is
-    the largest of the models' losses, and the score the least of their scores.
+    A prediction is right where all models are right, and a success where it is one for
+    every model. So the loss is the largest of the models' losses, and the score the
+    least of their scores.
     """
 
     name = "ensemble"
@@ -137,21 +161,36 @@ class Together(Joined):
     def read(self, returned: Any, count: int) -> list[Outputs]:
         return by_picture(returned, count)
 
-    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
-        """See `Task.on`; a target is for the tasks that take a label, where some do and some do not. Raises InputError
-        where it is no model of `together`, or one of fewer or more than there are tasks."""
+    def on(
+        self, model: Model, *, target: str | None = None, minimise: bool = False
+    ) -> Together:
+        """See `Task.on`; a target is for the tasks that take a label, where some do and
+        some do not. Raises InputError where it is no model of `together`, or one of
+        fewer or more than there are tasks.
+        """
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
-            raise InputError(f"model: expected {len(self.parts)}, one for each task, got {len(models) or 1}")
+            raise InputError(
+                f"model: expected {len(self.parts)}, one for each task, "
+                f"got {len(models) or 1}"
+            )
         tasks = tuple(
-            part.on(network, target=target if self._takes_label(part) else None, minimise=minimise)
+            part.on(
+                network,
+                target=target if self._takes_label(part) else None,
+                minimise=minimise,
+            )
             for part, network in zip(self.parts, models, strict=True)
         )
         targets = None if target is None else tuple(task.target for task in tasks)
-        return replace(self, models=models, tasks=tasks, target=targets, minimise=minimise)
+        return replace(
+            self, models=models, tasks=tasks, target=targets, minimise=minimise
+        )
 
     def seeking(self, objective: str) -> Together:
-        return replace(self, parts=tuple(part.seeking(objective) for part in self.parts))
+        return replace(
+            self, parts=tuple(part.seeking(objective) for part in self.parts)
+        )
 
     def told(self, one: Task, facts: Facts) -> Facts:
         """Return the facts for one of the tasks: without a label that is for others."""
@@ -164,59 +203,111 @@ class Together(Joined):
         for task in self.tasks:
             task.check(self.told(task, facts))
 
-    def after_calibration(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
-        each = zip(self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True)
-        return replace(self, tasks=tuple(task.after_calibration(*shown) for task, *shown in each))
+    def after_calibration(
+        self, output: Sequence[Outputs], truth: Truths | None
+    ) -> Together:
+        each = zip(
+            self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True
+        )
+        return replace(
+            self, tasks=tuple(task.after_calibration(*shown) for task, *shown in each)
+        )
 
     @property
     def ambiguities(self) -> str:
         pairs = zip(self.models, self.tasks, strict=True)
-        return "; ".join(f"{model.name}: {task.ambiguities}" for model, task in pairs if task.ambiguities)
+        return "; ".join(
+            f"{model.name}: {task.ambiguities}"
+            for model, task in pairs
+            if task.ambiguities
+        )
 
     def truth(self, facts: Facts) -> Truths:
         return tuple(task.truth(facts) for task in self.tasks)
 
     def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack([task.loss(*judged) for task, *judged in self._each(output, truth)]).amax(dim=0)
+        return torch.stack(
+            [task.loss(*judged) for task, *judged in self._each(output, truth)]
+        ).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack([task.score(*judged) for task, *judged in self._each(output, truth)]).amin(dim=0)
+        return torch.stack(
+            [task.score(*judged) for task, *judged in self._each(output, truth)]
+        ).amin(dim=0)
 
-    def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        said = [task.predictions(shown) for task, shown in zip(self.tasks, of_each(output), strict=True)]
-        return [(all_said(first for first, *_ in each),) for each in zip(*said, strict=True)]
+    def predictions(
+        self, output: Sequence[Outputs], count: int = 1
+    ) -> list[tuple[Prediction, ...]]:
+        said = [
+            task.predictions(shown)
+            for task, shown in zip(self.tasks, of_each(output), strict=True)
+        ]
+        return [
+            (all_said(first for first, *_ in each),) for each in zip(*said, strict=True)
+        ]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
         judgements = []
-        for each in zip(*(task.judge(*judged) for task, *judged in self._each(output, truth)), strict=True):
-            payloads = {model.name: judged.payload for model, judged in zip(self.models, each, strict=True)}
-            payload = payloads if any(kept is not None for kept in payloads.values()) else None
+        for each in zip(
+            *(task.judge(*judged) for task, *judged in self._each(output, truth)),
+            strict=True,
+        ):
+            payloads = {
+                model.name: judged.payload
+                for model, judged in zip(self.models, each, strict=True)
+            }
+            payload = (
+                payloads
+                if any(kept is not None for kept in payloads.values())
+                else None
+            )
             worst = min(each, key=lambda judged: judged.margin)
             payload = None if payload is None else {**payload, **outcome_in(worst)}
-            margin = math.nan if any(judged.not_a_number for judged in each) else min(judged.margin for judged in each)
+            margin = (
+                math.nan
+                if any(judged.not_a_number for judged in each)
+                else min(judged.margin for judged in each)
+            )
             prediction = all_said(judged.prediction for judged in each)
-            judgements.append(Judgement.of(min(judged.score for judged in each), margin, prediction, payload))
+            judgements.append(
+                Judgement.of(
+                    min(judged.score for judged in each), margin, prediction, payload
+                )
+            )
         return judgements
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""
+        """See `Task.marks`: what is true of the first, maps of all, and what each model
+        says under its name.
+        """
         pictures: list[list[Mark]] = [[] for _ in output]
         for number, (task, *judged) in enumerate(self._each(output, truth)):
             for picture, marks in zip(pictures, task.marks(*judged), strict=True):
-                picture += [mark for mark in marks if mark.true and (not number or mark.map is not None)]
+                picture += [
+                    mark
+                    for mark in marks
+                    if mark.true and (not number or mark.map is not None)
+                ]
                 name = self.models[number].name
-                picture += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
+                picture += [
+                    replace(mark, text=f"{name}: {mark.text}")
+                    for mark in marks
+                    if not mark.true
+                ]
         return pictures
 
-    def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
+    def _each(
+        self, output: Sequence[Outputs], truth: Truths
+    ) -> list[tuple[Any, Any, Any]]:
         return list(zip(self.tasks, of_each(output), truth, strict=True))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# One task, asked of the object and of every thing beside it: a prediction is right where it is right about all of
-# them.
+# One task, asked of the object and of every thing beside it: a prediction is right
+# where it is right about all of them.
 #
-# A search is after a wrong prediction about any of them: loss and score are the largest of the things' own.
+# A search is after a wrong prediction about any of them: loss and score are the largest
+# of the things' own.
 
 TruthOfEach = Mapping[str, Truth]  # what is true of each thing, by name
 
@@ -248,56 +339,91 @@ class EachThing(Joined):
         return self._largest("loss", output, truth)
 
     def score(self, output: Output, truth: TruthOfEach) -> Tensor:
-        return -self.loss(output, truth) if self.minimise else self._largest("score", output, truth)
+        return (
+            -self.loss(output, truth)
+            if self.minimise
+            else self._largest("score", output, truth)
+        )
 
     def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
         """Return that of the thing where it is largest, (N,); of segmentation."""
         return self._largest("pixel_margin", output, truth)
 
     def _largest(self, value: str, output: Output, truth: TruthOfEach) -> Tensor:
-        return torch.stack([getattr(self.part, value)(output, true) for true in truth.values()]).amax(dim=0)
+        return torch.stack(
+            [getattr(self.part, value)(output, true) for true in truth.values()]
+        ).amax(dim=0)
 
-    def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
+    def predictions(
+        self, output: Output, count: int = 1
+    ) -> list[tuple[Prediction, ...]]:
         return self.part.predictions(output, count)
 
-    def said(self, output: Output, truth: TruthOfEach, margins: Sequence[float]) -> list[Said]:
-        """See `Task.said`: the prediction about the thing that is worst, and in the payload what is said of each."""
+    def said(
+        self, output: Output, truth: TruthOfEach, margins: Sequence[float]
+    ) -> list[Said]:
+        """See `Task.said`: the prediction about the thing that is worst, and in the
+        payload what is said of each.
+        """
         found: list[Said] = []
-        for judged in zip(*(self.part.judge(output, true) for true in truth.values()), strict=True):
+        for judged in zip(
+            *(self.part.judge(output, true) for true in truth.values()), strict=True
+        ):
             by_name = dict(zip(truth, judged, strict=True))
-            seen = [name for name, thing in by_name.items() if thing.prediction.label != OUT_OF_VIEW] or list(by_name)
+            seen = [
+                name
+                for name, thing in by_name.items()
+                if thing.prediction.label != OUT_OF_VIEW
+            ] or list(by_name)
             worst = min(seen, key=lambda name: by_name[name].margin)
             payloads: dict[str, Any] = {
-                name: thing.payload if isinstance(thing.payload, dict) else {} for name, thing in by_name.items()
+                name: thing.payload if isinstance(thing.payload, dict) else {}
+                for name, thing in by_name.items()
             }
             things = {
-                name: {"right": thing.right, "margin": thing.margin, "answer": thing.prediction.label}
+                name: {
+                    "right": thing.right,
+                    "margin": thing.margin,
+                    "answer": thing.prediction.label,
+                }
                 | outcome_in(thing)
                 | ({"box": payloads[name]["box"]} if "box" in payloads[name] else {})
                 for name, thing in by_name.items()
             }
             average = mean([thing.margin for thing in judged])
-            payload = {**payloads[worst], "worst": worst, "mean_margin": average, "things": things}
+            payload = {
+                **payloads[worst],
+                "worst": worst,
+                "mean_margin": average,
+                "things": things,
+            }
             found.append((by_name[worst].prediction, payload))
         return found
 
     def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
         """See `Task.marks`: what is true of each thing, and the prediction once."""
-        each = zip(*(self.part.marks(output, true) for true in truth.values()), strict=True)
+        each = zip(
+            *(self.part.marks(output, true) for true in truth.values()), strict=True
+        )
         return [
-            [mark for thing in things for mark in thing if mark.true] + [mark for mark in things[0] if not mark.true]
+            [mark for thing in things for mark in thing if mark.true]
+            + [mark for mark in things[0] if not mark.true]
             for things in each
         ]
 
 
 def each_thing(task: Task) -> EachThing:
-    """Return a task on its model as one that judges every thing. Raises InputError: its models say one thing of a whole
-    picture, or are several."""
+    """Return a task on its model as one that judges every thing. Raises InputError: its
+    models say one thing of a whole picture, or are several.
+    """
     if isinstance(task, Together) or task.name not in JUDGES:
         raise InputError(
-            f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge one thing, by its name"
+            f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge "
+            "one thing, by its name"
         )
-    kind: Any = type("EachThing", (EachThing,), {"name": task.name, "objective": task.objective})
+    kind: Any = type(
+        "EachThing", (EachThing,), {"name": task.name, "objective": task.objective}
+    )
     made: EachThing = kind(part=task, minimise=task.minimise, target=task.target)
     return made
 

@@ -1,11 +1,14 @@
-"""Archives of model files, checked before torch, which trusts them, makes anything of them that could run or swell.
+"""Archives of model files, checked before torch, which trusts them, makes anything of
+them that could run or swell.
 
-The threat: a model file of somebody else runs code as it is unpickled or loaded, unpacks to more than the memory holds,
-or has members that lead elsewhere. So members have distinct, plain names in one folder, are not encrypted, and unpack
-to no more than a limit; nothing is unpickled. TorchScript is rewritten: torch runs a part of its code (`__setstate__`)
-while it loads, which can call operators that touch files.
+The threat: a model file of somebody else runs code as it is unpickled or loaded,
+unpacks to more than the memory holds, or has members that lead elsewhere. So members
+have distinct, plain names in one folder, are not encrypted, and unpack to no more than
+a limit; nothing is unpickled. TorchScript is rewritten: torch runs a part of its code
+(`__setstate__`) while it loads, which can call operators that touch files.
 
-Used by `models/files.py` and `models/source.py`; `exported_programs.py` has what archives of `torch.export` need more.
+Used by `models/files.py` and `models/source.py`; `exported_programs.py` has what
+archives of `torch.export` need more.
 """
 
 from __future__ import annotations
@@ -30,8 +33,10 @@ from advsearch.trust.foreign_code import first_line
 from advsearch.trust.stored_files import parse_json, scaled, too_large
 
 LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
-LARGEST_TEXT = 64 << 20  # bytes of a member that describes the network: JSON, source code, a pickle of names
-LARGEST_RATIO = 20  # bytes that a byte of the file may unpack to; torch itself does not compress
+# bytes of a member that describes the network: JSON, source code, a pickle of names
+LARGEST_TEXT = 64 << 20
+# bytes that a byte of the file may unpack to; torch itself does not compress
+LARGEST_RATIO = 20
 SLACK = 4 << 20  # bytes that a small file may unpack to, whatever the ratio
 _NAME = re.compile(r"[\w.+ -]+(/[\w.+ -]+)*")
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -39,8 +44,9 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """An open archive that has passed the checks, with its members by name without the root folder. Made by
-    `open_archive`."""
+    """An open archive that has passed the checks, with its members by name without the
+    root folder. Made by `open_archive`.
+    """
 
     path: Path
     zip: zipfile.ZipFile
@@ -50,43 +56,68 @@ class Archive:
         return name in self.members
 
     def read(self, name: str, limit: int = LARGEST) -> bytes:
-        """Return the content of a member. Raises FileFormatError where there is none of that name, it is larger than
-        `limit`, or it is damaged."""
+        """Return the content of a member. Raises FileFormatError where there is none of
+        that name, it is larger than `limit`, or it is damaged.
+        """
         if name not in self.members:
             raise refused(self.path, f"has no {name!r}, so it is not complete")
         size = self.members[name].file_size
         if size > scaled(limit):
-            raise too_large(self.path, f"{name!r} of at most {scaled(limit):,} bytes in it", f"{size:,}")
+            raise too_large(
+                self.path,
+                f"{name!r} of at most {scaled(limit):,} bytes in it",
+                f"{size:,}",
+            )
         try:
             return self.zip.read(self.members[name])
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            OSError,
+            RuntimeError,
+            NotImplementedError,
+        ) as error:
             raise truncated(self.path, error) from None
 
     def read_json(self, name: str) -> Any:
-        """Return the value of a member that is JSON; errors as for `read`, and where it is not JSON."""
+        """Return the value of a member that is JSON; errors as for `read`, and where it
+        is not JSON.
+        """
         try:
             return parse_json(self.read(name, LARGEST_TEXT))
         except ValueError as error:
-            raise refused(self.path, f"expected JSON in {name!r}, got {first_line(error)}") from None
+            raise refused(
+                self.path, f"expected JSON in {name!r}, got {first_line(error)}"
+            ) from None
 
 
 def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
-    """Return the archive in an open file of `size` bytes, which stays open as long as that is used. Raises
-    FileFormatError: it is damaged, unpacks to too much, or has members that torch's archives never have."""
+    """Return the archive in an open file of `size` bytes, which stays open as long as
+    that is used. Raises FileFormatError: it is damaged, unpacks to too much, or has
+    members that torch's archives never have.
+    """
     try:
         archive = zipfile.ZipFile(file)
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise truncated(path, error) from None
-    unpacked, limit = sum(entry.file_size for entry in entries), ""
+    unpacked = sum(entry.file_size for entry in entries)
+    limit = ""
     if unpacked > scaled(LARGEST):
-        limit, got = f"a model of at most {scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
+        limit = f"a model of at most {scaled(LARGEST):,} bytes unpacked"
+        got = f"{unpacked:,}"
     elif unpacked > scaled(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {scaled(LARGEST_RATIO)} times its size"
+        limit = (
+            f"a model that unpacks to at most {scaled(LARGEST_RATIO)} times its size"
+        )
         got = f"{size:,} bytes that unpack to {unpacked:,}"
     if limit:
         raise too_large(path, limit, got)
-    roots = {entry.filename.partition("/")[0] if "/" in entry.filename else "" for entry in entries}
+    roots = {
+        entry.filename.partition("/")[0] if "/" in entry.filename else ""
+        for entry in entries
+    }
     root = f"{roots.pop()}/" if len(roots) == 1 and "" not in roots else ""
     members = {entry.filename.removeprefix(root): entry for entry in entries}
     if len(members) < len(entries):
@@ -95,30 +126,39 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
         if not _NAME.fullmatch(name) or ".." in name.split("/"):
             raise refused(path, f"has a member of the name {name[:80]!r}")
         if entry.flag_bits & 0x1 or entry.compress_type not in _METHODS:
-            raise refused(path, f"has an encrypted or strangely packed member, {name[:80]!r}")
+            raise refused(
+                path, f"has an encrypted or strangely packed member, {name[:80]!r}"
+            )
     return Archive(path, archive, members)
 
 
 def refused(path: Path, what: str) -> FileFormatError:
     """Return the error for an archive with something in it that is never loaded."""
-    return FileFormatError(f"model file {path}: {what}; export a plain network with torch.export.save")
+    return FileFormatError(
+        f"model file {path}: {what}; export a plain network with torch.export.save"
+    )
 
 
 def truncated(path: Path, error: BaseException) -> FileFormatError:
     """Return the error for an archive that cannot be unpacked."""
-    return FileFormatError(f"model file {path}: truncated or damaged archive ({first_line(error)})")
+    return FileFormatError(
+        f"model file {path}: truncated or damaged archive ({first_line(error)})"
+    )
 
 
 LARGEST_PICKLE = 8 << 20  # bytes of a pickle that describes the modules
 LARGEST_CODE = 16 << 20  # bytes of source code, all files together
 DEPTH = 200  # of modules and values in one another
-PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}  # that torch reads, and the folder of their tensors
+# that torch reads, and the folder of their tensors
+PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}
 
 _HARMFUL = re.compile(
     r"\b(save|load|from_file|load_tensor|read_file|write_file|set_data|print|debugprims|symm_mem|inductor|profiler"
     r"|c10d|_c10d_functional|dist_c10d|dist_rpc|static_runtime|_TorchScriptTesting)\b"
 )
-"""Operators that touch files, the terminal or other processes, and families of such; as whole words anywhere."""
+"""Operators that touch files, the terminal or other processes, and families of such; as
+whole words anywhere.
+"""
 
 _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|u|U|N|[0-7]{1,3})")
 _CLASS = re.compile(r"torch\s*\.\s*classes\s*\.\s*(\w*)")
@@ -126,7 +166,10 @@ _CLASSES = frozenset(["quantized", "rnn", "mkldnn", "sparse"])
 _WHITE = frozenset((9, 10, 13))
 
 _ITEM_BYTES = {
-    **dict.fromkeys(("ByteStorage", "CharStorage", "BoolStorage", "QInt8Storage", "QUInt8Storage"), 1),
+    **dict.fromkeys(
+        ("ByteStorage", "CharStorage", "BoolStorage", "QInt8Storage", "QUInt8Storage"),
+        1,
+    ),
     **dict.fromkeys(("HalfStorage", "BFloat16Storage", "ShortStorage"), 2),
     **dict.fromkeys(("FloatStorage", "IntStorage", "QInt32Storage"), 4),
     **dict.fromkeys(("DoubleStorage", "LongStorage", "ComplexFloatStorage"), 8),
@@ -135,23 +178,37 @@ _ITEM_BYTES = {
 
 
 def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
-    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one, and whether
-    torch runs a part of the code while it loads it. Raises FileFormatError where its code calls what a network has no
-    use for, or its pickles state what is not there."""
-    scripts = [name for name in archive.members if name.startswith("code/") and name.endswith(".py")]
+    """Return an archive for `torch.jit.load` that holds the code, the pickles and the
+    tensors of this one, and whether torch runs a part of the code while it loads it.
+    Raises FileFormatError where its code calls what a network has no use for, or its
+    pickles state what is not there.
+    """
+    scripts = [
+        name
+        for name in archive.members
+        if name.startswith("code/") and name.endswith(".py")
+    ]
     code = {name: archive.read(name, LARGEST_CODE) for name in scripts}
     if sum(map(len, code.values())) > LARGEST_CODE:
-        raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
+        raise refused(
+            archive.path, f"has more than {LARGEST_CODE:,} bytes of source code"
+        )
     for name, content in code.items():
         if wrong := _code_problem(content):
-            raise refused(archive.path, f"{name!r} {wrong}, which no plain network does")
+            raise refused(
+                archive.path, f"{name!r} {wrong}, which no plain network does"
+            )
     for name in PICKLES:
         _check_pickle(archive, name)
-    tensors = [name for name in archive.members if name.partition("/")[0] in PICKLES.values()]
+    tensors = [
+        name for name in archive.members if name.partition("/")[0] in PICKLES.values()
+    ]
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
-        raise refused(archive.path, f"expected a version number in {name!r}, got {version[:20]!r}")
+        raise refused(
+            archive.path, f"expected a version number in {name!r}, got {version[:20]!r}"
+        )
     buffer = io.BytesIO()
     writer = torch._C.PyTorchFileWriter(buffer)
     writer.set_min_version(int(version))
@@ -172,9 +229,13 @@ def _code_problem(content: bytes) -> str:
         return f"uses {found[0]!r}"
     if any(family not in _CLASSES for family in _CLASS.findall(text)):
         return "uses native classes other than those of quantized networks"
-    # an escape in a text may stand for something that torch writes plainly, or that steers a terminal
+    # an escape in a text may stand for something that torch writes plainly, or that
+    # steers a terminal
     escapes = _ESCAPE.findall(text)
-    hidden = any(not e.isdigit() or (int(e, 8) < 128 and int(e, 8) not in _WHITE) for e in escapes)
+    hidden = any(
+        not e.isdigit() or (int(e, 8) < 128 and int(e, 8) not in _WHITE)
+        for e in escapes
+    )
     if hidden or any(ord(sign) < 32 and ord(sign) not in _WHITE for sign in text):
         return "has text with hidden characters"
     return ""
@@ -187,7 +248,9 @@ class _Inert:
     parts: list[Any]
 
     def __new__(cls, *parts: Any) -> _Inert:
-        """Make one as `__reduce__` or as ``cls.__new__`` would; there is no `__init__`."""
+        """Make one as `__reduce__` or as ``cls.__new__`` would; there is no
+        `__init__`.
+        """
         made = super().__new__(cls)
         made.parts = list(parts)
         return made
@@ -197,8 +260,10 @@ class _Inert:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Reads a pickle without making anything that it names: every class and every function is an `_Inert`. It is
-    Python's own slow reader, since the fast one makes room for any number that a pickle gives its memory."""
+    """Reads a pickle without making anything that it names: every class and every
+    function is an `_Inert`. It is Python's own slow reader, since the fast one makes
+    room for any number that a pickle gives its memory.
+    """
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data))
@@ -215,18 +280,33 @@ class _Unpickler(pickle._Unpickler):
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a pickle is no deeper than a network, and that the tensors that it names are as large as it says."""
+    """Check that a pickle is no deeper than a network, and that the tensors that it
+    names are as large as it says.
+    """
     reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
     try:
         value = reader.load()
     except Exception as error:  # a damaged pickle raises nearly anything
-        raise refused(archive.path, f"{name!r} is damaged ({first_line(error)})") from None
-    if any(family not in _CLASSES for text in reader.names for family in _CLASS.findall(text)):
-        raise refused(archive.path, f"{name!r} holds native objects, which are never loaded")
+        raise refused(
+            archive.path, f"{name!r} is damaged ({first_line(error)})"
+        ) from None
+    if any(
+        family not in _CLASSES
+        for text in reader.names
+        for family in _CLASS.findall(text)
+    ):
+        raise refused(
+            archive.path, f"{name!r} holds native objects, which are never loaded"
+        )
     _check_values(archive, name, value)
-    for storage in reader.storages:  # torch reads as many numbers as are stated, be they there or not
-        parts = storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
-        kind, key, count = getattr(parts[1], "name", ""), f"{PICKLES[name]}/{parts[2]}", parts[4]
+    # torch reads as many numbers as are stated, be they there or not
+    for storage in reader.storages:
+        parts = (
+            storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
+        )
+        kind = getattr(parts[1], "name", "")
+        key = f"{PICKLES[name]}/{parts[2]}"
+        count = parts[4]
         if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
             raise refused(archive.path, f"has a tensor of another kind in {key[:80]!r}")
         size = archive.members[key].file_size if key in archive else 0
@@ -236,12 +316,14 @@ def _check_pickle(archive: Archive, name: str) -> None:
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
-    level, seen = [value], {id(value)}
+    level = [value]
+    seen = {id(value)}
     for _ in range(DEPTH):
         signs = {sign for item in level if isinstance(item, str) for sign in item}
         if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
             raise refused(archive.path, f"{name!r} has text with hidden characters")
-        new = dict[int, Any]()  # each once: a pickle may name one part any number of times
+        # each once: a pickle may name one part any number of times
+        new = dict[int, Any]()
         for outer in level:
             inside: Iterable[Any] = ()
             if isinstance(outer, dict):
@@ -258,7 +340,9 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
 
 @contextlib.contextmanager
 def without_unpickling() -> Iterator[None]:
-    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever it asks for."""
+    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever
+    it asks for.
+    """
     switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
     os.environ[switches[0]] = "1"

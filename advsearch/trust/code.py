@@ -1,12 +1,16 @@
-"""What runs Python code, fetches weights of a library, or asks a model's address: only what a person has named.
+"""What runs Python code, fetches weights of a library, or asks a model's address: only
+what a person has named.
 
-The threat: a run, a suite, a recipe or a model file of somebody else names code, and whoever opens it would run that
-code. So a name that only a file has is refused, and the message says how a person allows it (`allow_code`, the setting
-`code`). Modules of the current directory come last, and processes of Python that we start begin in our own folder.
+The threat: a run, a suite, a recipe or a model file of somebody else names code, and
+whoever opens it would run that code. So a name that only a file has is refused, and the
+message says how a person allows it (`allow_code`, the setting `code`). Modules of the
+current directory come last, and processes of Python that we start begin in our own
+folder.
 
-Used wherever a name becomes code: controls, objectives, models and metrics (`registry.py`, `models/source.py`,
-`engine/judging.py`), models of libraries and addresses (`models/zoo/library.py`, `models/address.py`), workers
-(`cluster/worker.py`), and where people name things (`cli/`, `api/`, `testing.py`).
+Used wherever a name becomes code: controls, objectives, models and metrics
+(`registry.py`, `models/source.py`, `engine/judging.py`), models of libraries and
+addresses (`models/zoo/library.py`, `models/address.py`), workers (`cluster/worker.py`),
+and where people name things (`cli/`, `api/`, `testing.py`).
 """
 
 from __future__ import annotations
@@ -27,25 +31,31 @@ from advsearch.errors import CodeNotAllowedError, InputError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _ALLOWED: set[str] = set()
-"""The Python code, and the models of libraries, that whoever uses this process has named. Of the process, so that it
-holds in every thread; empty at first, so that what only a file names is refused, whoever reads that file."""
+"""The Python code, and the models of libraries, that whoever uses this process has
+named. Of the process, so that it holds in every thread; empty at first, so that what
+only a file names is refused, whoever reads that file.
+"""
 _CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):\S+")
 
 
 def allow_code(*names: str) -> None:
-    """Allow this process to import Python code that a file names, such as the `run.yaml` of a run: read it before.
+    """Allow this process to import Python code that a file names, such as the
+    `run.yaml` of a run: read it before.
 
     Args:
-        names: "package.module:attribute", each as it stands in the file, without weights behind an @; or a model of a
-            library, "hf:OWNER/NAME", whose weights may then be fetched; or a model's address, "https://...", to which
-            pictures may then be sent.
+        names: "package.module:attribute", each as it stands in the file, without
+            weights behind an @; or a model of a library, "hf:OWNER/NAME", whose weights
+            may then be fetched; or a model's address, "https://...", to which pictures
+            may then be sent.
 
     Raises:
         InputError: a name is none of this form.
     """
     for name in names:
         if not isinstance(name, str) or not _CODE.fullmatch(name):
-            raise InputError(f"code: expected package.module:attribute, got {str(name)[:80]!r}")
+            raise InputError(
+                f"code: expected package.module:attribute, got {str(name)[:80]!r}"
+            )
     _ALLOWED.update(names)
 
 
@@ -54,31 +64,47 @@ def allowed_code() -> tuple[str, ...]:
 
 
 def allow_named(settings: Mapping[str, Any]) -> None:
-    """Allow the code that stands in settings which a person has typed or given in Python: as models, controls or
-    metrics, in any form that they may have there. Settings that come from a file are never given to this."""
+    """Allow the code that stands in settings which a person has typed or given in
+    Python: as models, controls or metrics, in any form that they may have there.
+    Settings that come from a file are never given to this.
+    """
     names: list[object] = []
     for key in ("model", "compared", "than"):
         texts = [text for text in _listed(settings.get(key)) if isinstance(text, str)]
         names += [part.partition("@")[0] for text in texts for part in text.split(",")]
     for key in ("controls", "over"):
         value = settings.get(key)
-        for control in (*_listed(value), *(value.values() if isinstance(value, Mapping) else ())):
-            names += control.split(",") if isinstance(control, str) else [getattr(control, "kind", None)]
+        for control in (
+            *_listed(value),
+            *(value.values() if isinstance(value, Mapping) else ()),
+        ):
+            names += (
+                control.split(",")
+                if isinstance(control, str)
+                else [getattr(control, "kind", None)]
+            )
             names += [control.get("kind")] if isinstance(control, Mapping) else []
     metrics = settings.get("metrics")
     for metric in metrics.values() if isinstance(metrics, Mapping) else ():
-        names.append(f"{metric.__module__}:{getattr(metric, '__qualname__', '')}" if callable(metric) else metric)
+        names.append(
+            f"{metric.__module__}:{getattr(metric, '__qualname__', '')}"
+            if callable(metric)
+            else metric
+        )
     texts = [name.strip() for name in names if isinstance(name, str)]
     _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
 def names_code(function: Function) -> Function:
-    """Let what a caller gives a function, which is for Python only and not for what a file says, allow code too."""
+    """Let what a caller gives a function, which is for Python only and not for what a
+    file says, allow code too.
+    """
     signature = inspect.signature(function)
 
     @wraps(function)
     def asked(*args: Any, **given: Any) -> Any:
-        with suppress(TypeError):  # of arguments that do not fit, which the function says itself
+        # of arguments that do not fit, which the function says itself
+        with suppress(TypeError):
             allow_named(signature.bind(*args, **given).arguments)
         return function(*args, **given)
 
@@ -91,7 +117,9 @@ def _listed(value: Any) -> list[Any]:
 
 @contextmanager
 def nothing_allowed() -> Iterator[None]:
-    """Allow inside the block what is named there alone, and after it what was allowed before."""
+    """Allow inside the block what is named there alone, and after it what was allowed
+    before.
+    """
     before = allowed_code()
     _ALLOWED.clear()
     try:
@@ -102,35 +130,48 @@ def nothing_allowed() -> Iterator[None]:
 
 
 def may_fetch(model: str) -> bool:
-    """Return whether a person has named a model of a library, so that its weights may be fetched."""
+    """Return whether a person has named a model of a library, so that its weights may
+    be fetched.
+    """
     return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
 
 
 def how_to_allow(name: str) -> str:
     """Return how a person allows what only a file names, for messages."""
-    return f"if you trust it, allow it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
+    return (
+        "if you trust it, allow it yourself: in Python with "
+        f"advsearch.allow_code({name!r}), or with `code={name}`"
+    )
 
 
 def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where only a file does."""
+    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError
+    where only a file does.
+    """
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
-    spec = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
+    spec = PathFinder.find_spec(
+        name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()]
+    )
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
     raise CodeNotAllowedError(
-        f"a file names {name}, Python code{where} that would be imported and run; read it, and {how_to_allow(name)}"
+        f"a file names {name}, Python code{where} that would be imported and run; read "
+        f"it, and {how_to_allow(name)}"
     )
 
 
 OWN_FOLDER = Path(__file__).resolve().parents[2]
-"""Where processes of Python that we start begin: Python looks there for modules first, and the folder that a user is in
-may be somebody else's."""
+"""Where processes of Python that we start begin: Python looks there for modules first,
+and the folder that a user is in may be somebody else's.
+"""
 
 
 @contextmanager
 def current_directory_importable() -> Iterator[None]:
-    """Look for modules in the current directory too, behind the rest of the path, inside the block."""
+    """Look for modules in the current directory too, behind the rest of the path,
+    inside the block.
+    """
     directory = os.getcwd()
     added = directory not in sys.path and "" not in sys.path
     if added:

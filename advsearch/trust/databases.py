@@ -1,7 +1,9 @@
-"""SQLite's files: they hold the tables that we make and no code, and opening one touches no other file.
+"""SQLite's files: they hold the tables that we make and no code, and opening one
+touches no other file.
 
-The threat: a database of somebody else has a view or a trigger, which is code that SQLite runs and that may never end;
-its pages are damaged; or the journal beside it names a file that SQLite would delete.
+The threat: a database of somebody else has a view or a trigger, which is code that
+SQLite runs and that may never end; its pages are damaged; or the journal beside it
+names a file that SQLite would delete.
 
 Used by the results of runs (`runs/store.py`, `runs/files.py`).
 """
@@ -25,24 +27,34 @@ DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run 
 LARGEST = 64 << 30  # bytes of a database, and of its journal
 MAX_SCHEMA_ENTRIES = 100  # of a schema that are looked at; ours has fewer than ten
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""The last bytes of a journal that names a file (https://www.sqlite.org/fileformat2.html)."""
+"""The last bytes of a journal that names a file
+(https://www.sqlite.org/fileformat2.html).
+"""
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn what SQLite says of a damaged file inside the block into an error that names it."""
+    """Turn what SQLite says of a damaged file inside the block into an error that names
+    it.
+    """
     try:
         yield
     except (sqlite3.Error, UnicodeDecodeError) as error:
         text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
-        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}") from error
+        raise FileFormatError(
+            f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}"
+        ) from error
 
 
 def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
-    """Check that the file has what some statements make and no more: a view or a trigger is code, and may never end."""
+    """Check that the file has what some statements make and no more: a view or a
+    trigger is code, and may never end.
+    """
     if read_schema(db) != _schema_of(statements):
         db.close()
-        raise FileFormatError(f"{path}: expected the tables of a run, got others; {DAMAGED}")
+        raise FileFormatError(
+            f"{path}: expected the tables of a run, got others; {DAMAGED}"
+        )
 
 
 @cache
@@ -53,23 +65,34 @@ def _schema_of(statements: str) -> Counter[Any]:
 
 
 def read_schema(db: sqlite3.Connection) -> Counter[Any]:
-    """Return every entry of the schema, whatever its name: type, name, table and statement.
+    """Return every entry of the schema, whatever its name: type, name, table and
+    statement.
 
-    Statements are compared without comments and line breaks, which mean nothing to SQLite.
+    Statements are compared without comments and line breaks, which mean nothing to
+    SQLite.
     """
-    entries = db.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchmany(MAX_SCHEMA_ENTRIES)
-    return Counter((*names, None if sql is None else _without_comments(str(sql))) for *names, sql in entries)
+    entries = db.execute(
+        "SELECT type, name, tbl_name, sql FROM sqlite_master"
+    ).fetchmany(MAX_SCHEMA_ENTRIES)
+    return Counter(
+        (*names, None if sql is None else _without_comments(str(sql)))
+        for *names, sql in entries
+    )
 
 
 def _without_comments(statement: str) -> str:
-    without_comments = "\n".join(line.partition("--")[0] for line in statement.split("\n"))
+    without_comments = "\n".join(
+        line.partition("--")[0] for line in statement.split("\n")
+    )
     return re.sub("[ \n]+", " ", without_comments).strip(" ")
 
 
 def protect(db: sqlite3.Connection) -> None:
-    """Let a stranger's file call no function of its own choosing, and let SQLite look at each page that it reads.
+    """Let a stranger's file call no function of its own choosing, and let SQLite look
+    at each page that it reads.
 
-    Nothing here needs the schema, so nothing of the file's own statements has run by then.
+    Nothing here needs the schema, so nothing of the file's own statements has run by
+    then.
     """
     db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA writable_schema = OFF")
@@ -78,29 +101,42 @@ def protect(db: sqlite3.Connection) -> None:
 
 
 def check_before_writing(path: Path) -> None:
-    """Check that a file that SQLite is to write into is none, or an ordinary one and no link, with a journal of its
-    own. Raises FileFormatError."""
+    """Check that a file that SQLite is to write into is none, or an ordinary one and no
+    link, with a journal of its own. Raises FileFormatError.
+    """
     if os.path.islink(path):
-        raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
+        raise FileFormatError(
+            f"{path}: expected a file of this run, got a link to another; {DAMAGED}"
+        )
     if path.exists():
         open_regular(path, "a results.sqlite", LARGEST).close()
     _check_journal(path.with_name(f"{path.name}-journal"))
 
 
 def _check_journal(journal: Path) -> None:
-    """Refuse a journal that ends with the name of a file: SQLite would delete that file. None of ours does."""
+    """Refuse a journal that ends with the name of a file: SQLite would delete that
+    file. None of ours does.
+    """
     if not os.path.lexists(journal):
         return
     with open_regular(journal, "a journal of SQLite", LARGEST) as file:
         file.seek(-min(len(_JOURNAL), os.fstat(file.fileno()).st_size), os.SEEK_END)
         if file.read() == _JOURNAL:
-            raise FileFormatError(f"{journal}: expected the journal of one file, got one that names another; remove it")
+            raise FileFormatError(
+                f"{journal}: expected the journal of one file, got "
+                "one that names another; remove it"
+            )
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
-    """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
+    """Open the file for reading; where the log's index can't be made (a read-only
+    disk), as one that never changes.
+    """
     if not os.path.isfile(path):
-        raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
+        raise FileFormatError(
+            f"{path}: expected the results of a run, got no such "
+            "file; check the name of the run"
+        )
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)
     try:

@@ -1,9 +1,11 @@
 """`torch.export` archives (.pt2), rewritten before torch reads them.
 
-torch's reader evaluates expressions and guards as Python, writes names of the graph into code that it runs, imports
-modules for containers, and unpickles. So it never sees the file: a new archive is made in memory of its description of
-the network and its weights. What cannot be checked is left out, and all else has to have the form that
-`torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers, symbols and listed functions.
+torch's reader evaluates expressions and guards as Python, writes names of the graph
+into code that it runs, imports modules for containers, and unpickles. So it never sees
+the file: a new archive is made in memory of its description of the network and its
+weights. What cannot be checked is left out, and all else has to have the form that
+`torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers,
+symbols and listed functions.
 
 Used by `models/files.py`.
 """
@@ -27,13 +29,17 @@ from advsearch.trust.stored_files import parse_json
 
 LENGTH = 20_000  # characters of an expression
 DEPTH = 60  # of its nesting
-EXPONENT = 64  # multiplied over nested powers: nobody writes s0**65, and 9**9**9 never ends
+# multiplied over nested powers: nobody writes s0**65, and 9**9**9 never ends
+EXPONENT = 64
 NUMBER = 1 << 63  # numbers are smaller than this
 
 FUNCTIONS = frozenset(
-    "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality Unequality StrictLessThan LessThan "
-    "StrictGreaterThan GreaterThan And Or Not Piecewise ExprCondPair FloorDiv ModularIndexing Where PythonMod CleanDiv "
-    "CeilToInt FloorToInt CeilDiv FloatTrueDiv IntTrueDiv IsNonOverlappingAndDenseIndicator TruncToFloat TruncToInt "
+    "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality "
+    "Unequality StrictLessThan LessThan "
+    "StrictGreaterThan GreaterThan And Or Not Piecewise ExprCondPair FloorDiv "
+    "ModularIndexing Where PythonMod CleanDiv "
+    "CeilToInt FloorToInt CeilDiv FloatTrueDiv IntTrueDiv "
+    "IsNonOverlappingAndDenseIndicator TruncToFloat TruncToInt "
     "RoundToInt RoundDecimal ToFloat Identity floor ceiling".split()
 )
 POWERS = frozenset(["Pow", "PowByNatural", "FloatPow", "LShift", "RShift"])
@@ -41,13 +47,24 @@ NAMES = frozenset(["true", "false", "oo", "int_oo"])
 
 _SYMBOL = re.compile(r"[A-Za-z_]{1,40}[0-9]{0,5}")
 _DECIMAL = re.compile(r"-?[0-9]{1,40}(\.[0-9]{0,40})?(e[-+]?[0-9]{1,3})?")
-_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.BitAnd, ast.BitOr)
+_OPERATORS = (
+    ast.Add,
+    ast.Sub,
+    ast.Mult,
+    ast.Div,
+    ast.FloorDiv,
+    ast.Mod,
+    ast.BitAnd,
+    ast.BitOr,
+)
 _SIGNS = (ast.UAdd, ast.USub, ast.Not, ast.Invert)
 _COMPARISONS = (ast.Eq, ast.NotEq, ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
 def is_symbol(text: str) -> bool:
-    """Whether a text may name a symbol: letters, then at most five digits (torch counts up to the number)."""
+    """Whether a text may name a symbol: letters, then at most five digits (torch counts
+    up to the number).
+    """
     return _SYMBOL.fullmatch(text) is not None
 
 
@@ -59,13 +76,21 @@ def problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        reason = str(error.args[0]) if type(error) is ValueError else "it cannot be read"
-        return f"expected arithmetic with whole numbers and symbols, got {text[:60]!r} ({reason})"
+        reason = (
+            str(error.args[0]) if type(error) is ValueError else "it cannot be read"
+        )
+        return (
+            "expected arithmetic with whole numbers and symbols, got "
+            f"{text[:60]!r} "
+            f"({reason})"
+        )
     return ""
 
 
 def _check(node: ast.expr, depth: int, power: int) -> None:
-    """Raise ValueError unless the node is arithmetic; `power` is what may still be multiplied up by exponents."""
+    """Raise ValueError unless the node is arithmetic; `power` is what may still be
+    multiplied up by exponents.
+    """
     if depth <= 0:
         raise ValueError("it is nested too deeply")
     operands: list[ast.expr] = []
@@ -78,17 +103,28 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
         case ast.Name(id=name):
             if not (name in NAMES or (is_symbol(name) and name[-1].isdigit())):
                 raise ValueError(f"the name {name[:40]!r}")
-        case ast.Call(func=ast.Name(id="Symbol" | "Float" as name), args=arguments, keywords=words):
-            text = arguments[0].value if len(arguments) == 1 and isinstance(arguments[0], ast.Constant) else None
+        case ast.Call(
+            func=ast.Name(id="Symbol" | "Float" as name), args=arguments, keywords=words
+        ):
+            text = (
+                arguments[0].value
+                if len(arguments) == 1 and isinstance(arguments[0], ast.Constant)
+                else None
+            )
             keys = {word.arg for word in words}
             values = [
-                word.value.value if isinstance(word.value, ast.Constant) else None for word in words
+                word.value.value if isinstance(word.value, ast.Constant) else None
+                for word in words
             ]  # repeated keys too
             if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-                assumed = None not in keys and all(isinstance(value, bool) for value in values)
+                assumed = None not in keys and all(
+                    isinstance(value, bool) for value in values
+                )
                 if not (isinstance(text, str) and is_symbol(text) and assumed):
                     raise ValueError("a symbol of another form")
-            elif not (isinstance(text, str) and _DECIMAL.fullmatch(text)):  # Float('0.5', precision=53)
+            elif not (
+                isinstance(text, str) and _DECIMAL.fullmatch(text)
+            ):  # Float('0.5', precision=53)
                 raise ValueError("a number of another form")
             elif not keys <= {"precision", "prec", "dps"} or not all(
                 isinstance(value, int) and 0 < value <= 200 for value in values
@@ -97,20 +133,29 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
         case ast.Call(keywords=[_, *_]):
             raise ValueError("keywords")
         case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
-            operands, power = [base], _power_left(exponent, power)
-        case ast.Call(func=ast.Name(id=name), args=arguments) if name in FUNCTIONS and len(arguments) <= 16:
+            operands = [base]
+            power = _power_left(exponent, power)
+        case ast.Call(func=ast.Name(id=name), args=arguments) if (
+            name in FUNCTIONS and len(arguments) <= 16
+        ):
             operands = arguments
         case ast.Call(func=function):
             raise ValueError(f"a call of {ast.unparse(function)[:40]!r}")
         case ast.BinOp(left=base, op=ast.Pow(), right=exponent):
-            operands, power = [base], _power_left(exponent, power)
-        case ast.BinOp(left=left, op=operator, right=right) if isinstance(operator, _OPERATORS):
+            operands = [base]
+            power = _power_left(exponent, power)
+        case ast.BinOp(left=left, op=operator, right=right) if isinstance(
+            operator, _OPERATORS
+        ):
             operands = [left, right]
         case ast.UnaryOp(op=operator, operand=operand) if isinstance(operator, _SIGNS):
             operands = [operand]
-        case ast.Compare(left=left, ops=ops, comparators=others) if all(isinstance(op, _COMPARISONS) for op in ops):
+        case ast.Compare(left=left, ops=ops, comparators=others) if all(
+            isinstance(op, _COMPARISONS) for op in ops
+        ):
             operands = [left, *others]
-        case ast.BoolOp(values=parts) | ast.Tuple(elts=parts):  # a tuple is a case of a Piecewise
+        # a tuple is a case of a Piecewise
+        case ast.BoolOp(values=parts) | ast.Tuple(elts=parts):
             operands = parts
         case _:
             raise ValueError(f"{type(node).__name__} is none")
@@ -119,11 +164,22 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
 
 
 def _power_left(exponent: ast.expr, power: int) -> int:
-    """Return the power that is left for what has this exponent, which has to be a number."""
+    """Return the power that is left for what has this exponent, which has to be a
+    number.
+    """
     exponent = _without_sign(exponent)
-    if isinstance(exponent, ast.Call) and isinstance(exponent.func, ast.Name) and exponent.func.id == "Integer":
-        exponent = _without_sign(exponent.args[0]) if len(exponent.args) == 1 else exponent
-    if isinstance(exponent, ast.Call) and ast.unparse(exponent) in ("Rational(1, 2)", "Rational(-1, 2)"):
+    if (
+        isinstance(exponent, ast.Call)
+        and isinstance(exponent.func, ast.Name)
+        and exponent.func.id == "Integer"
+    ):
+        exponent = (
+            _without_sign(exponent.args[0]) if len(exponent.args) == 1 else exponent
+        )
+    if isinstance(exponent, ast.Call) and ast.unparse(exponent) in (
+        "Rational(1, 2)",
+        "Rational(-1, 2)",
+    ):
         return power
     value = exponent.value if isinstance(exponent, ast.Constant) else None
     if not isinstance(value, int) or isinstance(value, bool) or value > power:
@@ -132,7 +188,11 @@ def _power_left(exponent: ast.expr, power: int) -> int:
 
 
 def _without_sign(node: ast.expr) -> ast.expr:
-    return node.operand if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) else node
+    return (
+        node.operand
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub)
+        else node
+    )
 
 
 PROGRAM = "models/model.json"
@@ -147,12 +207,25 @@ OLD_NAMES = {
 EXAMPLE = ("data/sample_inputs/model.pt", "serialized_example_inputs.pt")
 
 NAMESPACES = "aten|prims|quantized|_quantized|quantized_decomposed|mkldnn|onednn|torchvision|torchao"
-HARMFUL = frozenset(["save", "load", "from_file", "warn", "_print", "set_data", "record_stream", "manual_seed"])
+HARMFUL = frozenset(
+    [
+        "save",
+        "load",
+        "from_file",
+        "warn",
+        "_print",
+        "set_data",
+        "record_stream",
+        "manual_seed",
+    ]
+)
 """Operators of these namespaces that touch files, the terminal or the process."""
 
 HIGHER_ORDER = "cond|map_impl|scan|associative_scan|flex_attention|wrap_with_set_grad_enabled|wrap_with_autocast"
 
-_OPERATOR = re.compile(rf"torch\.ops\.(?:{NAMESPACES})\.(\w+)\.\w+|torch\.ops\.higher_order\.(?:{HIGHER_ORDER})")
+_OPERATOR = re.compile(
+    rf"torch\.ops\.(?:{NAMESPACES})\.(\w+)\.\w+|torch\.ops\.higher_order\.(?:{HIGHER_ORDER})"
+)
 _ARITHMETIC = re.compile(
     r"_operator\.(eq|ne|le|ge|lt|gt|neg|pos|mul|add|sub|floordiv|mod|pow|truediv|and_|or_|lshift|rshift|getitem)"
     r"|math\.(trunc|floor|ceil)|torch\.sym_(not|int|float|ite|max|min|sqrt|sum)"
@@ -160,24 +233,39 @@ _ARITHMETIC = re.compile(
 _PLAIN = re.compile(r"[\w.:/ <>@=+-]{0,1000}")
 _RECORD = re.compile(r"\w[\w.-]{0,200}")
 _GLOBALS = re.compile(
-    r"torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict|torch [A-Z][A-Za-z0-9]*Storage"
-    r"|torch\.storage UntypedStorage|torch Size|torch device|torch\.serialization _get_layout"
+    r"torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict|torch "
+    r"[A-Z][A-Za-z0-9]*Storage"
+    r"|torch\.storage UntypedStorage|torch Size|torch device|torch\.serialization "
+    r"_get_layout"
     r"|torch (u?int|b?float|complex|bool)[0-9]*\w*"
 )
 """What the pickle of a tensor names; nothing of it runs anything."""
 
-_CONTAINERS = frozenset([None, "builtins.tuple", "builtins.list", "builtins.dict", "collections.OrderedDict"])
+_CONTAINERS = frozenset(
+    [
+        None,
+        "builtins.tuple",
+        "builtins.list",
+        "builtins.dict",
+        "collections.OrderedDict",
+    ]
+)
 _FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 
 
 def rewritten(archive: Archive) -> io.BytesIO:
-    """Return an archive for `torch.export.load` that holds what is harmless of this one: the network and its weights.
-    Raises FileFormatError where it has something in it that a plain network has not; the message says what."""
-    from torch.export.pt2_archive import PT2ArchiveWriter  # a second of compilers, which no other model needs
+    """Return an archive for `torch.export.load` that holds what is harmless of this
+    one: the network and its weights. Raises FileFormatError where it has something in
+    it that a plain network has not; the message says what.
+    """
+    # a second of compilers, which no other model needs
+    from torch.export.pt2_archive import PT2ArchiveWriter
 
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
     program = archive.read_json(names[PROGRAM])
-    if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
+    if not isinstance(program, dict) or not isinstance(
+        program.get("graph_module"), dict
+    ):
         expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
         raise refused(archive.path, f"cannot be read as torch.export ({expected})")
     program = _checked(archive.path, program, "")
@@ -188,13 +276,18 @@ def rewritten(archive: Archive) -> io.BytesIO:
     with PT2ArchiveWriter(buffer) as writer:  # type: ignore[no-untyped-call, arg-type, unused-ignore]
         writer.write_bytes(PROGRAM, json.dumps(program).encode())
         writer.write_bytes(EXAMPLE[0], b"")
-        for folder, kind in (("data/weights/", "weights"), ("data/constants/", "constants")):
+        for folder, kind in (
+            ("data/weights/", "weights"),
+            ("data/constants/", "constants"),
+        ):
             old = names[f"{folder}model.pt"]
             if old in archive:
                 _check_pickle(archive, old)
                 writer.write_bytes(f"{folder}model.pt", archive.read(old))
             else:
-                _copy_tensors(archive, writer, folder, f"{folder}model_{kind}_config.json")
+                _copy_tensors(
+                    archive, writer, folder, f"{folder}model_{kind}_config.json"
+                )
     buffer.seek(0)
     return buffer
 
@@ -202,35 +295,61 @@ def rewritten(archive: Archive) -> io.BytesIO:
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
-    if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-        raise refused(archive.path, f"expected a table of tensors in {config!r}, got something else")
+    if not isinstance(table, dict) or not all(
+        isinstance(entry, dict) for entry in table.values()
+    ):
+        raise refused(
+            archive.path,
+            f"expected a table of tensors in {config!r}, got something else",
+        )
     table = _checked(archive.path, table, "tensor_name")
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
         plain = isinstance(record, str) and _RECORD.fullmatch(record)
         if not isinstance(entry, dict) or entry.get("use_pickle") or not plain:
-            raise refused(archive.path, f"{name[:80]!r} is a pickled object or compiled code, which is never loaded")
-        member, meta = f"{folder}{record}", entry.get("tensor_meta")
+            raise refused(
+                archive.path,
+                f"{name[:80]!r} is a pickled object or "
+                "compiled code, which is never loaded",
+            )
+        member = f"{folder}{record}"
+        meta = entry.get("tensor_meta")
         sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
         listed = sizes if isinstance(sizes, list) else [None]
-        numbers: list[Any] = [size.get("as_int") if isinstance(size, dict) else None for size in listed]
+        numbers: list[Any] = [
+            size.get("as_int") if isinstance(size, dict) else None for size in listed
+        ]
         if not all(isinstance(number, int) and number >= 0 for number in numbers):
-            raise refused(archive.path, f"expected the sizes of a tensor for {member[:80]!r}, got something else")
+            raise refused(
+                archive.path,
+                "expected the sizes of a tensor for "
+                f"{member[:80]!r}, got something else",
+            )
         # torch makes a tensor without data of whatever size it is told
-        if member in archive and archive.members[member].file_size == 0 and math.prod(numbers) > 0:
-            raise refused(archive.path, f"{member[:80]!r} is empty, but should hold a tensor of {numbers[:8]}")
+        if (
+            member in archive
+            and archive.members[member].file_size == 0
+            and math.prod(numbers) > 0
+        ):
+            raise refused(
+                archive.path,
+                f"{member[:80]!r} is empty, but should hold a tensor of {numbers[:8]}",
+            )
         if member not in copied:
             writer.write_bytes(member, archive.read(member))
             copied.add(member)
     writer.write_bytes(config, json.dumps({"config": table}).encode())
 
 
-# ---- the description of the network ----------------------------------------------------------------------------------
+# ---- the description of the network
+# ----------------------------------------------------------------------------------
 
 
 def _checked(path: Path, value: JsonValue, key: str) -> Any:
-    """Return a value of the description, which stands under `key`, without what is left out."""
+    """Return a value of the description, which stands under `key`, without what is left
+    out.
+    """
     if isinstance(value, list):
         return [_checked(path, inner, key) for inner in value]
     if not isinstance(value, dict):
@@ -240,11 +359,15 @@ def _checked(path: Path, value: JsonValue, key: str) -> Any:
     checked: JsonObject = {}
     for name, inner in value.items():
         wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
-        if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
+        if name in ("as_custom_obj", "custom_obj") or (
+            name == "custom_obj_values" and inner
+        ):
             wrong = "holds a custom object, which is never loaded"
         if wrong:
             raise refused(path, wrong)
-        checked[name] = _FORGOTTEN[name] if name in _FORGOTTEN else _checked(path, inner, name)
+        checked[name] = (
+            _FORGOTTEN[name] if name in _FORGOTTEN else _checked(path, inner, name)
+        )
     return checked
 
 
@@ -263,33 +386,59 @@ def _plain_problem(text: str) -> str:
 
 
 def _identifier_problem(text: str) -> str:
-    proper = text == "" or (text.isascii() and text.isidentifier() and not keyword.iskeyword(text) and len(text) < 1000)
+    proper = text == "" or (
+        text.isascii()
+        and text.isidentifier()
+        and not keyword.iskeyword(text)
+        and len(text) < 1000
+    )
     return "" if proper else f"expected a name of a value, got {text[:60]!r}"
 
 
-def _argument_problem(text: str) -> str:  # that an operator is called with, such as 'same' or 'bilinear'
-    return "" if len(text) <= 1000 and text.isprintable() else "has text that is too long or not printable"
+# that an operator is called with, such as 'same' or 'bilinear'
+def _argument_problem(text: str) -> str:
+    return (
+        ""
+        if len(text) <= 1000 and text.isprintable()
+        else "has text that is too long or not printable"
+    )
 
 
 def _operator_problem(text: str) -> str:
     operator = _OPERATOR.fullmatch(text)
     if _ARITHMETIC.fullmatch(text) or (operator and operator[1] not in HARMFUL):
         return ""
-    return f"names the operator {text[:80]!r}, which is none of a plain network, and is never run"
+    return (
+        f"names the operator {text[:80]!r}, which is none of a plain network, and "
+        "is never run"
+    )
 
 
 def _tree_problem(text: str) -> str:
-    """What a container of inputs or outputs looks like: torch imports the types that it names."""
+    """What a container of inputs or outputs looks like: torch imports the types that it
+    names.
+    """
     try:
         version, tree = parse_json(text)
         nodes: list[Any] = [tree]
         while nodes:
             node = nodes.pop()
             context = "[]" if node["context"] in (None, "null") else node["context"]
-            names: Any = parse_json(context) if isinstance(context, str) else None  # of arguments
-            plain = isinstance(names, list) and all(isinstance(name, (str, int)) for name in names)
-            if node["type"] not in _CONTAINERS or not plain or any(_plain_problem(str(name)) for name in names):
-                return "has inputs or outputs in a container that is no tuple, list or dict"
+            # of arguments
+            names: Any = parse_json(context) if isinstance(context, str) else None
+            plain = isinstance(names, list) and all(
+                isinstance(name, (str, int)) for name in names
+            )
+            if (
+                node["type"] not in _CONTAINERS
+                or not plain
+                or any(_plain_problem(str(name)) for name in names)
+            ):
+                return (
+                    "has inputs or outputs in a container that is no tuple, list "
+                    "or "
+                    "dict"
+                )
             nodes += node["children_spec"]
     except (ValueError, TypeError, KeyError, RecursionError):
         return f"expected the structure of inputs or outputs, got {text[:60]!r}"
@@ -297,8 +446,13 @@ def _tree_problem(text: str) -> str:
 
 
 _TEXTS: dict[str, Callable[[str], str]] = {
-    **dict.fromkeys(("name", "as_name", "user_input_name", "forward_arg_names"), _identifier_problem),
-    **dict.fromkeys(("tensor_values", "sym_int_values", "sym_float_values", "sym_bool_values"), _identifier_problem),
+    **dict.fromkeys(
+        ("name", "as_name", "user_input_name", "forward_arg_names"), _identifier_problem
+    ),
+    **dict.fromkeys(
+        ("tensor_values", "sym_int_values", "sym_float_values", "sym_bool_values"),
+        _identifier_problem,
+    ),
     "expr_str": problem,
     "target": _operator_problem,
     "as_operator": _operator_problem,
@@ -310,16 +464,26 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 }
 
 
-# ---- pickles of tensors ----------------------------------------------------------------------------------------------
+# ---- pickles of tensors
+# ----------------------------------------------------------------------------------------------
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a member is what `torch.save` makes of tensors in tuples and dicts; nothing is unpickled here."""
+    """Check that a member is what `torch.save` makes of tensors in tuples and dicts;
+    nothing is unpickled here.
+    """
     data = archive.read(name)
     if not data:
         return
-    what = f"cannot be read as torch.export ({name!r} is in need of unpickling, which is never done)"
-    inner = open_archive(archive.path, io.BytesIO(data), len(data)) if data[:2] == b"PK" else None
+    what = (
+        f"cannot be read as torch.export ({name!r} is in need of unpickling, which "
+        "is never done)"
+    )
+    inner = (
+        open_archive(archive.path, io.BytesIO(data), len(data))
+        if data[:2] == b"PK"
+        else None
+    )
     if inner is None or "data.pkl" not in inner:
         raise refused(archive.path, what)
     try:
@@ -328,5 +492,12 @@ def _check_pickle(archive: Archive, name: str) -> None:
         raise refused(archive.path, what) from None
     for step, argument, _ in steps:
         foreign = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
-        if foreign or step.name in ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4"):
+        if foreign or step.name in (
+            "STACK_GLOBAL",
+            "INST",
+            "OBJ",
+            "EXT1",
+            "EXT2",
+            "EXT4",
+        ):
             raise refused(archive.path, what)

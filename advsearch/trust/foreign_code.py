@@ -1,11 +1,14 @@
-"""What code of others must not do to us: never end, leave torch's global switches turned, or say what it likes.
+"""What code of others must not do to us: never end, leave torch's global switches
+turned, or say what it likes.
 
-The threat: a network, a file of one or a library that reads it hangs, changes how all later tensors are made, or raises
-any error with any text. A call goes on in a thread of its own, left behind when the time is up, for nothing ends
-torch's loops; what would hold Python up too is tried in a process of its own. A network has the type and device for new
-tensors that its code chose. Of an error of others one short line is shown.
+The threat: a network, a file of one or a library that reads it hangs, changes how all
+later tensors are made, or raises any error with any text. A call goes on in a thread of
+its own, left behind when the time is up, for nothing ends torch's loops; what would
+hold Python up too is tried in a process of its own. A network has the type and device
+for new tensors that its code chose. Of an error of others one short line is shown.
 
-Used by all that loads and calls models (`models/`) and around what the engine does (`engine/`).
+Used by all that loads and calls models (`models/`) and around what the engine does
+(`engine/`).
 """
 
 from __future__ import annotations
@@ -27,10 +30,15 @@ from advsearch.errors import AdvsearchError, ModelError
 from advsearch.trust.code import OWN_FOLDER
 from advsearch.trust.stored_files import FACTOR, scaled
 
-LONGEST = 120  # seconds that a file's first passes may take each, and its loading, where that runs a part of it
+# seconds that a file's first passes may take each, and its loading, where that runs a
+# part of it
+LONGEST = 120
 GRACE = 5  # seconds for a call to end that was asked to
 _CPU = torch.device("cpu")
-_TRIAL = "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), map_location='cpu')"
+_TRIAL = (
+    "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), "
+    "map_location='cpu')"
+)
 
 Result = TypeVar("Result")
 
@@ -40,14 +48,19 @@ class TookTooLong(Exception):
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {scaled(LONGEST)} seconds; if you trust it, {FACTOR}=10 in the environment "
+            f"no answer within {scaled(LONGEST)} seconds; if you trust it, {FACTOR}=10 "
+            "in the environment "
             "waits ten times as long"
         )
 
 
-def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
-    """Return what `call`, which may never end, returns, or raise what it raises; `stop` asks it to end when the time is
-    up. Raises TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on."""
+def within(
+    call: Callable[[], Result], stop: Callable[[], None] | None = None
+) -> Result:
+    """Return what `call`, which may never end, returns, or raise what it raises; `stop`
+    asks it to end when the time is up. Raises TookTooLong: it has not ended in
+    `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
+    """
     outcome: Future[Result] = Future()
     gradients = torch.is_grad_enabled()  # a thread has its own
 
@@ -58,7 +71,8 @@ def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -
         except BaseException as error:
             outcome.set_exception(error)
 
-    thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
+    # a daemon's: the process may end before it
+    thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(scaled(LONGEST))
     if thread.is_alive():
@@ -70,8 +84,10 @@ def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -
 
 
 def try_torchscript(archive: io.BytesIO) -> str:
-    """Load TorchScript in a process of its own, and return what is wrong, or nothing: torch keeps Python waiting
-    meanwhile. An error that torch raises is not told: loading it here raises it again."""
+    """Load TorchScript in a process of its own, and return what is wrong, or nothing:
+    torch keeps Python waiting meanwhile. An error that torch raises is not told:
+    loading it here raises it again.
+    """
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
         done = subprocess.run(
@@ -83,13 +99,19 @@ def try_torchscript(archive: io.BytesIO) -> str:
         )
     except subprocess.TimeoutExpired:
         return str(TookTooLong())
-    return f"torch crashed while loading it (signal {-done.returncode})" if done.returncode < 0 else ""
+    return (
+        f"torch crashed while loading it (signal {-done.returncode})"
+        if done.returncode < 0
+        else ""
+    )
 
 
 @dataclass(frozen=True)
 class Switches:
-    """The state of torch's switches: dtype and device of new tensors, whether this thread records gradients, whether
-    operations that are not deterministic warn (1) or raise (2), and whether NaN in a derivative does."""
+    """The state of torch's switches: dtype and device of new tensors, whether this
+    thread records gradients, whether operations that are not deterministic warn (1) or
+    raise (2), and whether NaN in a derivative does.
+    """
 
     dtype: torch.dtype = torch.float32
     device: torch.device = _CPU
@@ -101,7 +123,12 @@ class Switches:
     def now(cls) -> Switches:
         """Return them as they are."""
         new = torch.get_default_dtype(), torch.get_default_device()
-        return cls(*new, torch.is_grad_enabled(), torch.get_deterministic_debug_mode(), torch.is_anomaly_enabled())
+        return cls(
+            *new,
+            torch.is_grad_enabled(),
+            torch.get_deterministic_debug_mode(),
+            torch.is_anomaly_enabled(),
+        )
 
     def turn(self) -> None:
         """Turn all of them."""
@@ -124,8 +151,14 @@ _outside: list[Switches] = []  # as `plainly` found them, the outermost first
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Turn torch's switches as it comes, and back at the end: also out of `torch.inference_mode`."""
-    with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+    """Turn torch's switches as it comes, and back at the end: also out of
+    `torch.inference_mode`.
+    """
+    with (
+        torch.inference_mode(False)
+        if torch.is_inference_mode_enabled()
+        else nullcontext()
+    ):
         before = Switches.now()
         _outside.append(before)
         if before != PLAIN:
@@ -139,7 +172,9 @@ def plainly() -> Iterator[None]:
 
 
 def turned_by_code() -> Switches:
-    """Return the switches as the code of a network has turned them just now, or had before; they are `PLAIN` then."""
+    """Return the switches as the code of a network has turned them just now, or had
+    before; they are `PLAIN` then.
+    """
     turned = Switches.now()
     if turned == PLAIN:
         return _outside[0] if _outside else PLAIN
@@ -148,7 +183,9 @@ def turned_by_code() -> Switches:
 
 
 def called_under(module: nn.Module, switches: Switches) -> None:
-    """Have a module called with switches of its own for new tensors, and those of the caller afterwards."""
+    """Have a module called with switches of its own for new tensors, and those of the
+    caller afterwards.
+    """
     if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
         return
     before: list[Switches] = []
@@ -167,15 +204,19 @@ def called_under(module: nn.Module, switches: Switches) -> None:
 def first_line(error: BaseException) -> str:
     """Return a foreign error as one short line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    lines = ["".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line) for line in lines[:1]]
+    lines = [
+        "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
+        for line in lines[:1]
+    ]
     text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
     return text if len(text) <= 300 else text[:297] + "..."
 
 
 @contextmanager
 def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None]:
-    """Turn what code of others raises inside the block, which may be anything, into an error: what failed, and the
-    foreign error. One of ours is left as it is."""
+    """Turn what code of others raises inside the block, which may be anything, into an
+    error: what failed, and the foreign error. One of ours is left as it is.
+    """
     try:
         yield
     except AdvsearchError:

@@ -1,10 +1,13 @@
-"""Files that a file names: only those in its own folder and below are read, after links are followed.
+"""Files that a file names: only those in its own folder and below are read, after links
+are followed.
 
-The threat: a mesh, a scene, a layer or a summary may come from anywhere, so it may name anything on this machine, which
-would be read into a picture, a page or an export. Of all that a mesh names no more is read than one file may have.
+The threat: a mesh, a scene, a layer or a summary may come from anywhere, so it may name
+anything on this machine, which would be read into a picture, a page or an export. Of
+all that a mesh names no more is read than one file may have.
 
-Used by the importers of meshes and scenes (`scene/importing/`, `scene/mitsuba_backend/xml_files.py`), for the mesh and
-the maps of a place (`scene/places/place_file.py`) and for pictures that a result names (`viewer/pages.py`).
+Used by the importers of meshes and scenes (`scene/importing/`,
+`scene/mitsuba_backend/xml_files.py`), for the mesh and the maps of a place
+(`scene/places/place_file.py`) and for pictures that a result names (`viewer/pages.py`).
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 
 def plain_name(name: str) -> str:
-    """Return a file name as it is written on this system: no quotes, no percent signs, forward slashes."""
+    """Return a file name as it is written on this system: no quotes, no percent signs,
+    forward slashes.
+    """
     return unquote(name.strip().strip('"')).replace("\\", "/")
 
 
@@ -34,8 +39,9 @@ def is_inside(path: Path | str, folder: Path | str) -> bool:
 
 
 class References:
-    """Finds the files that a mesh file names. `refused` are those that it could not get, as `plain_name` gives them,
-    and why: `MISSING`, `OUTSIDE` or another clause."""
+    """Finds the files that a mesh file names. `refused` are those that it could not
+    get, as `plain_name` gives them, and why: `MISSING`, `OUTSIDE` or another clause.
+    """
 
     def __init__(self, path: Path) -> None:
         self.refused: dict[str, str] = {}
@@ -44,8 +50,10 @@ class References:
         self._size = 0
 
     def get(self, name: str) -> bytes:
-        """Return the content of a named file; after the name as it stands, its usual distortions are tried. Raises
-        FileNotFoundError: it is not there, or must not be read; `refused` says which."""
+        """Return the content of a named file; after the name as it stands, its usual
+        distortions are tried. Raises FileNotFoundError: it is not there, or must not be
+        read; `refused` says which.
+        """
         content = self.tried(name)
         if isinstance(content, bytes):
             return content
@@ -53,17 +61,27 @@ class References:
         raise FileNotFoundError(name)
 
     def tried(self, name: str) -> bytes | str:
-        """Return the content of a named file, or why it is not read, which is not remembered."""
+        """Return the content of a named file, or why it is not read, which is not
+        remembered.
+        """
         reason = MISSING
         spellings = (name.strip(), plain_name(name))
-        forms = [form for text in spellings for form in (text, text.lstrip("/"), os.path.basename(text))]
+        forms = [
+            form
+            for text in spellings
+            for form in (text, text.lstrip("/"), os.path.basename(text))
+        ]
         for form in filter(None, dict.fromkeys(forms)):
             try:
                 return self._content(form)
             except ValueError:  # a zero byte in the name
                 continue
             except OSError as error:
-                reason = reason if error.errno in _NO_SUCH_NAME else f"cannot be read ({error.strerror})"
+                reason = (
+                    reason
+                    if error.errno in _NO_SUCH_NAME
+                    else f"cannot be read ({error.strerror})"
+                )
             except FileFormatError as error:
                 reason = str(error)
         return reason
@@ -74,10 +92,19 @@ class References:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
         if path not in self._contents:
             try:
-                data = stored_files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
-                check_most(path, self._size + len(data), LARGEST_FILE, "files of at most {} bytes in all")
+                data = stored_files.read_bytes(
+                    Path(path), "an ordinary file", LARGEST_FILE
+                )
+                check_most(
+                    path,
+                    self._size + len(data),
+                    LARGEST_FILE,
+                    "files of at most {} bytes in all",
+                )
             except FileFormatError as error:
-                raise FileFormatError(f"is not read ({str(error).removeprefix(f'{path}: ')})") from error
+                raise FileFormatError(
+                    f"is not read ({str(error).removeprefix(f'{path}: ')})"
+                ) from error
             self._contents[path] = data
             self._size += len(data)
         return self._contents[path]

@@ -1,13 +1,15 @@
-"""What goes to another machine and comes from one: no secret in an address, none sent unencrypted or sent on.
+"""What goes to another machine and comes from one: no secret in an address, none sent
+unencrypted or sent on.
 
-The threat: an address is stored with the run, shown and shared, and whoever listens on the way, or is named by a
-redirect, would have the key to a model. So the key comes from the environment alone, goes over HTTPS or stays on this
-machine, and follows no redirect; and what is served beyond this machine is served over HTTPS.
+The threat: an address is stored with the run, shown and shared, and whoever listens on
+the way, or is named by a redirect, would have the key to a model. So the key comes from
+the environment alone, goes over HTTPS or stays on this machine, and follows no
+redirect; and what is served beyond this machine is served over HTTPS.
 
 A library connects to nobody for what only a file names.
 
-Used by models behind addresses (`models/address.py`), libraries (`models/zoo/library.py`) and the server of the
-dashboard (`viewer/server.py`).
+Used by models behind addresses (`models/address.py`), libraries
+(`models/zoo/library.py`) and the server of the dashboard (`viewer/server.py`).
 """
 
 from __future__ import annotations
@@ -31,25 +33,44 @@ from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 from advsearch.errors import InputError
 
-KEY = "ADVSEARCH_MODEL_KEY"  # the environment variable with the key that is sent as ``Authorization: Bearer``
+# the environment variable with the key that is sent as ``Authorization: Bearer``
+KEY = "ADVSEARCH_MODEL_KEY"
 
 
 def check_address(spec: str) -> SplitResult:
-    """Return the parts of an address. Raises InputError: it has no host, a secret in it, which would be stored with the
-    run, or the key would go over it unencrypted."""
+    """Return the parts of an address. Raises InputError: it has no host, a secret in
+    it, which would be stored with the run, or the key would go over it unencrypted.
+    """
     try:
         address = urlsplit(spec)
-        host, _ = address.hostname, address.port
+        host = address.hostname
+        _ = address.port
     except ValueError as error:
-        raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})") from None
+        raise InputError(
+            f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
+        ) from None
     if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
-    secret = [name for name, _ in parse_qsl(address.query) if re.search("key|token|secret|passw|sig|auth", name, re.I)]
+    secret = [
+        name
+        for name, _ in parse_qsl(address.query)
+        if re.search("key|token|secret|passw|sig|auth", name, re.I)
+    ]
     if "@" in address.netloc or secret:
-        where = f"`{secret[0]}` in the address" if secret else "the user and password in the address"
-        raise InputError(f"model: {where} would be stored with the run; put the key into {KEY} and leave it out there")
+        where = (
+            f"`{secret[0]}` in the address"
+            if secret
+            else "the user and password in the address"
+        )
+        raise InputError(
+            f"model: {where} would be stored with the run; put the key "
+            f"into {KEY} and leave it out there"
+        )
     if read_key() and address.scheme == "http" and not is_local(host):
-        raise InputError(f"model {spec}: the key in {KEY} would go there unencrypted; use https, or unset {KEY}")
+        raise InputError(
+            f"model {spec}: the key in {KEY} would go there unencrypted; "
+            f"use https, or unset {KEY}"
+        )
     return address
 
 
@@ -62,10 +83,15 @@ def is_local(host: str) -> bool:
 
 
 def read_key() -> str:
-    """Return the key from the environment, or nothing. Raises InputError: it is no printable ASCII."""
+    """Return the key from the environment, or nothing. Raises InputError: it is no
+    printable ASCII.
+    """
     key = os.environ.get(KEY, "").strip()
-    if not (key.isascii() and key.isprintable()):  # http.client would show it in its error
-        raise InputError(f"{KEY}: expected a key of printable ASCII characters, got others")
+    # http.client would show it in its error
+    if not (key.isascii() and key.isprintable()):
+        raise InputError(
+            f"{KEY}: expected a key of printable ASCII characters, got others"
+        )
     return key
 
 
@@ -80,31 +106,73 @@ DAYS = 7  # for which a certificate is good
 
 
 def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
-    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
-    Raises InputError where there is no `openssl`, or it makes none."""
-    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
+    """Return what speaks HTTPS under some names and addresses, and the SHA-256
+    fingerprint of its new certificate. Raises InputError where there is no `openssl`,
+    or it makes none.
+    """
+    names = ",".join(
+        f"IP:{host}" if is_address(host) else f"DNS:{host}"
+        for host in dict.fromkeys(hosts)
+    )
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
-        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
+        key = Path(folder) / "key.pem"
+        certificate = Path(folder) / "certificate.pem"
         key.touch(mode=0o600)
-        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
-        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
-        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
+        command = [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:P-256",
+            "-nodes",
+        ]
+        command += [
+            "-keyout",
+            str(key),
+            "-out",
+            str(certificate),
+            "-days",
+            str(DAYS),
+            "-subj",
+            "/CN=advsearch",
+        ]
+        command += [
+            "-addext",
+            f"subjectAltName={names}",
+            "-addext",
+            "extendedKeyUsage=serverAuth",
+        ]
         try:
-            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
+            subprocess.run(
+                command,
+                check=True,
+                capture_output=True,
+                timeout=30.0,
+                stdin=subprocess.DEVNULL,
+            )
         except FileNotFoundError:
             raise InputError(
-                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
+                "https: needs the program openssl, which makes the certificate; "
+                "apt-get install openssl, or leave "
                 "`host` and `https` out"
             ) from None
         except (OSError, subprocess.SubprocessError) as error:
-            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
-            raise InputError(f"https: openssl made no certificate: {text or error}") from None
+            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[
+                -300:
+            ]
+            raise InputError(
+                f"https: openssl made no certificate: {text or error}"
+            ) from None
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.load_cert_chain(certificate, key)
         data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
     digest = hashlib.sha256(data).hexdigest().upper()
-    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
+    return context, ":".join(
+        digest[place : place + 2] for place in range(0, len(digest), 2)
+    )
 
 
 def is_address(host: str) -> bool:
@@ -118,11 +186,14 @@ def is_address(host: str) -> bool:
 
 @contextlib.contextmanager
 def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Let this thread connect to nobody inside the block, unless that is allowed; each try is noted in `tries`."""
+    """Let this thread connect to nobody inside the block, unless that is allowed; each
+    try is noted in `tries`.
+    """
     if allowed:
         yield
         return
-    names, thread = ("connect", "connect_ex"), threading.get_ident()
+    names = ("connect", "connect_ex")
+    thread = threading.get_ident()
     before = {name: getattr(socket.socket, name) for name in names}
 
     def refusing(name: str) -> Callable[[socket.socket, Any], Any]:

@@ -1,12 +1,14 @@
 """Pages that a server of ours sends: to whom, and what they may do in a browser.
 
-The threat: another site in the same browser asks this server, under a name that leads here (DNS rebinding) or from its
-own pages; somebody else on the network asks it; or a page in the folder of a run, which may be somebody else's, runs
-scripts that read other runs or send them away. So a request is for this server's own address, from no other origin, and
-beyond this machine it has the token; and a page runs no script but those of this package.
+The threat: another site in the same browser asks this server, under a name that leads
+here (DNS rebinding) or from its own pages; somebody else on the network asks it; or a
+page in the folder of a run, which may be somebody else's, runs scripts that read other
+runs or send them away. So a request is for this server's own address, from no other
+origin, and beyond this machine it has the token; and a page runs no script but those of
+this package.
 
-Used by the dashboard's server (`viewer/server.py`), by the frame of every page (`viewer/document.py`) and for
-photographs (`questions/photographs/result.py`).
+Used by the dashboard's server (`viewer/server.py`), by the frame of every page
+(`viewer/document.py`) and for photographs (`questions/photographs/result.py`).
 """
 
 from __future__ import annotations
@@ -45,7 +47,13 @@ class Refused(Exception):
 
 
 def check_request(
-    command: str, path: str, headers: Message, scheme: str, named: str, port: int, token: str | None
+    command: str,
+    path: str,
+    headers: Message,
+    scheme: str,
+    named: str,
+    port: int,
+    token: str | None,
 ) -> None:
     """Check that a request may be answered. Raises Refused.
 
@@ -56,16 +64,23 @@ def check_request(
         scheme: that the server speaks, "http" or "https".
         named: what the server was told to listen at.
         port: that it listens at.
-        token: what the address or a cookie has to have; None of a server of this machine alone.
+        token: what the address or a cookie has to have; None of a server of this
+            machine alone.
     """
     if len(path) > LONGEST:
         raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
     host = headers.get("Host", "")
     if not _is_own(host, named, port, token):
-        raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so; open the address that it printed")
+        raise Refused(
+            HTTPStatus.FORBIDDEN,
+            "this server is not called so; open the address that it printed",
+        )
     origin = headers.get("Origin")
     if origin is not None and origin != f"{scheme}://{host}":
-        raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
+        raise Refused(
+            HTTPStatus.FORBIDDEN,
+            "a page of another origin asks; open the address that was printed",
+        )
     if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
         if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
@@ -76,22 +91,30 @@ def check_request(
             if name == f"{COOKIE}-{port}":
                 given.append(value)
         if not any(hmac.compare_digest(token, one) for one in given if one.isascii()):
-            raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
+            raise Refused(
+                HTTPStatus.UNAUTHORIZED,
+                "the token is missing; open the address that was printed",
+            )
 
 
 def _is_own(host: str, named: str, port: int, token: str | None) -> bool:
-    """Whether a request's Host is an address of this server: a name would need a name server to lead here."""
+    """Whether a request's Host is an address of this server: a name would need a name
+    server to lead here.
+    """
     name, _, own_port = host.rpartition(":")
     if not own_port.isdecimal() or int(own_port) != port:
         return False
     if token is None:
         return name in ("localhost", LOOPBACK, "[::1]")
-    return name in ("localhost", named) or is_address(name.removeprefix("[").removesuffix("]"))
+    return name in ("localhost", named) or is_address(
+        name.removeprefix("[").removesuffix("]")
+    )
 
 
 def token_cookie(port: int, token: str) -> str:
-    """Return what a browser keeps so that links need no token. It is lax: a link on the page of a run, which has an
-    origin of its own, leads back to the list."""
+    """Return what a browser keeps so that links need no token. It is lax: a link on the
+    page of a run, which has an origin of its own, leads back to the list.
+    """
     return f"{COOKIE}-{port}={token}; HttpOnly; Secure; SameSite=Lax; Path=/"
 
 
@@ -102,24 +125,35 @@ def script_digest(code: bytes) -> str:
 
 def page_policy(digests: Iterable[str], *, connects: bool) -> str:
     """Return what a page may load and run; `digests` are those of its scripts."""
-    images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
+    images, connect = (
+        ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
+    )
     runs = "".join(f" 'sha256-{one}'" for one in sorted(digests))
     scripts = f"; script-src{runs}" if runs else ""
-    return f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+    return (
+        f"default-src 'none'; img-src {images}; style-src "
+        f"'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+    )
 
 
 def served_policy(digests: Iterable[str], *, own: bool) -> str:
-    """Return the `Content-Security-Policy` that a server sends; `digests` are those of all our scripts. A page that it
-    has made itself may ask its server for more. All else lies in the folder of a run, which may be somebody else's: it
-    gets an origin of its own, so that it can read and send nothing, and runs no script but ours."""
-    sandbox = "form-action 'none'; sandbox allow-scripts allow-popups allow-popups-to-escape-sandbox"
+    """Return the `Content-Security-Policy` that a server sends; `digests` are those of
+    all our scripts. A page that it has made itself may ask its server for more. All
+    else lies in the folder of a run, which may be somebody else's: it gets an origin of
+    its own, so that it can read and send nothing, and runs no script but ours.
+    """
+    sandbox = (
+        "form-action 'none'; sandbox allow-scripts allow-popups "
+        "allow-popups-to-escape-sandbox"
+    )
     closed = "form-action 'self'" if own else sandbox
     return f"{page_policy(digests, connects=own)}; frame-ancestors 'none'; {closed}"
 
 
 def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
-    """Return whether a page has a script whose digest is none of these. Scripts that are data do not count; one pass,
-    as the page may be somebody else's."""
+    """Return whether a page has a script whose digest is none of these. Scripts that
+    are data do not count; one pass, as the page may be somebody else's.
+    """
     end = 0
     for opening in re.finditer(rb"<script", page, re.IGNORECASE):
         if opening.start() < end:

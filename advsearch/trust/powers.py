@@ -1,11 +1,13 @@
-"""Settings with power over more than their run: they connect, start many processes, or write and delete elsewhere.
+"""Settings with power over more than their run: they connect, start many processes, or
+write and delete elsewhere.
 
-The threat: run, suite and recipe may be somebody else's, and a setting in one would do such a thing when it is opened.
-So each setting is declared with what it does there (`setting(..., power=...)`), and that is done because a person has
-typed it, or given it in Python, never because a file says so.
+The threat: run, suite and recipe may be somebody else's, and a setting in one would do
+such a thing when it is opened. So each setting is declared with what it does there
+(`setting(..., power=...)`), and that is done because a person has typed it, or given it
+in Python, never because a file says so.
 
-Used by `settings/configuration.py`, which leaves such settings out of what a file says, and by what declares them
-(`config.py`, `questions/`).
+Used by `settings/configuration.py`, which leaves such settings out of what a file says,
+and by what declares them (`config.py`, `questions/`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from typing import Any, NamedTuple
 from advsearch.threads import cores
 
 Power = Callable[[Any], str]
-"""What a value of a setting does beyond the run, in words that follow its name; empty where it does nothing there."""
+"""What a value of a setting does beyond the run, in words that follow its name; empty
+where it does nothing there.
+"""
 
 
 def none(value: Any) -> str:
@@ -27,14 +31,24 @@ def none(value: Any) -> str:
 
 
 def many_processes(count: int | None) -> str:
-    """Of a number of processes; as many as there are processors are no more than a run takes anyway."""
+    """Of a number of processes; as many as there are processors are no more than a run
+    takes anyway.
+    """
     here = cores()
-    return "" if count is None or count <= here else f"starts {count} processes on {here} processors"
+    return (
+        ""
+        if count is None or count <= here
+        else (f"starts {count} processes on {here} processors")
+    )
 
 
 def connection(place: str | None) -> str:
     """Of where workers are."""
-    return "" if place in (None, "local") else f"connects to {place}, and what answers there can run code here"
+    return (
+        ""
+        if place in (None, "local")
+        else (f"connects to {place}, and what answers there can run code here")
+    )
 
 
 def tracker(name: str | None) -> str:
@@ -64,7 +78,9 @@ def beside_suite(wanted: str | bool | None) -> str:
 
 
 class LeftOut(NamedTuple):
-    """A setting of a file with power over more than its run: name, field, value, what that does, and the default."""
+    """A setting of a file with power over more than its run: name, field, value, what
+    that does, and the default.
+    """
 
     name: str
     field: str
@@ -74,7 +90,15 @@ class LeftOut(NamedTuple):
 
     @property
     def ask(self) -> str:
-        """How a person asks for it, and how to do without, as both are typed behind a file or a run."""
-        plain, without = (str(v).lower() if isinstance(v, bool) else v for v in (self.value, self.default))
+        """How a person asks for it, and how to do without, as both are typed behind a
+        file or a run.
+        """
+        plain, without = (
+            str(v).lower() if isinstance(v, bool) else v
+            for v in (self.value, self.default)
+        )
         asked = shlex.quote(f"{self.name}={plain}")
-        return f"{asked} if you want that, or {self.name}={'null' if without is None else without} to do without"
+        return (
+            f"{asked} if you want that, or "
+            f"{self.name}={'null' if without is None else without} to do without"
+        )

@@ -1,6 +1,8 @@
-"""Other programs that read files of others: each in a folder of its own, for a limited time, with nothing to ask.
+"""Other programs that read files of others: each in a folder of its own, for a limited
+time, with nothing to ask.
 
-The threat: a file makes a program hang, wait for somebody to type, or find settings and modules of the user's.
+The threat: a file makes a program hang, wait for somebody to type, or find settings and
+modules of the user's.
 
 Used for OpenUSD (`scene/importing/usd`) and Blender (`scene/importing/blender.py`).
 """
@@ -20,46 +22,87 @@ from advsearch.trust.stored_files import FACTOR, scaled
 
 
 def run_converter(
-    path: Path, program: str, command: Sequence[str], *, folder: str | Path, seconds: int, env: Mapping[str, str] | None
+    path: Path,
+    program: str,
+    command: Sequence[str],
+    *,
+    folder: str | Path,
+    seconds: int,
+    env: Mapping[str, str] | None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program that makes glTF of the file at `path`, in a folder, and return what it said. Raises OSError: it
-    can't be started; FileFormatError: it takes longer than so many seconds, before `scaled`."""
-    longest, unread = scaled(seconds), subprocess.DEVNULL
+    """Run a program that makes glTF of the file at `path`, in a folder, and return what
+    it said. Raises OSError: it can't be started; FileFormatError: it takes longer than
+    so many seconds, before `scaled`.
+    """
+    longest = scaled(seconds)
+    unread = subprocess.DEVNULL
     try:
         return subprocess.run(
-            command, cwd=folder, env=env, stdin=unread, capture_output=True, errors="replace", timeout=longest
+            command,
+            cwd=folder,
+            env=env,
+            stdin=unread,
+            capture_output=True,
+            errors="replace",
+            timeout=longest,
         )
     except subprocess.TimeoutExpired:
         raise FileFormatError(
-            f"{path}: {program} had not read it after {longest} seconds; export glTF (.glb) from it yourself, or give "
-            f"it longer: {FACTOR}=10 in the environment makes all limits ten times as large"
+            f"{path}: {program} had not read it after {longest} seconds; export glTF "
+            "(.glb) from it yourself, or give "
+            f"it longer: {FACTOR}=10 in the environment makes all limits ten times as "
+            "large"
         ) from None
 
 
 def surroundings(folder: str) -> dict[str, str]:
-    """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    """Return the environment of a process that has a folder for its home, and nothing
+    of ours but the path.
+    """
+    kept = {
+        name: os.environ[name]
+        for name in ("PATH", "LD_LIBRARY_PATH")
+        if name in os.environ
+    }
     return {**kept, "HOME": folder, "TMPDIR": folder}
 
 
 BLENDER = "ADVSEARCH_BLENDER"
-"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
+"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of
+those that are looked for.
+"""
 
 
 def find_blender(who: str, otherwise: str) -> list[str]:
-    """Return the program that is given a script behind it, with what makes it run that and nothing else. Raises
-    FileFormatError, for which it is told who needs it, and what else can be done: there is none."""
+    """Return the program that is given a script behind it, with what makes it run that
+    and nothing else. Raises FileFormatError, for which it is told who needs it, and
+    what else can be done: there is none.
+    """
     program = os.environ.get(BLENDER) or shutil.which("blender")
     if program is None and importlib.util.find_spec("bpy") is not None:
         program = sys.executable
     runs = shutil.which(program or "")
     if runs is None:
-        missing = "none is installed" if program is None else f"{BLENDER} names {program}, which can't be run"
+        missing = (
+            "none is installed"
+            if program is None
+            else f"{BLENDER} names {program}, which can't be run"
+        )
         raise FileFormatError(
-            f"{who}, and {missing}; install Blender so that `blender` is found, or type "
-            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {BLENDER}=bpy/bin/python; or {otherwise}"
+            f"{who}, and {missing}; install Blender so that `blender` is found, or "
+            "type "
+            "`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
+            f"{BLENDER}=bpy/bin/python; or {otherwise}"
         )
     program = os.path.abspath(runs)
     if Path(program).name.startswith("python"):
         return [program, "-I"]
-    return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
+    return [
+        program,
+        "--background",
+        "--factory-startup",
+        "--disable-autoexec",
+        "--python-exit-code",
+        "1",
+        "--python",
+    ]

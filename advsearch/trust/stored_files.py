@@ -1,10 +1,13 @@
-"""What is read: only ordinary files, never more of them than a limit, JSON no deeper than one.
+"""What is read: only ordinary files, never more of them than a limit, JSON no deeper
+than one.
 
-The threat: a file, or what it names, is a device or a pipe, which may never end or wait for ever; or it is made so
-that it fills the memory. A device, a pipe or a socket is refused before a byte of it is read, and each reader says its
-limit, which a person raises by the environment (`FACTOR`).
+The threat: a file, or what it names, is a device or a pipe, which may never end or wait
+for ever; or it is made so that it fills the memory. A device, a pipe or a socket is
+refused before a byte of it is read, and each reader says its limit, which a person
+raises by the environment (`FACTOR`).
 
-Used for every file that a user names, and for every file that such a file names, by every reader of the package.
+Used for every file that a user names, and for every file that such a file names, by
+every reader of the package.
 """
 
 from __future__ import annotations
@@ -21,10 +24,13 @@ from typing import Any, BinaryIO
 
 from advsearch.errors import FileFormatError, InputError
 
-FACTOR = "ADVSEARCH_LIMITS"  # environment variable with a number that all limits on the size of input are multiplied by
+# environment variable with a number that all limits on the size of input are multiplied
+# by
+FACTOR = "ADVSEARCH_LIMITS"
 DEPTH = 100  # deepest nesting of JSON, in lists and objects
 DEEPEST = 16  # lists and mappings inside one another that a setting may have
-DIGITS = 300  # most digits of a whole number; more than these have no floating-point form
+# most digits of a whole number; more than these have no floating-point form
+DIGITS = 300
 _KINDS = (
     (stat.S_ISDIR, "a directory; name a file inside it"),
     (stat.S_ISFIFO, "a pipe; write what it yields to a file and name that"),
@@ -32,13 +38,17 @@ _KINDS = (
     (stat.S_ISCHR, "a device; name an ordinary file"),
     (stat.S_ISBLK, "a device; name an ordinary file"),
 )
-_ROOT: ContextVar[str | None] = ContextVar("the file that others are read for", default=None)
+_ROOT: ContextVar[str | None] = ContextVar(
+    "the file that others are read for", default=None
+)
 _OPENED: dict[str, dict[str, None]] = {}
 
 
 @contextmanager
 def reading(path: Path | str) -> Iterator[None]:
-    """Files that are opened inside are parts of this one (see `opened_for`), unless it is part of another itself."""
+    """Files that are opened inside are parts of this one (see `opened_for`), unless it
+    is part of another itself.
+    """
     token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
     try:
         yield
@@ -53,38 +63,53 @@ def note_opened(path: Path | str) -> None:
 
 
 def opened_for(path: Path | str) -> list[str]:
-    """Return the files that this process has read for a file: itself, and what it names, in order, by full path."""
+    """Return the files that this process has read for a file: itself, and what it
+    names, in order, by full path.
+    """
     return list(_OPENED.get(os.path.abspath(path), {}))
 
 
 def scaled(limit: int) -> int:
-    """Return a limit on the size of input (bytes, pixels, faces, ...) times `ADVSEARCH_LIMITS`, which is 1 by default.
-    Raises InputError where `ADVSEARCH_LIMITS` is not a number greater than 0."""
+    """Return a limit on the size of input (bytes, pixels, faces, ...) times
+    `ADVSEARCH_LIMITS`, which is 1 by default. Raises InputError where
+    `ADVSEARCH_LIMITS` is not a number greater than 0.
+    """
     text = os.environ.get(FACTOR, "") or "1"
     try:
         factor = float(text)
     except ValueError:
         factor = math.nan
     if not 0 < factor < math.inf:
-        raise InputError(f"{FACTOR}: expected a number greater than 0, by which limits are multiplied, got {text!r}")
+        raise InputError(
+            f"{FACTOR}: expected a number greater than 0, by which limits "
+            f"are multiplied, got {text!r}"
+        )
     return int(limit * factor)
 
 
 def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input over a limit, which names what raises it: "a mesh of at most 100 faces", "120"."""
+    """Return the error for input over a limit, which names what raises it: "a mesh of
+    at most 100 faces", "120".
+    """
     return FileFormatError(
-        f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the environment makes all limits "
+        f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the "
+        "environment makes all limits "
         "ten times as large"
     )
 
 
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
-    """Return an ordinary file, such as ``"a label file"``, opened for reading; close it. Links are followed. Raises
-    FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or more bytes than the limit,
-    which is `scaled`. Raises OSError as `open`: it is not there, or there is no permission."""
+    """Return an ordinary file, such as ``"a label file"``, opened for reading; close
+    it. Links are followed. Raises FileFormatError: a directory, a pipe, a socket or a
+    device, none of which is read; or more bytes than the limit, which is `scaled`.
+    Raises OSError as `open`: it is not there, or there is no permission.
+    """
     if "\0" in str(path):
-        raise FileFormatError(f"{path}: expected the name of a file, got one with a zero byte in it")
-    _check(path, os.stat(path), expected, limit)  # before it is opened: to open a device or a pipe may change it
+        raise FileFormatError(
+            f"{path}: expected the name of a file, got one with a zero byte in it"
+        )
+    # before it is opened: to open a device or a pipe may change it
+    _check(path, os.stat(path), expected, limit)
     # Not blocking, for whatever has taken its place since.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
@@ -98,13 +123,16 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
 
 
 def read_bytes(path: Path, expected: str, limit: int) -> bytes:
-    """Return the content of an ordinary file; arguments and errors as for `open_regular`."""
+    """Return the content of an ordinary file; arguments and errors as for
+    `open_regular`.
+    """
     most = scaled(limit)
     with open_regular(path, expected, limit) as file:
         data = file.read(most + 1)  # a file may grow, and those of /proc give no size
     if data is None:  # the kernel's log is such a file
         raise FileFormatError(
-            f"{path}: expected {expected}, got a file that waits for something; name an ordinary file"
+            f"{path}: expected {expected}, got a file that waits for something; name "
+            "an ordinary file"
         )
     if len(data) > most:
         raise too_large(path, f"{expected} of at most {most:,} bytes", "more")
@@ -112,28 +140,40 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
 
 
 def read_text(path: Path, expected: str, limit: int) -> str:
-    """Return the text of an ordinary file in UTF-8, without a byte order mark. Raises FileFormatError: as for
-    `open_regular`, or the bytes are not UTF-8; OSError: as for `open_regular`."""
+    """Return the text of an ordinary file in UTF-8, without a byte order mark. Raises
+    FileFormatError: as for `open_regular`, or the bytes are not UTF-8; OSError: as for
+    `open_regular`.
+    """
     try:
         return read_bytes(path, expected, limit).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise FileFormatError(f"{path}: expected {expected} in UTF-8, got bytes that are not text") from None
+        raise FileFormatError(
+            f"{path}: expected {expected} in UTF-8, got bytes that are not text"
+        ) from None
 
 
 def present_text(path: Path | str, expected: str, limit: int) -> str:
-    """Return what `read_text` returns, and raise FileFormatError where it raises OSError, too."""
+    """Return what `read_text` returns, and raise FileFormatError where it raises
+    OSError, too.
+    """
     try:
         return read_text(Path(path), expected, limit)
     except OSError as error:
-        raise FileFormatError(f"{path}: expected {expected}, got {error.strerror}; check the path") from None
+        raise FileFormatError(
+            f"{path}: expected {expected}, got {error.strerror}; check the path"
+        ) from None
 
 
 def parsed(path: Path | str, text: str, kind: str, parse: Callable[[str], Any]) -> Any:
-    """Return what the text of a file says. Raises FileFormatError where it is not of its kind, such as "JSON"."""
+    """Return what the text of a file says. Raises FileFormatError where it is not of
+    its kind, such as "JSON".
+    """
     try:
         return parse(text)
     except (ValueError, SyntaxError) as error:  # that of XML is a SyntaxError
-        raise FileFormatError(f"{path}: expected {kind}, got {error}; correct the file") from None
+        raise FileFormatError(
+            f"{path}: expected {kind}, got {error}; correct the file"
+        ) from None
 
 
 class JsonBoundsError(ValueError):
@@ -141,11 +181,15 @@ class JsonBoundsError(ValueError):
 
 
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
-    """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
-    number of thousands of digits; with `finite` also where one is NaN or infinite. The message is short."""
+    """Return the value of a JSON text. Raises ValueError where it is not JSON, is
+    nested deeper than `DEPTH`, or has a number of thousands of digits; with `finite`
+    also where one is NaN or infinite. The message is short.
+    """
     number = _finite if finite else None
     try:
-        value = json.loads(text, parse_int=_whole_number, parse_float=number, parse_constant=number)
+        value = json.loads(
+            text, parse_int=_whole_number, parse_float=number, parse_constant=number
+        )
     except RecursionError:
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
     if not is_shallow(value, DEPTH - 1):
@@ -155,7 +199,13 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
     """Return whether lists and mappings are nested at most so deep in `value`."""
-    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    inner = (
+        value.values()
+        if isinstance(value, Mapping)
+        else value
+        if isinstance(value, (list, tuple))
+        else ()
+    )
     return levels >= 0 and all(is_shallow(part, levels - 1) for part in inner)
 
 
@@ -173,17 +223,31 @@ def _finite(text: str) -> float:
 
 def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:
     if not stat.S_ISREG(status.st_mode):
-        got = next((words for is_kind, words in _KINDS if is_kind(status.st_mode)), "something else")
+        got = next(
+            (words for is_kind, words in _KINDS if is_kind(status.st_mode)),
+            "something else",
+        )
         raise FileFormatError(f"{path}: expected {expected}, got {got}")
     if status.st_size > scaled(limit):
-        raise too_large(path, f"{expected} of at most {scaled(limit):,} bytes", f"{status.st_size:,}")
+        raise too_large(
+            path,
+            f"{expected} of at most {scaled(limit):,} bytes",
+            f"{status.st_size:,}",
+        )
 
 
-LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `scaled`
+# bytes that a mesh, a texture or an environment may have, before `scaled`
+LARGEST_FILE = 1 << 29
 
 
-def check_most(path: Path | str, count: int, limit: int, expected: str, got: str | None = None) -> None:
-    """Raise FileFormatError where a file has more of something than a limit, before `scaled`; what was expected has {}
-    in the place of that, and what it got is the count by itself."""
+def check_most(
+    path: Path | str, count: int, limit: int, expected: str, got: str | None = None
+) -> None:
+    """Raise FileFormatError where a file has more of something than a limit, before
+    `scaled`; what was expected has {} in the place of that, and what it got is the
+    count by itself.
+    """
     if count > (most := scaled(limit)):
-        raise too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)
+        raise too_large(
+            path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got
+        )

@@ -1,10 +1,13 @@
-"""What is written: whole or not at all, by one process at a time, through no link, and where nothing else is lost.
+"""What is written: whole or not at all, by one process at a time, through no link, and
+where nothing else is lost.
 
-The threat: a process is killed or the disk is full while it writes; two processes write into one run; a run's folder is
-removed or renamed meanwhile; or somebody else made the folder, and has put a link there to a file that would be shown,
-copied or overwritten. A lock is dropped by the kernel when its process ends.
+The threat: a process is killed or the disk is full while it writes; two processes write
+into one run; a run's folder is removed or renamed meanwhile; or somebody else made the
+folder, and has put a link there to a file that would be shown, copied or overwritten. A
+lock is dropped by the kernel when its process ends.
 
-Used by all that writes: runs (`runs/directory.py`, `runs/files.py`, `runs/store.py`), exports, pages and studies.
+Used by all that writes: runs (`runs/directory.py`, `runs/files.py`, `runs/store.py`),
+exports, pages and studies.
 """
 
 from __future__ import annotations
@@ -20,15 +23,20 @@ from pathlib import Path
 
 from advsearch.errors import FileFormatError, InputError, StorageError
 
-PART = ".part-"  # prefix of a file that is still being written; what a killed process may leave behind
+# prefix of a file that is still being written; what a killed process may leave behind
+PART = ".part-"
 _ADVICE = {
     errno.ENOSPC: "the disk is full; free some space or choose another place with `run`",
-    errno.EDQUOT: "the disk quota is used up; free some space or choose another place with `run`",
+    errno.EDQUOT: "the disk quota is used up; free some space or choose another place "
+    "with `run`",
     errno.EROFS: "the file system is read-only; choose another place with `run`",
-    errno.EACCES: "there is no permission to write there; choose another place with `run`",
+    errno.EACCES: "there is no permission to write there; choose another place with "
+    "`run`",
     errno.EPERM: "writing there is not permitted; choose another place with `run`",
-    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another place with `run`",
-    errno.EEXIST: "a file of that name stands where a folder is needed; choose another place with `run`",
+    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another place "
+    "with `run`",
+    errno.EEXIST: "a file of that name stands where a folder is needed; choose another "
+    "place with `run`",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one with `run`",
 }
 _SQLITE_ADVICE = {
@@ -41,22 +49,31 @@ _SQLITE_ADVICE = {
 
 @contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the operating system and of SQLite inside the block into a `StorageError` that names `path`."""
+    """Turn errors of the operating system and of SQLite inside the block into a
+    `StorageError` that names `path`.
+    """
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
         check_there(path)
         if isinstance(error, OSError):
-            known, text = _ADVICE.get(error.errno or 0), str(error.strerror or error)
+            known = _ADVICE.get(error.errno or 0)
+            text = str(error.strerror or error)
         else:
-            known, text = next((how for words, how in _SQLITE_ADVICE.items() if words in str(error)), None), str(error)
+            known = next(
+                (how for words, how in _SQLITE_ADVICE.items() if words in str(error)),
+                None,
+            )
+            text = str(error)
         advice = known or f"{text}; choose another place with `run`"
         raise StorageError(f"cannot write {path}: {advice}") from error
 
 
 @contextmanager
 def placed_by(setting: str) -> Iterator[None]:
-    """Let the advice of a `StorageError` inside the block name the setting that says where the file goes."""
+    """Let the advice of a `StorageError` inside the block name the setting that says
+    where the file goes.
+    """
     try:
         yield
     except StorageError as error:
@@ -65,9 +82,11 @@ def placed_by(setting: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; when the block ends well its file takes the place of `path` in one step. When it
-    raises, or the process is killed, `path` is as it was before. Missing folders are made. A `durable` file survives a
-    power cut; that takes some 10 ms."""
+    """Yield a path to write to; when the block ends well its file takes the place of
+    `path` in one step. When it raises, or the process is killed, `path` is as it was
+    before. Missing folders are made. A `durable` file survives a power cut; that takes
+    some 10 ms.
+    """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
     check_there(path)  # or missing folders would be made
     try:
@@ -86,23 +105,34 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def check_free_folder(out: Path, setting: str) -> None:
-    """Check that a folder that is to be written whole is not there, or is empty. Raises InputError, also of a link: a
-    folder takes the place of no link, and what it leads to may be somebody else's."""
+    """Check that a folder that is to be written whole is not there, or is empty. Raises
+    InputError, also of a link: a folder takes the place of no link, and what it leads
+    to may be somebody else's.
+    """
     if os.path.islink(out):
-        raise InputError(f"{setting}: expected a new or an empty folder, got the link {out}; name the folder itself")
+        raise InputError(
+            f"{setting}: expected a new or an empty folder, got the link "
+            f"{out}; name the folder itself"
+        )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{setting}: {out} is there already and not empty; name another folder")
+        raise InputError(
+            f"{setting}: {out} is there already and not empty; name another folder"
+        )
 
 
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
-    """Write `data` to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
+    """Write `data` to `path`, whole or not at all, and return the path; `durable` as
+    for `replacing`.
+    """
     with replacing(path, durable=durable) as part:
         part.write_bytes(data)
     return path
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
-    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
+    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path;
+    `durable` as for `replacing`.
+    """
     return write_bytes(path, text.encode("utf-8"), durable=durable)
 
 
@@ -115,11 +145,15 @@ def _flush(path: Path) -> None:
 
 
 _open: dict[Path, tuple[Path, tuple[int, int]]] = {}
-"""Of the folders of runs that are written to here, the results and which file these are."""
+"""Of the folders of runs that are written to here, the results and which file these
+are.
+"""
 
 
 def note_open(results: Path) -> Callable[[], None]:
-    """Note that the results of a run are open for writing, for `check_there`; return what notes that they are not."""
+    """Note that the results of a run are open for writing, for `check_there`; return
+    what notes that they are not.
+    """
     with storage_errors(results):
         found = results.stat()
     entry = _open[results.parent] = results, (found.st_dev, found.st_ino)
@@ -132,8 +166,10 @@ def note_open(results: Path) -> Callable[[], None]:
 
 
 def check_there(path: Path) -> None:
-    """Check that a path does not lie in the folder of a run that is written to here and was removed or renamed since:
-    what is open is still written then, but to nowhere. Raises StorageError."""
+    """Check that a path does not lie in the folder of a run that is written to here and
+    was removed or renamed since: what is open is still written then, but to nowhere.
+    Raises StorageError.
+    """
     for folder in (path, *path.parents):
         if folder not in _open:
             continue
@@ -144,7 +180,8 @@ def check_there(path: Path) -> None:
             found = None
         if found is None or (found.st_dev, found.st_ino) != known:
             raise StorageError(
-                f"{folder}: the folder of this run was removed or renamed while the run went on; start it again, or "
+                f"{folder}: the folder of this run was removed or renamed while the "
+                "run went on; start it again, or "
                 "go on with what was renamed by advsearch resume"
             )
 
@@ -153,16 +190,24 @@ LOCK = ".lock"
 
 
 class RunLock:
-    """The lock on a run directory, held until `release` or the end of the process; an InputError names who else works
-    on it."""
+    """The lock on a run directory, held until `release` or the end of the process; an
+    InputError names who else works on it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / LOCK
         with storage_errors(self._path):
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+            self._descriptor = os.open(
+                self._path,
+                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK,
+                0o644,
+            )
         if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
             self.release()
-            raise FileFormatError(f"{self._path}: expected an ordinary file, got a pipe or the like; remove it")
+            raise FileFormatError(
+                f"{self._path}: expected an ordinary file, got a "
+                "pipe or the like; remove it"
+            )
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.truncate(self._descriptor, 0)
@@ -173,11 +218,18 @@ class RunLock:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
                 owner = f"process {pid}" if pid.isdigit() else "another process"
                 raise InputError(
-                    f"{folder}: {owner} is working on this run; wait for it or choose another name with `run`"
+                    f"{folder}: {owner} is working on this run; wait for it or choose "
+                    "another name with `run`"
                 ) from None
             if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-                raise StorageError(f"{folder}: the file system has no locks; choose a local disk with `run`") from None
-            raise StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with `run`") from None
+                raise StorageError(
+                    f"{folder}: the file system has no locks; choose a "
+                    "local disk with `run`"
+                ) from None
+            raise StorageError(
+                f"cannot lock {folder}: {error.strerror}; choose "
+                "another place with `run`"
+            ) from None
 
     def release(self) -> None:
         if self._descriptor >= 0:
@@ -201,24 +253,38 @@ def is_held(folder: Path) -> bool:
 
 
 def check_no_links(run: Path, contents: Collection[str], unread: str) -> None:
-    """Check that what a run's folder has is its own: one that somebody else made may link to any file, which would be
-    shown, copied or overwritten. The folder itself may be reached by a link. Looked at are the lock and its `contents`,
-    by name, without what is in folders whose path ends in `unread`. Raises FileFormatError."""
+    """Check that what a run's folder has is its own: one that somebody else made may
+    link to any file, which would be shown, copied or overwritten. The folder itself may
+    be reached by a link. Looked at are the lock and its `contents`, by name, without
+    what is in folders whose path ends in `unread`. Raises FileFormatError.
+    """
     folders = [str(run)]
     while folders:
         folder = folders.pop()
         try:
             with os.scandir(folder) as found:
-                inside = [one for one in found if folder != str(run) or one.name in (*contents, LOCK)]
+                inside = [
+                    one
+                    for one in found
+                    if folder != str(run) or one.name in (*contents, LOCK)
+                ]
         except OSError as error:
             if error.errno == errno.ENOENT:  # it was removed meanwhile
                 continue
-            raise FileFormatError(f"{folder}: expected a folder of a run, got {error.strerror}") from None
+            raise FileFormatError(
+                f"{folder}: expected a folder of a run, got {error.strerror}"
+            ) from None
         for one in inside:
             if one.is_symlink():
-                raise FileFormatError(f"{one.path}: expected a file or a folder of this run, got a link; remove it")
+                raise FileFormatError(
+                    f"{one.path}: expected a file or a folder of "
+                    "this run, got a link; remove it"
+                )
             if one.is_dir(follow_symlinks=False):
                 if not folder.endswith(unread):
                     folders.append(one.path)
             elif not one.is_file(follow_symlinks=False) and one.name != LOCK:
-                raise FileFormatError(f"{one.path}: expected a file of this run, got a pipe or the like; remove it")
+                raise FileFormatError(
+                    f"{one.path}: expected a file of this run, got a "
+                    "pipe or the like; remove it"
+                )

@@ -1,7 +1,9 @@
-"""YAML as settings are written in it: text, numbers, truth values, lists and mappings, of limited size.
+"""YAML as settings are written in it: text, numbers, truth values, lists and mappings,
+of limited size.
 
-Read by PyYAML's safe loader, less what does not belong in settings: numbers to the base of 60 (0:360:24 is text), dates
-(2026-11-22 is text), tags, and structures that are small in the file and endless in memory.
+Read by PyYAML's safe loader, less what does not belong in settings: numbers to the base
+of 60 (0:360:24 is text), dates (2026-11-22 is text), tags, and structures that are
+small in the file and endless in memory.
 """
 
 from __future__ import annotations
@@ -14,12 +16,18 @@ import yaml
 from advsearch.trust.stored_files import DEPTH, DIGITS, scaled
 
 LARGEST = 1 << 17  # most bytes of a YAML file
-MOST_VALUES = 100_000  # most values of a YAML text, those that an alias repeats counted again
-_PLAIN = frozenset(f"tag:yaml.org,2002:{kind}" for kind in "str int float bool null seq map merge".split())
+# most values of a YAML text, those that an alias repeats counted again
+MOST_VALUES = 100_000
+_PLAIN = frozenset(
+    f"tag:yaml.org,2002:{kind}"
+    for kind in "str int float bool null seq map merge".split()
+)
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
-    """The safe loader with our numbers, which checks a text before it makes anything of it."""
+    """The safe loader with our numbers, which checks a text before it makes anything of
+    it.
+    """
 
     def get_single_data(self) -> Any:
         node = self.get_single_node()
@@ -29,19 +37,28 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         return self.construct_document(node)
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
-        if len(node.value) > 4 * DIGITS or abs(number := int(super().construct_yaml_int(node))) >= 10**DIGITS:
+        if (
+            len(node.value) > 4 * DIGITS
+            or abs(number := int(super().construct_yaml_int(node))) >= 10**DIGITS
+        ):
             raise _problem(node, f"a number of more than {DIGITS} digits")
         return number
 
 
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, form) for tag, form in forms if tag.rpartition(":")[2] not in ("int", "float", "timestamp")]
+    first: [
+        (tag, form)
+        for tag, form in forms
+        if tag.rpartition(":")[2] not in ("int", "float", "timestamp")
+    ]
     for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:int",
-    re.compile(r"^(?:[-+]?0b_*[01][01_]*|[-+]?0[0-7_]*|[-+]?[1-9][0-9_]*|[-+]?0x_*[0-9a-fA-F][0-9a-fA-F_]*)$"),
+    re.compile(
+        r"^(?:[-+]?0b_*[01][01_]*|[-+]?0[0-7_]*|[-+]?[1-9][0-9_]*|[-+]?0x_*[0-9a-fA-F][0-9a-fA-F_]*)$"
+    ),
     list("-+0123456789"),
 )
 _Loader.add_implicit_resolver(
@@ -55,8 +72,10 @@ _Loader.add_implicit_resolver(
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text. Raises ValueError where it is not YAML, is too large or nested too deeply, or
-    holds something else than settings are made of; the message is short."""
+    """Return the value of a YAML text. Raises ValueError where it is not YAML, is too
+    large or nested too deeply, or holds something else than settings are made of; the
+    message is short.
+    """
     if len(text) > scaled(LARGEST):
         raise ValueError(f"a text of {len(text):,} characters")
     try:
@@ -66,10 +85,22 @@ def parse_yaml(text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         what = error.note or f"other text ({error.problem or error.context})"
         mark = error.problem_mark or error.context_mark
-        marked = what if mark is None else f"{what} in line {mark.line + 1}, column {mark.column + 1}"
+        marked = (
+            what
+            if mark is None
+            else (f"{what} in line {mark.line + 1}, column {mark.column + 1}")
+        )
         raise ValueError(_short(marked)) from None
-    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-        # The constructors of PyYAML raise all of these for values that do not fit their tags.
+    except (
+        yaml.YAMLError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+    ) as error:
+        # The constructors of PyYAML raise all of these for values that do not fit their
+        # tags.
         raise ValueError(_short(str(error))) from None
 
 
@@ -79,7 +110,9 @@ def _short(text: str) -> str:
 
 
 def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
-    """Return how many values a node has; `counts` holds those of the nodes above (0) and of those done."""
+    """Return how many values a node has; `counts` holds those of the nodes above (0)
+    and of those done.
+    """
     if node.tag not in _PLAIN:
         raise _problem(node, f"the tag {node.tag[:40]!r}, which no setting has")
     if isinstance(node, yaml.ScalarNode):
@@ -94,7 +127,11 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
             seen.add(str(name.value))
     if id(node) not in counts:
         counts[id(node)] = 0
-        inner = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
+        inner = (
+            node.value
+            if isinstance(node, yaml.SequenceNode)
+            else [part for pair in node.value for part in pair]
+        )
         total = 1
         for part in inner:
             total += _check(part, depth + 1, counts)
@@ -105,4 +142,6 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
 
 
 def _problem(node: yaml.Node, what: str) -> yaml.YAMLError:
-    return yaml.constructor.ConstructorError(None, None, what, node.start_mark, note=what)
+    return yaml.constructor.ConstructorError(
+        None, None, what, node.start_mark, note=what
+    )

@@ -1,1 +1,3 @@
-"""The viewer: runs as pages that a browser lets one explore, from a single file or from `advsearch dashboard`."""
+"""The viewer: runs as pages that a browser lets one explore, from a single file or from
+`advsearch dashboard`.
+"""

@@ -1,7 +1,8 @@
-"""Those who ask the dashboard's server: in what time each has to have asked and taken the answer, and HTTPS.
+"""Those who ask the dashboard's server: in what time each has to have asked and taken
+the answer, and HTTPS.
 
-A few workers answer. A client that has said nothing yet keeps none of them from others, one that is slow does so until
-its time is up, or for `GRACE` only where others wait.
+A few workers answer. A client that has said nothing yet keeps none of them from others,
+one that is slow does so until its time is up, or for `GRACE` only where others wait.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ from typing import Any
 
 WORKERS = 16  # requests that are answered at once; others wait
 WAITING = 128
-"""Connections that may be open beside those that are served. More wait in the operating system, without a file open
-here."""
+"""Connections that may be open beside those that are served. More wait in the operating
+system, without a file open here.
+"""
 PATIENCE = 10.0  # seconds in which a client has to have said what it asks for
-SLOWEST = 50_000  # bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`
+# bytes a second at which it has to take the answer at least, beyond as long as
+# `PATIENCE`
+SLOWEST = 50_000
 GRACE = 1.0  # seconds that a slow client has where others wait
 TICK = 0.05  # seconds between two looks at the clock
 
@@ -35,10 +39,16 @@ NO_QR = "pip install segno"  # what to type where there is nothing to draw a cod
 
 
 def reachable(host: str) -> str:
-    """Return the address under which others reach what listens at `host`: of any address, the one that leads out."""
+    """Return the address under which others reach what listens at `host`: of any
+    address, the one that leads out.
+    """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    family, far = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
+    family, far = (
+        (socket.AF_INET6, "2001:db8::1")
+        if host == "::"
+        else (socket.AF_INET, "192.0.2.1")
+    )
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.connect((far, 9))  # chooses an address; nothing is sent
@@ -49,8 +59,10 @@ def reachable(host: str) -> str:
 
 @dataclass(eq=False)
 class _Served:
-    """One that a worker serves: its connection, since when the worker waits for it, and until when that may last; both
-    are infinite while the worker itself is what takes time."""
+    """One that a worker serves: its connection, since when the worker waits for it, and
+    until when that may last; both are infinite while the worker itself is what takes
+    time.
+    """
 
     connection: socket.socket
     since: float = math.inf
@@ -58,13 +70,20 @@ class _Served:
 
 
 class Clients:
-    """Serves the connections that a socket accepts until `close`, with HTTPS if there is a context. `answer` is called
-    with each, in a worker's thread, and says when it waits for the client (`wait_for`) or works."""
+    """Serves the connections that a socket accepts until `close`, with HTTPS if there
+    is a context. `answer` is called with each, in a worker's thread, and says when it
+    waits for the client (`wait_for`) or works.
+    """
 
     def __init__(
-        self, listening: socket.socket, answer: Callable[[socket.socket, Any], None], context: ssl.SSLContext | None
+        self,
+        listening: socket.socket,
+        answer: Callable[[socket.socket, Any], None],
+        context: ssl.SSLContext | None,
     ) -> None:
-        self._listening, self._answer, self._context = listening, answer, context
+        self._listening = listening
+        self._answer = answer
+        self._context = context
         # Who came last is served first: a crowd may be there to keep others out.
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
         self._served: dict[int, _Served] = {}
@@ -90,20 +109,26 @@ class Clients:
         self._closed.set()
         self._ended.wait()
         with suppress(Empty):
-            while (job := self._ready.get_nowait()) is not None:  # behind `None` no worker comes to them
+            # behind `None` no worker comes to them
+            while (job := self._ready.get_nowait()) is not None:
                 job[0].close()
         for _ in range(WORKERS):
             self._ready.put(None)
 
     def wait_for(self, seconds: float | None) -> None:
-        """Say, in a worker's thread, that it waits for its client from now on, and for how long at most; None that it
-        does not."""
+        """Say, in a worker's thread, that it waits for its client from now on, and for
+        how long at most; None that it does not.
+        """
         client = self._served[threading.get_ident()]
         now = time.monotonic()
-        client.since, client.due = (math.inf, math.inf) if seconds is None else (now, now + seconds)
+        client.since, client.due = (
+            (math.inf, math.inf) if seconds is None else (now, now + seconds)
+        )
 
     def _watch(self, selector: selectors.BaseSelector) -> None:
-        """Hand each connection that has said something to the workers, and end those whose time is up."""
+        """Hand each connection that has said something to the workers, and end those
+        whose time is up.
+        """
         silent: dict[Any, tuple[Any, float]] = {}
         listens = False
         while not self._closed.is_set():
@@ -125,18 +150,22 @@ class Clients:
                     self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
             most = PATIENCE if room else min(PATIENCE, GRACE)
-            for connection in [one for one, (_, since) in silent.items() if now - since > most]:
+            for connection in [
+                one for one, (_, since) in silent.items() if now - since > most
+            ]:
                 del silent[connection]
                 selector.unregister(connection)
                 connection.close()
             served = sorted(self._served.copy().values(), key=lambda one: one.since)
             others = self._ready.qsize() if len(served) == WORKERS else 0
-            for one in served:  # where others wait, those end too that have had `GRACE`, the slowest first
+            # where others wait, those end too that have had `GRACE`, the slowest first
+            for one in served:
                 pressed = others > 0 and now - one.since > GRACE
                 if one.due < now or pressed:
                     others -= 1
                     one.since = one.due = math.inf
-                    with suppress(OSError):  # not the method of an SSL socket, which would forget that it is one
+                    # not the method of an SSL socket, which would forget that it is one
+                    with suppress(OSError):
                         socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
         for connection in silent:
             connection.close()
@@ -147,7 +176,9 @@ class Clients:
         try:
             connection.setblocking(True)
             if self._context is not None:
-                connection = self._context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False)
+                connection = self._context.wrap_socket(
+                    connection, server_side=True, do_handshake_on_connect=False
+                )
             self._served[own] = _Served(connection)
             self.wait_for(PATIENCE)
             if isinstance(connection, ssl.SSLSocket):
@@ -163,8 +194,11 @@ class Clients:
 
 
 def qr_text(address: str) -> str | None:
-    """Return an address as a QR code for a terminal; None where segno is not installed."""
-    code, text = qr_code(address), io.StringIO()
+    """Return an address as a QR code for a terminal; None where segno is not
+    installed.
+    """
+    code = qr_code(address)
+    text = io.StringIO()
     if code is not None:
         code.terminal(out=text, compact=True)
     return text.getvalue() or None

@@ -1,7 +1,8 @@
-"""HTML of pages that experiments make: elements, tables, whole documents, and what the server refuses.
+"""HTML of pages that experiments make: elements, tables, whole documents, and what the
+server refuses.
 
-`advsearch.extend` offers this module to added experiments. Text becomes markup only through `element`, which escapes
-it.
+`advsearch.extend` offers this module to added experiments. Text becomes markup only
+through `element`, which escapes it.
 """
 
 from __future__ import annotations

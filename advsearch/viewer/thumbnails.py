@@ -1,4 +1,6 @@
-"""Small pictures of a sweep's configurations: ``images/rows/0001/1234.jpg``, a thousand to a folder."""
+"""Small pictures of a sweep's configurations: ``images/rows/0001/1234.jpg``, a thousand
+to a folder.
+"""
 
 from __future__ import annotations
 
@@ -31,18 +33,22 @@ SIDE = 128  # longest side of a thumbnail, pixels
 QUALITY = 85  # of the JPEG files, from 1 to 95
 LARGEST_COVER = 50_000_000  # pixels of a picture that a list shows small
 LARGEST = 1 << 24  # most bytes of the file of a thumbnail
-BYTES = 5000  # what a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects
+# what a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects
+BYTES = 5000
 
 
 def thumbnail(picture: object) -> bytes:
-    """Return a display-referred picture (H, W, 3) in [0, 1] as a JPEG of at most `SIDE` pixels a side."""
+    """Return a display-referred picture (H, W, 3) in [0, 1] as a JPEG of at most `SIDE`
+    pixels a side.
+    """
     values: Bytes = to_8bit(picture)
     return _jpeg(Image.fromarray(values))
 
 
 def cover(run: Path) -> bytes:
-    """Return a small picture of a run as a JPEG: its worst prediction, or else its first figure; grey where it has
-    none."""
+    """Return a small picture of a run as a JPEG: its worst prediction, or else its
+    first figure; grey where it has none.
+    """
     first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
     for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
         if not file.is_file():
@@ -65,15 +71,21 @@ def path_of(run: Path, number: int) -> Path:
 
 
 def kept_file(run: Path, number: int) -> Path | None:
-    """Return the file of the thumbnail of a picture; None where there is none. A link is none (`check_links` leaves
-    these to this function)."""
+    """Return the file of the thumbnail of a picture; None where there is none. A link
+    is none (`check_links` leaves these to this function).
+    """
     file = path_of(run, number)
-    return file if file.is_file() and not (file.is_symlink() or file.parent.is_symlink()) else None
+    return (
+        file
+        if file.is_file() and not (file.is_symlink() or file.parent.is_symlink())
+        else None
+    )
 
 
 def read_thumbnail(run: Path, number: int) -> bytes:
-    """Return the thumbnail of a picture. Raises FileNotFoundError where there is none, or a link in its place, and
-    FileFormatError where it is too large."""
+    """Return the thumbnail of a picture. Raises FileNotFoundError where there is none,
+    or a link in its place, and FileFormatError where it is too large.
+    """
     file = kept_file(run, number)
     if file is None:
         raise FileNotFoundError(f"{run}: has no picture {number}")
@@ -81,14 +93,17 @@ def read_thumbnail(run: Path, number: int) -> bytes:
 
 
 def keep(run: Path, number: int, data: bytes) -> None:
-    """Keep the thumbnail of a picture. Raises StorageError where it cannot be written."""
+    """Keep the thumbnail of a picture. Raises StorageError where it cannot be
+    written.
+    """
     write_bytes(path_of(run, number), data, durable=False)
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The thumbnails that a run has, each of `models` configurations in a row; only of some of the pictures, if it says
-    so."""
+    """The thumbnails that a run has, each of `models` configurations in a row; only of
+    some of the pictures, if it says so.
+    """
 
     run: Path
     models: int
@@ -96,11 +111,15 @@ class Kept:
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
-        """Of the pictures, sorted. Listing the files of a million takes seconds, so only who needs them asks."""
+        """Of the pictures, sorted. Listing the files of a million takes seconds, so
+        only who needs them asks.
+        """
         return tuple(sorted(_numbers(self.run)))
 
     def png_of(self, step: int) -> bytes | None:
-        """Return the picture of a configuration as a PNG; None where it was not kept."""
+        """Return the picture of a configuration as a PNG; None where it was not
+        kept.
+        """
         try:
             data = read_thumbnail(self.run, step // self.models)
         except OSError:
@@ -111,14 +130,20 @@ class Kept:
                 image.save(stream, "PNG")
         except BAD_PICTURE:
             file = path_of(self.run, step // self.models)
-            raise FileFormatError(f"{file}: expected a small picture of the run, got something else") from None
+            raise FileFormatError(
+                f"{file}: expected a small picture of the run, got something else"
+            ) from None
         return stream.getvalue()
 
     def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
-        """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
-        steps, margins = rows["step"].to_numpy(), rows["margin"].to_numpy()
+        """Yield number and data address of thumbnails, of the worst margins first, up
+        to `most` bytes.
+        """
+        steps = rows["step"].to_numpy()
+        margins = rows["margin"].to_numpy()
         order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
-        there, spent = set(self.numbers), 0
+        there = set(self.numbers)
+        spent = 0
         for step in steps[order]:
             number = int(step) // self.models
             if number not in there:
@@ -128,7 +153,10 @@ class Kept:
             spent += len(data) * 4 // 3
             if spent > most:
                 return
-            yield str(number), "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
+            yield (
+                str(number),
+                "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii"),
+            )
 
 
 def kept_pictures(run: Path) -> Kept | None:
@@ -152,5 +180,9 @@ def _numbers(run: Path) -> Iterator[int]:
             with os.scandir(folder) as files:
                 for file in files:
                     stem, _, suffix = file.name.rpartition(".")
-                    if suffix == "jpg" and stem.isdecimal() and file.is_file(follow_symlinks=False):
+                    if (
+                        suffix == "jpg"
+                        and stem.isdecimal()
+                        and file.is_file(follow_symlinks=False)
+                    ):
                         yield int(stem)

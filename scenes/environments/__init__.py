@@ -1,4 +1,6 @@
-"""The bundled environments: rooms cast in numpy and skies, half of them never used in training, and streets."""
+"""The bundled environments: rooms cast in numpy and skies, half of them never used in
+training, and streets.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,8 @@ from .rooms import ROOMS
 from .skies import SKIES
 from .streets import STREETS
 
-ENVIRONMENTS: dict[str, EnvironmentFamily] = {family.name: family for family in (*ROOMS, *SKIES, *STREETS)}
+ENVIRONMENTS: dict[str, EnvironmentFamily] = {
+    family.name: family for family in (*ROOMS, *SKIES, *STREETS)
+}
 
 __all__ = ["ENVIRONMENTS", "EnvironmentFamily"]

@@ -1,4 +1,6 @@
-"""The bundled places: streets, a road, a car park and a room, as glTF files with YAML files beside them."""
+"""The bundled places: streets, a road, a car park and a room, as glTF files with YAML
+files beside them.
+"""
 
 from __future__ import annotations
 

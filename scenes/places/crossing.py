@@ -1,6 +1,8 @@
-"""A crossing: the avenue with another one across it, zebras and a stop sign. Lengths are metres.
+"""A crossing: the avenue with another one across it, zebras and a stop sign. Lengths
+are metres.
 
-The object stands at the origin as at the stop line, and the other street is `AHEAD` of it.
+The object stands at the origin as at the stop line, and the other street is `AHEAD` of
+it.
 """
 
 from __future__ import annotations
@@ -11,7 +13,16 @@ from advsearch.scene.assets import Mesh
 from advsearch.scene.geometry import rotation
 from advsearch.scene.library import load_object
 from scenes.places import avenue, paint
-from scenes.places.avenue import END, KERB, StreetPlan, Tree, asphalt, level, painted, street
+from scenes.places.avenue import (
+    END,
+    KERB,
+    StreetPlan,
+    Tree,
+    asphalt,
+    level,
+    painted,
+    street,
+)
 from scenes.places.houses import DEPTH
 from scenes.places.models import Look, Node, Primitive, make_primitive
 from scenes.places.paint import BAY, FRONTS
@@ -20,18 +31,23 @@ from scenes.places.road import KERBS
 
 AHEAD = 14.0  # x of the middle of the other street, which is as wide
 MIDDLE = sum(KERBS) / 2.0
-NEAR, FAR = AHEAD + MIDDLE - KERBS[1], AHEAD + MIDDLE - KERBS[0]  # x of its kerbs
-WEST, EAST = AHEAD + MIDDLE - FRONTS[1], AHEAD + MIDDLE - FRONTS[0]  # x of its fronts
+NEAR = AHEAD + MIDDLE - KERBS[1]  # x of its kerbs
+FAR = AHEAD + MIDDLE - KERBS[0]
+WEST = AHEAD + MIDDLE - FRONTS[1]  # x of its fronts
+EAST = AHEAD + MIDDLE - FRONTS[0]
 SIDE_END = 64.0
-STOP, ZEBRA = (3.6, 4.0), (4.9, 7.9)  # x of the stop line and of the zebra across the lane ahead
+STOP = (3.6, 4.0)  # x of the stop line and of the zebra across the lane ahead
+ZEBRA = (4.9, 7.9)
 STRIPE = 0.5
 SIGN = (4.4, -2.95)
 SIGN_LOW = 1.5  # of the bundled stop sign's lower end over the pavement, on a post
 
 
 def _ground() -> Quads:
-    quads, side = Quads(), Quads()
-    (right, left), (low, high) = KERBS, FRONTS
+    quads = Quads()
+    side = Quads()
+    (right, left) = KERBS
+    (low, high) = FRONTS
     street(quads, -END, STOP[0] - 0.4)
     street(quads, STOP[0] - 0.4, NEAR, marked=False)
     street(quads, FAR, FAR + 5.0, marked=False)
@@ -40,11 +56,16 @@ def _ground() -> Quads:
     asphalt(quads, (NEAR, FAR), (low, high))
     for x, turn in ((NEAR, 1), (FAR, -1)):  # kerbs of the other street at the corners
         for y0, y1 in ((low, right), (left, high)):
-            corners = np.array([[(x, y0, 0.0), (x, y1, 0.0), (x, y1, KERB), (x, y0, KERB)]])
+            corners = np.array(
+                [[(x, y0, 0.0), (x, y1, 0.0), (x, y1, KERB), (x, y0, KERB)]]
+            )
             v = (right - 0.1 - low) / (high - low) + np.zeros(4)
-            uvs = np.stack([np.array([y0, y1, y1, y0]) / paint.GROUND_PERIOD, v], axis=-1)[None]
+            uvs = np.stack(
+                [np.array([y0, y1, y1, y0]) / paint.GROUND_PERIOD, v], axis=-1
+            )[None]
             quads.add(corners[:, ::turn], uvs[:, ::turn])
-    for begin, end in ((-SIDE_END, low), (high, SIDE_END)):  # the other street, as if it ran along x
+    # the other street, as if it ran along x
+    for begin, end in ((-SIDE_END, low), (high, SIDE_END)):
         street(side, begin, end)
     for corners, uvs, normals in zip(side.corners, side.uvs, side.normals, strict=True):
         x, y, z = np.moveaxis(corners, -1, 0)
@@ -61,17 +82,28 @@ def _ground() -> Quads:
 
 
 def _sign() -> tuple[dict[str, Look], tuple[Node, ...]]:
-    """Return the bundled stop sign on a post instead of its stand, each of its materials as one of its own."""
-    asset, post = load_object("stop-sign"), Quads()
+    """Return the bundled stop sign on a post instead of its stand, each of its
+    materials as one of its own.
+    """
+    asset = load_object("stop-sign")
+    post = Quads()
     assert asset.metres is not None
-    foot, low = np.array([*SIGN, KERB]), np.array([*SIGN, KERB + SIGN_LOW])
+    foot = np.array([*SIGN, KERB])
+    low = np.array([*SIGN, KERB + SIGN_LOW])
     avenue.limb(post, foot, low + np.array([0.0, 0.0, 0.1]), 0.035, 0.035, 10)
     linear = asset.metres * rotation(180.0, 0.0, 0.0)
     mesh = asset.mesh
     vertices = (mesh.vertices.astype(np.float64) @ linear.T + low).astype(np.float32)
-    normals = (mesh.normals.astype(np.float64) @ linear.T / asset.metres).astype(np.float32)
-    looks, primitives = dict[str, Look](), list[Primitive]()
-    for name, look in (("face", "sign"), ("metal", "sign-metal"), ("post", "sign-tube")):
+    normals = (mesh.normals.astype(np.float64) @ linear.T / asset.metres).astype(
+        np.float32
+    )
+    looks = dict[str, Look]()
+    primitives = list[Primitive]()
+    for name, look in (
+        ("face", "sign"),
+        ("metal", "sign-metal"),
+        ("post", "sign-tube"),
+    ):
         faces = mesh.faces[mesh.materials[name]]
         primitives.append(Primitive(Mesh(vertices, faces, normals, mesh.uvs), look))
         looks[look] = Look(asset.base_color, asset.finishes[name])
@@ -85,9 +117,13 @@ def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:
     def row(length: float) -> float:
         return BAY * int(length / BAY) + 0.01
 
-    long, west, east = row(END - EAST), row(END + WEST), row(SIDE_END - FRONTS[1] - DEPTH)
-    (low, high), side = FRONTS, row(SIDE_END + FRONTS[0] - DEPTH)
-    facing_east, facing_west = Wall((WEST, 0.0, KERB), (1.0, 0.0, 0.0)), Wall((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
+    long = row(END - EAST)
+    west = row(END + WEST)
+    east = row(SIDE_END - FRONTS[1] - DEPTH)
+    (low, high) = FRONTS
+    side = row(SIDE_END + FRONTS[0] - DEPTH)
+    facing_east = Wall((WEST, 0.0, KERB), (1.0, 0.0, 0.0))
+    facing_west = Wall((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
     return (
         (avenue.RIGHT, -WEST, -WEST + west, 1), (avenue.RIGHT, -EAST - long, -EAST, 6),
         (avenue.LEFT, WEST - west, WEST, 2), (avenue.LEFT, EAST, EAST + long, 7),
@@ -108,9 +144,15 @@ CROSSING = StreetPlan(
     _fronts(),
     (
         *(tree for tree in avenue.trees_along() if _clear(tree.x)),
-        *(Tree((NEAR - 2.1, FAR + 2.1)[n % 2], y, n) for n, y in enumerate((24.0, 33.0, 42.0, -19.0, -28.0, -37.0))),
+        *(
+            Tree((NEAR - 2.1, FAR + 2.1)[n % 2], y, n)
+            for n, y in enumerate((24.0, 33.0, 42.0, -19.0, -28.0, -37.0))
+        ),
     ),
-    (*(post for post in avenue.posts_along() if _clear(post[0])), *avenue.posts_along((30.0, -1.0))),
+    (
+        *(post for post in avenue.posts_along() if _clear(post[0])),
+        *avenue.posts_along((30.0, -1.0)),
+    ),
     {
         "day": {"map": "avenue", "lux": 75000.0},
         "dusk": {"map": "avenue-dusk", "lux": 12.0},
@@ -123,14 +165,20 @@ CROSSING = StreetPlan(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A car park: rows of bays along two lanes, with trees and lamps, and houses around it. Lengths are metres.
+# A car park: rows of bays along two lanes, with trees and lamps, and houses around it.
+# Lengths are metres.
 #
 # The object stands in a bay at the origin, with its front towards a lane.
 
-DEEP, WIDE, BAYS = 5.0, 2.5, 17  # of a bay, and how many are beside each other
-ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)  # where rows begin in x: two back to back, then a lane, and so on
+DEEP = 5.0  # of a bay, and how many are beside each other
+WIDE = 2.5
+BAYS = 17
+# where rows begin in x: two back to back, then a lane, and so on
+ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)
 LINE = 0.1
-(BEGIN, CAR_PARK_END), HALF, WALK = (-20.0, 31.0), 24.0, 7.0
+(BEGIN, CAR_PARK_END) = (-20.0, 31.0)
+HALF = 24.0
+WALK = 7.0
 """From and to in x, half of what it is in y, and how wide the pavement around it is."""
 
 
@@ -146,17 +194,32 @@ def _car_park_ground() -> Quads:
     for ends in ((BEGIN - WALK, BEGIN), (CAR_PARK_END, CAR_PARK_END + WALK)):
         level(quads, ends, (-HALF - WALK, HALF + WALK), KERB, (-9.9, -9.9 + WALK))
     for sign in (-1.0, 1.0):
-        level(quads, (BEGIN, CAR_PARK_END), (sign * HALF, sign * (HALF + WALK)), KERB, (-9.9, -9.9 + WALK))
-    around = [(BEGIN, HALF, CAR_PARK_END - BEGIN, (0.0, -1.0)), (CAR_PARK_END, -HALF, CAR_PARK_END - BEGIN, (0.0, 1.0))]
-    around += [(BEGIN, -HALF, 2.0 * HALF, (1.0, 0.0)), (CAR_PARK_END, HALF, 2.0 * HALF, (-1.0, 0.0))]
+        level(
+            quads,
+            (BEGIN, CAR_PARK_END),
+            (sign * HALF, sign * (HALF + WALK)),
+            KERB,
+            (-9.9, -9.9 + WALK),
+        )
+    around = [
+        (BEGIN, HALF, CAR_PARK_END - BEGIN, (0.0, -1.0)),
+        (CAR_PARK_END, -HALF, CAR_PARK_END - BEGIN, (0.0, 1.0)),
+    ]
+    around += [
+        (BEGIN, -HALF, 2.0 * HALF, (1.0, 0.0)),
+        (CAR_PARK_END, HALF, 2.0 * HALF, (-1.0, 0.0)),
+    ]
     for x, y, long, (out_x, out_y) in around:  # kerbs
         frame = Wall((x, y, 0.0), (out_x, out_y, 0.0))
         shown = np.array([[0.0, long / 24.0, 0.345, 0.348]])
-        quads.boxes(frame, np.array([[0.0, long, 0.0, 0.16, 0.0, KERB]]), shown, (FRONT, TOP))
+        quads.boxes(
+            frame, np.array([[0.0, long, 0.0, 0.16, 0.0, KERB]]), shown, (FRONT, TOP)
+        )
     return quads
 
 
-CAR_PARK_MIDDLE, OUT = (BEGIN + CAR_PARK_END) / 2.0, HALF + WALK
+CAR_PARK_MIDDLE = (BEGIN + CAR_PARK_END) / 2.0
+OUT = HALF + WALK
 CAR_PARK = StreetPlan(
     _car_park_ground,
     (
@@ -171,7 +234,11 @@ CAR_PARK = StreetPlan(
         for number, x in enumerate((-16.0, -8.5, 9.0, 17.0, 24.0))
     ),
     (
-        *((x, y, y + arm) for x in (-2.5, 13.5) for y, arm in ((-WIDE * 5.5, -1.7), (WIDE * 5.5, 1.7))),
+        *(
+            (x, y, y + arm)
+            for x in (-2.5, 13.5)
+            for y, arm in ((-WIDE * 5.5, -1.7), (WIDE * 5.5, 1.7))
+        ),
         *((-13.0, sign * (HALF + 0.6), sign * (HALF - 1.1)) for sign in (-1.0, 1.0)),
     ),
     CROSSING.lights,

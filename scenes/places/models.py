@@ -1,7 +1,8 @@
-"""A place as it is written: a binary glTF file with variants of its materials, and the YAML file beside it.
+"""A place as it is written: a binary glTF file with variants of its materials, and the
+YAML file beside it.
 
-Textures are PNG files of 8 bits. The strength of a reflection that glTF's factor of at most 1 cannot say is written as
-an index of refraction. What emits light is in cd/m2.
+Textures are PNG files of 8 bits. The strength of a reflection that glTF's factor of at
+most 1 cannot say is written as an index of refraction. What emits light is in cd/m2.
 """
 
 from __future__ import annotations
@@ -20,11 +21,21 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.glb import GlbBuffer, mime_type
 from scenes.places.quads import Quads
 
-VARIANTS, EMISSION = "KHR_materials_variants", "KHR_materials_emissive_strength"
-SPECULAR, IOR, CLEARCOAT = "KHR_materials_specular", "KHR_materials_ior", "KHR_materials_clearcoat"
+VARIANTS = "KHR_materials_variants"
+EMISSION = "KHR_materials_emissive_strength"
+SPECULAR = "KHR_materials_specular"
+IOR = "KHR_materials_ior"
+CLEARCOAT = "KHR_materials_clearcoat"
 USUAL_SPECULAR = 0.5  # of an index of refraction of 1.5
 REFLECTANCE = 0.08  # of a surface of specular 1 that faces the light
-Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+Y_UP = np.array(
+    [
+        [0.0, 1.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0, 0.0],
+        [1.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
 """From z up and x ahead to y up and z ahead."""
 
 
@@ -32,7 +43,8 @@ Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0
 class Look:
     """A material of the file."""
 
-    base: Floats  # (h, w, 3) display-referred, row 0 at v = 1; (3,) where it is the same everywhere
+    # (h, w, 3) display-referred, row 0 at v = 1; (3,) where it is the same everywhere
+    base: Floats
     finish: Material
     emission: Floats | None = None  # (h, w, 3) or (3,) linear luminance, cd/m2
 
@@ -69,13 +81,22 @@ def make_primitive(quads: Quads, look: str, **variants: str) -> Primitive:
 
 def place_files(name: str, model: PlaceModel) -> dict[str, bytes]:
     """Return the files of a place by path below the data folder."""
-    text = yaml.safe_dump({"mesh": "place.glb", **model.file}, sort_keys=False, default_flow_style=None, width=110)
-    return {f"places/{name}/place.yaml": text.encode(), f"places/{name}/place.glb": glb(model)}
+    text = yaml.safe_dump(
+        {"mesh": "place.glb", **model.file},
+        sort_keys=False,
+        default_flow_style=None,
+        width=110,
+    )
+    return {
+        f"places/{name}/place.yaml": text.encode(),
+        f"places/{name}/place.glb": glb(model),
+    }
 
 
 def glb(model: PlaceModel) -> bytes:
     """Return the binary glTF file of a place."""
-    buffer, names = GlbBuffer(), list(model.looks)
+    buffer = GlbBuffer()
+    names = list(model.looks)
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch, scenes/build.py"},
         "scene": 0,
@@ -84,32 +105,57 @@ def glb(model: PlaceModel) -> bytes:
         "meshes": [],
         "materials": [],
         "textures": [],
-        "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
+        "samplers": [
+            {"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}
+        ],
         "images": [],
     }
     for name, look in model.looks.items():
         header["materials"].append(_material(header, buffer, name, look))
-    variants = sorted({variant for node in model.nodes for one in node.primitives for variant in one.variants})
+    variants = sorted(
+        {
+            variant
+            for node in model.nodes
+            for one in node.primitives
+            for variant in one.variants
+        }
+    )
     meshes: dict[int, int] = {}
     for node in model.nodes:
         if id(node.primitives) not in meshes:
             meshes[id(node.primitives)] = len(header["meshes"])
-            written = [_primitive(buffer, primitive, names, variants) for primitive in node.primitives]
-            header["meshes"].append({"name": node.primitives[0].look, "primitives": written})
-        entry: dict[str, Any] = {"name": node.primitives[0].look, "mesh": meshes[id(node.primitives)]}
+            written = [
+                _primitive(buffer, primitive, names, variants)
+                for primitive in node.primitives
+            ]
+            header["meshes"].append(
+                {"name": node.primitives[0].look, "primitives": written}
+            )
+        entry: dict[str, Any] = {
+            "name": node.primitives[0].look,
+            "mesh": meshes[id(node.primitives)],
+        }
         if not np.array_equal(node.pose, np.eye(4)):
             entry["matrix"] = (Y_UP @ node.pose @ Y_UP.T).T.reshape(-1).tolist()
         header["nodes"].append(entry)
-    used = {name for material in header["materials"] for name in material.get("extensions", ())}
+    used = {
+        name
+        for material in header["materials"]
+        for name in material.get("extensions", ())
+    }
     if variants:
-        header["extensions"] = {VARIANTS: {"variants": [{"name": variant} for variant in variants]}}
+        header["extensions"] = {
+            VARIANTS: {"variants": [{"name": variant} for variant in variants]}
+        }
         used.add(VARIANTS)
     if used:
         header["extensionsUsed"] = sorted(used)
     return buffer.file({name: value for name, value in header.items() if value != []})
 
 
-def _primitive(buffer: GlbBuffer, primitive: Primitive, names: list[str], variants: list[str]) -> dict[str, Any]:
+def _primitive(
+    buffer: GlbBuffer, primitive: Primitive, names: list[str], variants: list[str]
+) -> dict[str, Any]:
     mesh = primitive.mesh
     is_small = len(mesh.vertices) <= np.iinfo(np.uint16).max
     indices = mesh.faces.reshape(-1).astype(np.uint16 if is_small else np.uint32)
@@ -117,7 +163,9 @@ def _primitive(buffer: GlbBuffer, primitive: Primitive, names: list[str], varian
         "attributes": {
             "POSITION": buffer.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
             "NORMAL": buffer.accessor(_y_up(mesh.normals), "VEC3"),
-            "TEXCOORD_0": buffer.accessor(np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"),
+            "TEXCOORD_0": buffer.accessor(
+                np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"
+            ),
         },
         "indices": buffer.accessor(indices, "SCALAR"),
         "material": names.index(primitive.look),
@@ -135,9 +183,14 @@ def _y_up(vectors: Floats) -> Floats:
     return np.ascontiguousarray(vectors[:, [1, 2, 0]], np.float32)
 
 
-def _material(header: dict[str, Any], buffer: GlbBuffer, name: str, look: Look) -> dict[str, Any]:
+def _material(
+    header: dict[str, Any], buffer: GlbBuffer, name: str, look: Look
+) -> dict[str, Any]:
     finish = look.finish
-    surface: dict[str, Any] = {"roughnessFactor": finish.roughness, "metallicFactor": finish.metallic}
+    surface: dict[str, Any] = {
+        "roughnessFactor": finish.roughness,
+        "metallicFactor": finish.metallic,
+    }
     if look.base.ndim == 1:
         linear = srgb_to_linear(look.base.astype(np.float32)).tolist()
         surface["baseColorFactor"] = [*linear, 1.0]
@@ -159,12 +212,16 @@ def _material(header: dict[str, Any], buffer: GlbBuffer, name: str, look: Look) 
             material["emissiveFactor"] = fraction.tolist()
         else:
             material["emissiveFactor"] = [1.0, 1.0, 1.0]
-            material["emissiveTexture"] = _texture(header, buffer, linear_to_srgb(fraction))
+            material["emissiveTexture"] = _texture(
+                header, buffer, linear_to_srgb(fraction)
+            )
         extensions[EMISSION] = {"emissiveStrength": strength}
     return {**material, "extensions": extensions} if extensions else material
 
 
-def _texture(header: dict[str, Any], buffer: GlbBuffer, display: Floats) -> dict[str, int]:
+def _texture(
+    header: dict[str, Any], buffer: GlbBuffer, display: Floats
+) -> dict[str, int]:
     picture = _png(display)
     view = buffer.view(picture)
     views = [image["bufferView"] for image in header["images"]]
@@ -176,7 +233,9 @@ def _texture(header: dict[str, Any], buffer: GlbBuffer, display: Floats) -> dict
 
 
 def _png(display: Floats) -> bytes:
-    levels = np.clip(np.round(display.astype(np.float64) * 255.0), 0, 255).astype(np.uint8)
+    levels = np.clip(np.round(display.astype(np.float64) * 255.0), 0, 255).astype(
+        np.uint8
+    )
     stream = io.BytesIO()
     Image.fromarray(levels).save(stream, "PNG", optimize=True)
     return stream.getvalue()

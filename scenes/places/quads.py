@@ -9,26 +9,37 @@ import numpy as np
 
 from advsearch.scene.assets import Bools, Doubles, Mesh
 
-FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"
-SHOWN = (FRONT, SIDES, TOP, BOTTOM)  # faces of a box that stands at a wall: all but its back
-SLOPE = 0.35  # cosine between a surface that snow stays on and the level, at the least: 70 degrees
+FRONT = "front"
+SIDES = "sides"
+TOP = "top"
+BOTTOM = "bottom"
+# faces of a box that stands at a wall: all but its back
+SHOWN = (FRONT, SIDES, TOP, BOTTOM)
+# cosine between a surface that snow stays on and the level, at the least: 70 degrees
+SLOPE = 0.35
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall's own coordinates: along it, out of it, and up, in metres from its origin (3,); `out` (3,) is the level
-    unit vector that it faces."""
+    """A wall's own coordinates: along it, out of it, and up, in metres from its origin
+    (3,); `out` (3,) is the level unit vector that it faces.
+    """
 
     origin: tuple[float, float, float]
     out: tuple[float, float, float]
 
     def world(self, along: Doubles, out: Doubles, up: Doubles) -> Doubles:
-        """Return places (..., 3) from coordinates of the wall; seen from outside, `along` runs to the right."""
+        """Return places (..., 3) from coordinates of the wall; seen from outside,
+        `along` runs to the right.
+        """
         away = np.array(self.out)
         right = np.array([-away[1], away[0], 0.0])
         along, out, up = np.broadcast_arrays(along, out, up)
         return np.asarray(
-            np.array(self.origin) + along[..., None] * right + out[..., None] * away + up[..., None] * [0.0, 0.0, 1.0]
+            np.array(self.origin)
+            + along[..., None] * right
+            + out[..., None] * away
+            + up[..., None] * [0.0, 0.0, 1.0]
         )
 
 
@@ -40,31 +51,62 @@ class Quads:
     uvs: list[Doubles] = field(default_factory=list)
     normals: list[Doubles] = field(default_factory=list)
 
-    def add(self, corners: Doubles, uvs: Doubles, normals: Doubles | None = None) -> None:
-        """Add (N, 4, 3) corners with (N, 4, 2) texture coordinates and, unless they are flat, (N, 4, 3) normals."""
+    def add(
+        self, corners: Doubles, uvs: Doubles, normals: Doubles | None = None
+    ) -> None:
+        """Add (N, 4, 3) corners with (N, 4, 2) texture coordinates and, unless they are
+        flat, (N, 4, 3) normals.
+        """
         self.corners.append(corners)
         self.uvs.append(np.broadcast_to(uvs, (*corners.shape[:2], 2)))
         self.normals.append(np.zeros_like(corners) if normals is None else normals)
 
-    def at(self, frame: Wall, along: Doubles, out: Doubles, up: Doubles, uvs: Doubles, turn: int = 1) -> None:
-        """Add quadrilaterals by a wall's coordinates (N, 4), in the other order where `turn` is -1; (N, 4, 2) uvs."""
+    def at(
+        self,
+        frame: Wall,
+        along: Doubles,
+        out: Doubles,
+        up: Doubles,
+        uvs: Doubles,
+        turn: int = 1,
+    ) -> None:
+        """Add quadrilaterals by a wall's coordinates (N, 4), in the other order where
+        `turn` is -1; (N, 4, 2) uvs.
+        """
         self.add(frame.world(along, out, up)[:, ::turn], uvs[:, ::turn])
 
-    def level(self, x: tuple[float, float], y: tuple[float, float], z: float, uvs: Doubles, up: int = 1) -> None:
-        """Add a level rectangle, which faces up, or down where `up` is -1; texture coordinates (4, 2) of its corners,
-        counter-clockwise from the least x and y."""
-        corners = np.array([[(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]])
+    def level(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        z: float,
+        uvs: Doubles,
+        up: int = 1,
+    ) -> None:
+        """Add a level rectangle, which faces up, or down where `up` is -1; texture
+        coordinates (4, 2) of its corners, counter-clockwise from the least x and y.
+        """
+        corners = np.array(
+            [[(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]]
+        )
         self.add(corners[:, ::up], uvs[None, ::up])
 
-    def wall(self, frame: Wall, rows: Doubles, out: Doubles | float, uvs: Doubles) -> None:
-        """Add upright rectangles (N, 4) at a wall: left, right, low and high, so far out of it (N,), with texture
-        coordinates (N, 4) of the same order."""
+    def wall(
+        self, frame: Wall, rows: Doubles, out: Doubles | float, uvs: Doubles
+    ) -> None:
+        """Add upright rectangles (N, 4) at a wall: left, right, low and high, so far
+        out of it (N,), with texture coordinates (N, 4) of the same order.
+        """
         along, up = np.moveaxis(_around(rows), -1, 0)
         self.at(frame, along, np.reshape(out, (-1, 1)), up, _around(uvs))
 
-    def boxes(self, frame: Wall, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN) -> None:
-        """Add boxes (N, 6) at a wall: left, right, back, front, low, high, with texture coordinates (N, 4) as of `wall`
-        for the front, of which the other faces show a part; only some faces are there."""
+    def boxes(
+        self, frame: Wall, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN
+    ) -> None:
+        """Add boxes (N, 6) at a wall: left, right, back, front, low, high, with texture
+        coordinates (N, 4) as of `wall` for the front, of which the other faces show a
+        part; only some faces are there.
+        """
         left, right, _, front, low, high = rows.T
         shown = _around(uvs)
         if FRONT in faces:
@@ -80,10 +122,16 @@ class Quads:
                 self.at(frame, side[:, None], out, up, narrow, turn)
 
     def swept(self, fallen: Quads) -> Quads:
-        """Return those that do not face up, and add the others, which snow lies on, to `fallen`."""
+        """Return those that do not face up, and add the others, which snow lies on, to
+        `fallen`.
+        """
         bare = Quads()
-        for corners, uvs, normals in zip(self.corners, self.uvs, self.normals, strict=True):
-            across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        for corners, uvs, normals in zip(
+            self.corners, self.uvs, self.normals, strict=True
+        ):
+            across = np.cross(
+                corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+            )
             shaded: Bools = np.asarray(normals.any(axis=(1, 2)))
             faced = np.where(shaded[:, None], normals.mean(axis=1), across)
             lies = faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1)
@@ -93,20 +141,36 @@ class Quads:
 
     def mesh(self) -> Mesh:
         """Return all of them as one mesh."""
-        corners, uvs, normals = (np.concatenate(part) for part in (self.corners, self.uvs, self.normals))
+        corners, uvs, normals = (
+            np.concatenate(part) for part in (self.corners, self.uvs, self.normals)
+        )
         across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        normals = np.where((np.abs(normals).sum(axis=(1, 2)) > 0.0)[:, None, None], normals, across[:, None])
+        normals = np.where(
+            (np.abs(normals).sum(axis=(1, 2)) > 0.0)[:, None, None],
+            normals,
+            across[:, None],
+        )
         first = 4 * np.arange(len(corners))[:, None]
         return Mesh(
             corners.reshape(-1, 3).astype(np.float32),
-            np.concatenate([first + np.array(three) for three in ((0, 1, 2), (0, 2, 3))]).astype(np.uint32),
+            np.concatenate(
+                [first + np.array(three) for three in ((0, 1, 2), (0, 2, 3))]
+            ).astype(np.uint32),
             normals.reshape(-1, 3).astype(np.float32),
             uvs.reshape(-1, 2).astype(np.float32),
         )
 
 
 def _around(uvs: Doubles) -> Doubles:
-    """(N, 4, 2) the corners of rectangles (N, 4) of texture coordinates: left, right, low, high."""
+    """(N, 4, 2) the corners of rectangles (N, 4) of texture coordinates: left, right,
+    low, high.
+    """
     left, right, low, high = np.atleast_2d(uvs).T
-    return np.stack([np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)], axis=-1)
+    return np.stack(
+        [
+            np.stack([left, right, right, left], axis=1),
+            np.stack([low, low, high, high], axis=1),
+        ],
+        axis=-1,
+    )

@@ -6,15 +6,33 @@ from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
-from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
+from advsearch.attacks.candidates import (
+    Failures,
+    FoundFailure,
+    failure_share,
+    most_different,
+)
 from advsearch.attacks.domain import Domain, centre_of_option, half_widths, wraps
-from advsearch.attacks.evaluation import Evaluated, Evaluation, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import (
+    Evaluated,
+    Evaluation,
+    Policy,
+    Proposal,
+    draw_seed,
+    one_thread,
+    seeded,
+)
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
-from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate, box_coordinates
+from advsearch.attacks.policies.surrogate import (
+    MOST_OWN,
+    Observed,
+    Surrogate,
+    box_coordinates,
+)
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
@@ -25,17 +43,23 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
     list_built_ins("policy"),
     "a dataclass over Policy whose name is that of the entry point",
     lambda name, entry: (
-        isinstance(entry, type) and is_dataclass(entry) and issubclass(entry, Policy) and entry.name == name
+        isinstance(entry, type)
+        and is_dataclass(entry)
+        and issubclass(entry, Policy)
+        and entry.name == name
     ),
 )
 """Every policy by its word on the command line."""
 
 Spec = str | Mapping[str, object] | Policy[Any]
-"""A policy inside another one: its name, a mapping with its `name` and options, or the policy itself."""
+"""A policy inside another one: its name, a mapping with its `name` and options, or the
+policy itself.
+"""
 
 
 def make_policy(name: str, **options: Any) -> Policy[Any]:
-    """Return the policy of that name with the given options, which are its dataclass's fields.
+    """Return the policy of that name with the given options, which are its dataclass's
+    fields.
 
     A wrapper's `policy` and `policies` may be given as a `Spec`, and as a list of them:
 
@@ -55,7 +79,9 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     if "policies" in options:
         specs = options["policies"]
         specs = specs if isinstance(specs, (list, tuple)) else [specs]
-        options["policies"] = tuple(_nested(spec, f"policies of {name}") for spec in specs)
+        options["policies"] = tuple(
+            _nested(spec, f"policies of {name}") for spec in specs
+        )
     return policy(**options)
 
 
@@ -65,8 +91,14 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
     if isinstance(spec, str):
         return make_policy(spec)
     if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
-        raise InputError(f"{where}: expected a name or a mapping with a name and options, got {spec!r}")
-    return make_policy(str(spec["name"]), **{option: spec[option] for option in spec if option != "name"})
+        raise InputError(
+            f"{where}: expected a name or a mapping with a name and "
+            f"options, got {spec!r}"
+        )
+    return make_policy(
+        str(spec["name"]),
+        **{option: spec[option] for option in spec if option != "name"},
+    )
 
 
 __all__ = [

@@ -1,4 +1,6 @@
-"""Quality diversity: many different failures instead of one, kept in an archive over chosen parameters."""
+"""Quality diversity: many different failures instead of one, kept in an archive over
+chosen parameters.
+"""
 
 from __future__ import annotations
 
@@ -16,25 +18,40 @@ from advsearch.extend import InputError, Policy, errors, policies, seeds
 
 MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
 MOST_CELLS = 1_000_000  # an archive has no more
-MOST_SPANNED = 4  # parameters that span it; with more, nearly every configuration has a cell of its own
-ANEW = 0.1  # share of the configurations, and of the discrete choices, that are drawn anew
-TOURNAMENT = 4  # so many kept configurations are drawn, and the one with the largest objective is changed
-SIGMA, LINE = 0.1, 0.3
-"""Standard deviations of a step, in half of each number's range, and of one along the line through two configurations,
-in their distance."""
+# parameters that span it; with more, nearly every configuration has a cell of its own
+MOST_SPANNED = 4
+# share of the configurations, and of the discrete choices, that are drawn anew
+ANEW = 0.1
+# so many kept configurations are drawn, and the one with the largest objective is
+# changed
+TOURNAMENT = 4
+SIGMA = 0.1
+LINE = 0.3
+"""Standard deviations of a step, in half of each number's range, and of one along the
+line through two configurations, in their distance.
+"""
 
-WIDER = 4.0  # how much larger steps are in the parameters that span the archive: that is where there are cells to fill
+# how much larger steps are in the parameters that span the archive: that is where there
+# are cells to fill
+WIDER = 4.0
 CANDIDATES = 300  # configurations that the surrogate chooses a generation from
 ELSEWHERE = 0.5  # share of these whose parameters of the archive are drawn anew
-BETTER = 0.1  # what a larger objective in a cell that fails already counts for, beside a failure in another
-MEMORY = 300  # the surrogate is made from so many of the best configurations and so many of the latest
+# what a larger objective in a cell that fails already counts for, beside a failure in
+# another
+BETTER = 0.1
+# the surrogate is made from so many of the best configurations and so many of the
+# latest
+MEMORY = 300
 
 
 @dataclass(frozen=True, eq=False)
 class ArchiveState:
-    """Where the search stands: positions (k,) in u of what spans the archive, half of each number's range (d,), the
-    archive of ribs, which is never written to again, this generation's configurations (n, d), objectives and successes
-    of the first of them, and what the surrogate is made from; None where there are too many numbers, or a norm ball."""
+    """Where the search stands: positions (k,) in u of what spans the archive, half of
+    each number's range (d,), the archive of ribs, which is never written to again, this
+    generation's configurations (n, d), objectives and successes of the first of them,
+    and what the surrogate is made from; None where there are too many numbers, or a
+    norm ball.
+    """
 
     domain: policies.Domain
     seed: int
@@ -48,25 +65,38 @@ class ArchiveState:
     seen: policies.Observed | None = None
 
     def kept(self) -> ArchiveState:
-        """Let a copy of the archive take in what is evaluated of a generation; what could not be has no cell."""
+        """Let a copy of the archive take in what is evaluated of a generation; what
+        could not be has no cell.
+        """
         values = np.array(self.values)
         finite = np.isfinite(values)
         archive = copy.deepcopy(self.archive)
         if finite.any():
             points = self.points[: len(values)][torch.from_numpy(finite)]
             measures = points[:, self.spanned].double().numpy()
-            archive.add(points.numpy(), values[finite], measures, wrong=np.array(self.wrong)[finite])
+            archive.add(
+                points.numpy(),
+                values[finite],
+                measures,
+                wrong=np.array(self.wrong)[finite],
+            )
         return replace(self, archive=archive)
 
     def bred(self, samples: Tensor, rng: torch.Generator) -> Tensor:
-        """Return (n, d), each made of two kept ones and maybe out of bounds; options are those of the first, now and
-        then of a sample (n, d)."""
+        """Return (n, d), each made of two kept ones and maybe out of bounds; options
+        are those of the first, now and then of a sample (n, d).
+        """
         count, dim = samples.shape
         archive = copy.deepcopy(self.archive)  # it draws with a generator of its own
         drawn = archive.sample_elites((TOURNAMENT + 1) * count)
         kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, count))
-        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, count))[1:].argmax(0)
-        first, second = kept[1 + best, torch.arange(count)], kept[0]
+        best = (
+            torch.from_numpy(drawn["objective"])
+            .unflatten(0, (TOURNAMENT + 1, count))[1:]
+            .argmax(0)
+        )
+        first = kept[1 + best, torch.arange(count)]
+        second = kept[0]
         noise = torch.randn(count, dim, generator=rng)
         noise[:, self.spanned] *= WIDER
         along = LINE * torch.randn(count, 1, generator=rng)
@@ -74,17 +104,30 @@ class ArchiveState:
         anew = torch.rand(count, dim, generator=rng) < ANEW
         for block, part in self.domain.parts():
             if block.options:
-                points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
+                points[:, part] = torch.where(
+                    anew[:, part], samples[:, part], first[:, part]
+                )
         return points
 
-    def likeliest(self, surrogate: policies.Surrogate, points: Tensor, count: int) -> Tensor:
-        """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely
-        fail where nothing fails yet. Where something does, being worse than it counts for `BETTER` as much."""
+    def likeliest(
+        self, surrogate: policies.Surrogate, points: Tensor, count: int
+    ) -> Tensor:
+        """Return (count, d) of the candidates (n, d), of different cells as long as
+        there are: those that most likely fail where nothing fails yet. Where something
+        does, being worse than it counts for `BETTER` as much.
+        """
         mean, deviation = surrogate.predict(surrogate.space.take(points))
         kept = self.archive.data()
-        objective, wrong = torch.from_numpy(kept["objective"]), torch.from_numpy(kept["wrong"])
+        objective = torch.from_numpy(kept["objective"])
+        wrong = torch.from_numpy(kept["wrong"])
         enough = float(objective[wrong].min() if bool(wrong.any()) else objective.max())
-        failing = dict(zip(kept["index"][kept["wrong"]].tolist(), objective[wrong].tolist(), strict=True))
+        failing = dict(
+            zip(
+                kept["index"][kept["wrong"]].tolist(),
+                objective[wrong].tolist(),
+                strict=True,
+            )
+        )
         cells = self.archive.index_of(points[:, self.spanned].double().numpy()).tolist()
         to_beat = torch.tensor([failing.get(cell, enough) for cell in cells])
         weight = torch.tensor([BETTER if cell in failing else 1.0 for cell in cells])
@@ -99,29 +142,35 @@ class ArchiveState:
 
 @dataclass(frozen=True)
 class MapElites(Policy[ArchiveState]):
-    """MAP-Elites (Mouret and Clune 2015, "Illuminating search spaces by mapping elites") with the package ribs.
+    """MAP-Elites (Mouret and Clune 2015, "Illuminating search spaces by mapping
+    elites") with the package ribs.
 
-    The archive is a grid over a few parameters. Each cell keeps the configuration with the largest objective that fell
-    into it, whatever the parameters beyond are there. A new configuration is made of two kept ones, a the best of four
-    that are drawn, b one that is drawn, as by Vassiliades and Mouret 2018, "Discovering the elite hypervolume by
-    leveraging interspecies correlation":
+    The archive is a grid over a few parameters. Each cell keeps the configuration with
+    the largest objective that fell into it, whatever the parameters beyond are there. A
+    new configuration is made of two kept ones, a the best of four that are drawn, b one
+    that is drawn, as by Vassiliades and Mouret 2018, "Discovering the elite hypervolume
+    by leveraging interspecies correlation":
 
         P(a + 0.1 s z + 0.3 (b - a) y),
 
-    z a vector and y a number, standard normal, s half of each number's range, four times that for the parameters of
-    the archive: what makes the model fail in one cell is tried in others. A discrete choice is that of a, or, one in
-    ten, drawn anew. One in ten configurations is drawn anew, so that no part of the domain is out of reach.
+    z a vector and y a number, standard normal, s half of each number's range, four
+    times that for the parameters of the archive: what makes the model fail in one cell
+    is tried in others. A discrete choice is that of a, or, one in ten, drawn anew. One
+    in ten configurations is drawn anew, so that no part of the domain is out of reach.
 
-    In a box of few numbers (16) renders are saved as by Gaier, Asteroth and Mouret 2017 (arXiv 1702.03713): 300 are
-    made so, of half of them the parameters of the archive drawn anew, and a Gaussian process fitted to what was seen
-    chooses a generation among them: of different cells, those that most likely fail where nothing does yet.
+    In a box of few numbers (16) renders are saved as by Gaier, Asteroth and Mouret 2017
+    (arXiv 1702.03713): 300 are made so, of half of them the parameters of the archive
+    drawn anew, and a Gaussian process fitted to what was seen chooses a generation
+    among them: of different cells, those that most likely fail where nothing does yet.
 
-    The objective is noisy, so a cell may keep a configuration that was lucky; only verified ones count as failures.
+    The objective is noisy, so a cell may keep a configuration that was lucky; only
+    verified ones count as failures.
 
     Attributes:
-        over: the parameters that span the archive, at most 4, separated by commas, by name ("pose.yaw",
-            "camera.target.0"); empty for the first two.
-        cells: how many parts each number's range has in the archive, 2 to 1,000; a discrete choice has its options.
+        over: the parameters that span the archive, at most 4, separated by commas, by
+            name ("pose.yaw", "camera.target.0"); empty for the first two.
+        cells: how many parts each number's range has in the archive, 2 to 1,000; a
+            discrete choice has its options.
         population: configurations a generation, at least 2.
     """
 
@@ -135,19 +184,33 @@ class MapElites(Policy[ArchiveState]):
 
     def __post_init__(self) -> None:
         if find_spec("ribs") is None:
-            raise InputError("policy 'archive' needs ribs, which is not installed: pip install 'advsearch[archive]'")
+            raise InputError(
+                "policy 'archive' needs ribs, which is not installed: pip "
+                "install 'advsearch[archive]'"
+            )
         if not 2 <= self.cells <= 1000:
-            raise InputError(f"cells: expected 2 to 1000 parts of each range, got {self.cells}")
+            raise InputError(
+                f"cells: expected 2 to 1000 parts of each range, got {self.cells}"
+            )
         if self.population < 2:
             raise InputError(f"population: expected at least 2, got {self.population}")
 
-    def start(self, domain: policies.Domain, generator: torch.Generator, steps: int) -> ArchiveState:
+    def start(
+        self, domain: policies.Domain, generator: torch.Generator, steps: int
+    ) -> ArchiveState:
         if domain.dim > MOST:
-            raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
-        seed, spanned = policies.draw_seed(generator), self._spanned(domain)
+            raise InputError(
+                f"policy 'archive': expected at most {MOST} numbers, got "
+                f"{domain.dim}; use pgd or auto"
+            )
+        seed = policies.draw_seed(generator)
+        spanned = self._spanned(domain)
         dims = [options or self.cells for options in domain.options[spanned].tolist()]
         if math.prod(dims) > MOST_CELLS:
-            raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
+            raise InputError(
+                f"cells: expected at most {MOST_CELLS} in all, got "
+                f"{math.prod(dims)}; set `cells` lower"
+            )
         from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
@@ -156,18 +219,38 @@ class MapElites(Policy[ArchiveState]):
             solution_dtype=np.float32, objective_dtype=np.float64, measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
         )  # fmt: skip
-        first = [domain.begin[None], domain.sample(policies.seeded(seed, 0), self.population - 1)]
+        first = [
+            domain.begin[None],
+            domain.sample(policies.seeded(seed, 0), self.population - 1),
+        ]
         box = policies.box_coordinates(domain)
         few = box.count == domain.dim <= policies.MOST_OWN
-        seen = policies.Observed(box, torch.empty(0, box.count), memory=MEMORY) if few else None
+        seen = (
+            policies.Observed(box, torch.empty(0, box.count), memory=MEMORY)
+            if few
+            else None
+        )
         return ArchiveState(
-            domain, seed, spanned, policies.half_widths(domain), archive, 0, torch.cat(first), seen=seen
+            domain,
+            seed,
+            spanned,
+            policies.half_widths(domain),
+            archive,
+            0,
+            torch.cat(first),
+            seen=seen,
         )
 
-    def propose(self, state: ArchiveState, n: int) -> tuple[tuple[policies.Proposal, ...], ArchiveState]:
-        return tuple(policies.Proposal(u) for u in state.points[len(state.values) :][:n]), state
+    def propose(
+        self, state: ArchiveState, n: int
+    ) -> tuple[tuple[policies.Proposal, ...], ArchiveState]:
+        return tuple(
+            policies.Proposal(u) for u in state.points[len(state.values) :][:n]
+        ), state
 
-    def update(self, state: ArchiveState, evaluated: policies.Evaluated) -> ArchiveState:
+    def update(
+        self, state: ArchiveState, evaluated: policies.Evaluated
+    ) -> ArchiveState:
         values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
         wrong = (*state.wrong, *(evaluation.success for _, evaluation in evaluated))
         seen = None if state.seen is None else state.seen.extended(evaluated)
@@ -175,19 +258,31 @@ class MapElites(Policy[ArchiveState]):
         return state if len(values) < len(state.points) else self._next(state.kept())
 
     def failures(self, state: ArchiveState) -> policies.Failures:
-        """Return the cells whose configuration is a success; those of a generation that is not whole yet count."""
-        archive, over = state.kept().archive, tuple(state.spanned.tolist())
+        """Return the cells whose configuration is a success; those of a generation that
+        is not whole yet count.
+        """
+        archive = state.kept().archive
+        over = tuple(state.spanned.tolist())
         kept = archive.data()
         wrong = np.flatnonzero(kept["wrong"])
-        at, objectives = archive.int_to_grid_index(kept["index"][wrong]), kept["objective"][wrong].tolist()
-        around, discrete = policies.wraps(state.domain)[state.spanned], state.domain.options[state.spanned] > 0
+        at = archive.int_to_grid_index(kept["index"][wrong])
+        objectives = kept["objective"][wrong].tolist()
+        around = policies.wraps(state.domain)[state.spanned]
+        discrete = state.domain.options[state.spanned] > 0
         listed = []
-        for number in policies.most_different(torch.from_numpy(at / archive.dims), objectives, around, discrete):
+        for number in policies.most_different(
+            torch.from_numpy(at / archive.dims), objectives, around, discrete
+        ):
             ends = zip(over, archive.boundaries, at[number], strict=True)
-            ranges = {place: (float(edges[k]), float(edges[k + 1])) for place, edges, k in ends}
+            ranges = {
+                place: (float(edges[k]), float(edges[k + 1]))
+                for place, edges, k in ends
+            }
             u = torch.from_numpy(kept["solution"][wrong[number]].copy())
             listed.append(policies.FoundFailure(u, objectives[number], ranges))
-        return policies.Failures(tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells))
+        return policies.Failures(
+            tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells)
+        )
 
     def _next(self, state: ArchiveState) -> ArchiveState:
         """Draw a generation; the archive belongs to nobody else yet."""
@@ -196,14 +291,20 @@ class MapElites(Policy[ArchiveState]):
         if state.archive.empty:
             return replace(state, points=state.domain.sample(rng, self.population))
         anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
-        samples, seen = state.domain.sample(rng, self.population), state.seen
+        samples = state.domain.sample(rng, self.population)
+        seen = state.seen
         if seen is None:
-            children = [state.domain.project(u) for u in state.bred(samples[anew:], rng)]
+            children = [
+                state.domain.project(u) for u in state.bred(samples[anew:], rng)
+            ]
             return replace(state, points=torch.stack([*samples[:anew], *children]))
         with policies.one_thread():
             surrogate, seen = seen.surrogate()
-            box, moved = seen.space, int(ELSEWHERE * CANDIDATES)
-            drawn = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
+            box = seen.space
+            moved = int(ELSEWHERE * CANDIDATES)
+            drawn = box.low + box.width * torch.rand(
+                CANDIDATES, box.count, generator=rng
+            )
             bred = state.bred(drawn, rng)
             bred[:moved, state.spanned] = drawn[:moved, state.spanned]  # to any cell
             candidates = box.put(bred, box.tidy((bred - box.low) / box.width))
@@ -211,14 +312,21 @@ class MapElites(Policy[ArchiveState]):
         return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
 
     def _spanned(self, domain: policies.Domain) -> Tensor:
-        """Return (k,) positions of the parameters of these names; of the first two without names."""
+        """Return (k,) positions of the parameters of these names; of the first two
+        without names.
+        """
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
             return torch.arange(min(2, domain.dim))
         places = {name: place for place, name in enumerate(domain.names)}
         for name in names:
             if name not in places:
-                raise errors.UnknownNameError("parameter in `over` of policy 'archive':", name, places)
+                raise errors.UnknownNameError(
+                    "parameter in `over` of policy 'archive':", name, places
+                )
         if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
-            raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
+            raise InputError(
+                f"over: expected 1 to {MOST_SPANNED} different "
+                f"parameters, got {', '.join(names)}"
+            )
         return torch.tensor([places[name] for name in names])

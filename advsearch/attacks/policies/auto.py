@@ -1,5 +1,7 @@
-"""The policy to use first (it looks everywhere, then where a model of what it has seen promises most, then uphill), and
-what wraps others: several policies on one budget, or several starts of one."""
+"""The policy to use first (it looks everywhere, then where a model of what it has seen
+promises most, then uphill), and what wraps others: several policies on one budget, or
+several starts of one.
+"""
 
 from __future__ import annotations
 
@@ -28,33 +30,50 @@ from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
 from advsearch.errors import InputError
 
-SCREEN, SCREEN_MIXED = 0.5, 0.25  # share of the renders that the screen takes, in a box alone and beside a norm ball
-UNTIL, UNTIL_MIXED = 0.75, 0.5  # share of the renders after which an ascent takes over, if there is one
+# share of the renders that the screen takes, in a box alone and beside a norm ball
+SCREEN = 0.5
+SCREEN_MIXED = 0.25
+UNTIL = 0.75  # share of the renders after which an ascent takes over, if there is one
+UNTIL_MIXED = 0.5
 LOW = 10
-"""Up to so many box coordinates are worth the whole screen. Of more it sees less and less, so if gradients cost nothing
-its share shrinks in proportion and the ascent follows at once."""
+"""Up to so many box coordinates are worth the whole screen. Of more it sees less and
+less, so if gradients cost nothing its share shrinks in proportion and the ascent
+follows at once.
+"""
 
 PAYS = 4
-"""Beside no norm ball, a gradient is worth its renders if it brings so many numbers for each, and so many gradients fit
-into the ascent. One by differences never is: half a number for each, and the surrogate was better on average."""
+"""Beside no norm ball, a gradient is worth its renders if it brings so many numbers for
+each, and so many gradients fit into the ascent. One by differences never is: half a
+number for each, and the surrogate was better on average.
+"""
 
-REACH = 0.1  # the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else
-MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.95
-"""Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with
-noise PGD's own is better."""
+# the ascent's whole step in a box, as a share of half the diagonal: the screen has been
+# everywhere else
+REACH = 0.1
+MOMENTUM = 0.75
+MOMENTUM_DRAWN = 0.95
+"""Weight of past gradients where none has noise and all point the same way, and where
+each sees other conditions; with noise PGD's own is better.
+"""
 
 CURIOSITY = 2.0
-"""How many standard deviations of the surrogate a candidate gets on top of its mean. One does as well without noise;
-with a noise as large as all differences it settles too soon on a lucky point."""
+"""How many standard deviations of the surrogate a candidate gets on top of its mean.
+One does as well without noise; with a noise as large as all differences it settles too
+soon on a lucky point.
+"""
 
-NEAR, FAR, CENTRES = 256, 128, 4  # candidates near the best points, candidates anywhere, and the number of best points
+# candidates near the best points, candidates anywhere, and the number of best points
+NEAR = 256
+FAR = 128
+CENTRES = 4
 NEVER = 1 << 30  # renders of a gradient that no search can pay
 
 
 @dataclass(frozen=True)
 class Spending:
-    """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
-    `steps`."""
+    """What the renders are for: the screen; the ascent, which asks for `gradient`,
+    begins after `until`, or never at `steps`.
+    """
 
     steps: int
     screen: int
@@ -66,8 +85,14 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Spending:
     if box.count == 0:
         return Spending(steps, 0, 0, True)
     if box.count < domain.dim:
-        screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
-        return Spending(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
+        screen = math.ceil(SCREEN_MIXED * steps)
+        until = math.ceil(UNTIL_MIXED * steps)
+        return Spending(
+            steps,
+            screen,
+            until,
+            "free" if domain.gradient_cost and domain.partial_gradients else True,
+        )
     ways = int((box.options == 0).sum())
     screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
     until = math.ceil(UNTIL * steps) if ways <= LOW else screen
@@ -85,9 +110,12 @@ def _pgd(domain: Domain) -> PGD:
 
 @dataclass(frozen=True, eq=False)
 class AutoState:
-    """Where the search stands: where the screened box coordinates have been, with norm balls at their start, where the
-    screen (m, k) looks next, the renders spent, and, once it has begun, the ascent of PGD, its latest objective and
-    where the box coordinates stood before the latest proposal moved them at random, if it did (`trial`)."""
+    """Where the search stands: where the screened box coordinates have been, with norm
+    balls at their start, where the screen (m, k) looks next, the renders spent, and,
+    once it has begun, the ascent of PGD, its latest objective and where the box
+    coordinates stood before the latest proposal moved them at random, if it did
+    (`trial`).
+    """
 
     domain: Domain
     seen: Observed
@@ -105,7 +133,9 @@ class AutoState:
         return self.seen.space
 
     def at(self, x: Tensor) -> Tensor:
-        """Return the configuration (d,) whose box coordinates are x and whose norm balls are at their start."""
+        """Return the configuration (d,) whose box coordinates are x and whose norm
+        balls are at their start.
+        """
         return self.domain.project(self.box.put(self.domain.begin, x))
 
 
@@ -113,35 +143,53 @@ class AutoState:
 class Auto(Policy[AutoState]):
     """What to use first; it has no options.
 
-    - Norm balls alone (a texture): `PGD`, bit for bit; with more momentum where evaluations have no noise.
-    - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled Sobol points take half of the
-      renders. Then a Gaussian process is fitted to all that was seen, and the next point is the candidate with the
-      largest mean plus `CURIOSITY` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the best points,
-      points anywhere, and the best point itself. The process models the noise, so a lucky value does not pass for a
-      peak, and rendering the best point again is one of its choices. Where gradients cost no renders (adjoints), `PGD`
-      with small steps takes the last quarter; with more than `LOW` coordinates it begins right after a shorter screen.
-    - Both: screen and surrogate over the box coordinates, with the balls at their start, take half of the renders and
-      `PGD` over everything the rest. If the box coordinates' gradient costs renders and can be left out
-      (`Domain.partial_gradients`), PGD follows what is free, and every second evaluation tries a random move of the
-      box coordinates, which is taken back if the objective falls.
+    - Norm balls alone (a texture): `PGD`, bit for bit; with more momentum where
+    evaluations have no noise.
+    - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled
+      Sobol points take half of the renders. Then a Gaussian process is fitted to all
+      that was seen, and the next point is the candidate with the largest mean plus
+      `CURIOSITY` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the
+      best points, points anywhere, and the best point itself. The process models the
+      noise, so a lucky value does not pass for a peak, and rendering the best point
+      again is one of its choices. Where gradients cost no renders (adjoints), `PGD`
+      with small steps takes the last quarter; with more than `LOW` coordinates it
+      begins right after a shorter screen.
+    - Both: screen and surrogate over the box coordinates, with the balls at their
+      start, take half of the renders and `PGD` over everything the rest. If the box
+      coordinates' gradient costs renders and can be left out
+      (`Domain.partial_gradients`), PGD follows what is free, and every second
+      evaluation tries a random move of the box coordinates, which is taken back if the
+      objective falls.
     """
 
     name: ClassVar[str] = "auto"
     uses_gradient: ClassVar[bool] = True
     handles_choices: ClassVar[bool] = True
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> AutoState:
         box = box_coordinates(domain)
-        nothing, plan = torch.empty(0, box.count), make_plan(domain, box, steps)
+        nothing = torch.empty(0, box.count)
+        plan = make_plan(domain, box, steps)
         seen = Observed(box, nothing)
         if box.count == 0:
-            return AutoState(domain, seen, plan, 0, nothing, ascent=_pgd(domain).start(domain, generator, steps))
+            return AutoState(
+                domain,
+                seen,
+                plan,
+                0,
+                nothing,
+                ascent=_pgd(domain).start(domain, generator, steps),
+            )
         seed = draw_seed(generator)
         with one_thread():
             screen = box.screen(seed, max(0, plan.screen - 1))
         return AutoState(domain, seen, plan, seed, screen)
 
-    def propose(self, state: AutoState, n: int) -> tuple[tuple[Proposal, ...], AutoState]:
+    def propose(
+        self, state: AutoState, n: int
+    ) -> tuple[tuple[Proposal, ...], AutoState]:
         state = replace(state, climbing=False, trial=None)
         if state.ascent is None and state.spent >= state.plan.until:
             with one_thread():
@@ -150,12 +198,17 @@ class Auto(Policy[AutoState]):
             steps, ascent = _pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
-                proposal, state = replace(proposal, gradient=state.plan.gradient), replace(state, climbing=True)
+                proposal = replace(proposal, gradient=state.plan.gradient)
+                state = replace(state, climbing=True)
                 if proposal.gradient is True or ascent.count % 2 == 0:
                     return (proposal,), state
-                # only the balls have a gradient, so every second one moves in the box too
-                box, x = state.box, state.box.take(proposal.u)
-                moved = box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
+                # only the balls have a gradient, so every second one moves in the box
+                # too
+                box = state.box
+                x = state.box.take(proposal.u)
+                moved = box.moves(
+                    x[None], seeded(state.seed, state.plan.steps + ascent.count)
+                )[0]
                 u = state.domain.project(box.put(proposal.u, moved))
                 return (replace(proposal, u=u),), replace(state, trial=x)
             if state.box.count < state.domain.dim:
@@ -170,7 +223,10 @@ class Auto(Policy[AutoState]):
         return tuple(map(Proposal, us)), state
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
-        state = replace(state, spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated))
+        state = replace(
+            state,
+            spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated),
+        )
         if state.climbing and state.ascent is not None:
             ((_, evaluation),) = evaluated
             ascent = _pgd(state.domain).update(state.ascent, evaluated)
@@ -188,39 +244,58 @@ class Auto(Policy[AutoState]):
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
     def _next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
-        box, generator = state.box, seeded(state.seed, len(state.seen.values))
+        box = state.box
+        generator = seeded(state.seed, len(state.seen.values))
         if not state.seen.finite:
             return box.tidy(torch.rand(box.count, generator=generator)), state
         surrogate, seen = state.seen.surrogate()
-        best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
-        centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
+        best = surrogate.x[
+            surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)
+        ]
+        centres = torch.randint(
+            0, min(CENTRES, len(best)), (NEAR,), generator=generator
+        )
         centres[: NEAR // 2] = 0
         near = box.moves(best[centres], generator)
         far = box.tidy(torch.rand(FAR, box.count, generator=generator))
         candidates = torch.cat([best[:1], near, far])
         mean, deviation = surrogate.predict(candidates)
-        return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(state, seen=seen)
+        return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(
+            state, seen=seen
+        )
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
-        """Let PGD go on from the best of the points seen so far, with small steps in the box."""
-        x, blocks = state.box.take(state.domain.begin), state.domain.blocks
+        """Let PGD go on from the best of the points seen so far, with small steps in
+        the box.
+        """
+        x = state.box.take(state.domain.begin)
+        blocks = state.domain.blocks
         if state.seen.finite:
             surrogate, seen = state.seen.surrogate()
             state = replace(state, seen=seen)
             x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
-        shortened = (replace(block, reach=REACH * block.radius if block.norm == "box" else None) for block in blocks)
+        shortened = (
+            replace(block, reach=REACH * block.radius if block.norm == "box" else None)
+            for block in blocks
+        )
         domain = replace(state.domain, blocks=tuple(shortened))
-        ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
+        ascent = _pgd(domain).start(
+            domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent)
+        )
         return replace(state, ascent=replace(ascent, u=state.at(x)))
 
 
 @dataclass(frozen=True)
 class WithoutAscent(Auto):
-    """Screen and surrogate of `Auto` alone, over box coordinates, for a model that has no gradient."""
+    """Screen and surrogate of `Auto` alone, over box coordinates, for a model that has
+    no gradient.
+    """
 
     uses_gradient: ClassVar[bool] = False
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> AutoState:
         return super().start(replace(domain, gradient_cost=NEVER), generator, steps)
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
@@ -229,15 +304,18 @@ class WithoutAscent(Auto):
 
 @dataclass(frozen=True)
 class Restarts(Raced[Race]):
-    """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
+    """Lets a policy search `times` times, each with an equal share of the renders; they
+    take turns, step by step.
 
-    The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
-    norm balls stay where they are. One that has nothing more to propose leaves its renders to the rest. For an
-    objective with several peaks, where a gradient finds the nearest. Discrete choices are fixed outside (`Choices`), so
-    every combination of options has its own restarts.
+    The first begins where the policy would begin by itself, the others at samples of
+    the domain (`Domain.sample`); the norm balls stay where they are. One that has
+    nothing more to propose leaves its renders to the rest. For an objective with
+    several peaks, where a gradient finds the nearest. Discrete choices are fixed
+    outside (`Choices`), so every combination of options has its own restarts.
 
     Attributes:
-        policy: what searches; in `make_policy` a name, or a mapping with a name and options.
+        policy: what searches; in `make_policy` a name, or a mapping with a name and
+            options.
         times: at least 1; fewer if the renders do not suffice for one evaluation each.
     """
 
@@ -248,7 +326,10 @@ class Restarts(Raced[Race]):
 
     def __post_init__(self) -> None:
         if not isinstance(self.policy, Policy):
-            raise InputError(f"policy of restarts: expected a policy, got {self.policy!r}; use make_policy for names")
+            raise InputError(
+                "policy of restarts: expected a policy, got "
+                f"{self.policy!r}; use make_policy for names"
+            )
         if self.times < 1:
             raise InputError(f"times: expected at least 1, got {self.times}")
 
@@ -260,23 +341,34 @@ class Restarts(Raced[Race]):
         seed = draw_seed(generator)
         each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
         count = max(1, min(self.times, steps // each))
-        begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
-        return line_up([(self.policy, replace(domain, first=begin)) for begin in begins], steps, seed, rounds=1)
+        begins = (
+            domain.begin,
+            *(domain.sample(seeded(seed, number))[0] for number in range(1, count)),
+        )
+        return line_up(
+            [(self.policy, replace(domain, first=begin)) for begin in begins],
+            steps,
+            seed,
+            rounds=1,
+        )
 
 
 @dataclass(frozen=True)
 class Portfolio(Raced[Race]):
-    """Lets several policies search side by side and goes on with those that reached more.
+    """Lets several policies search side by side and goes on with those that reached
+    more.
 
-    With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
-    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So of
-    two policies each has a quarter of the renders, and the better one the other half.
+    With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see
+    `choices`. Within a round every policy that is still in has an equal share; after it
+    the better half goes on, by the largest objective so far. So of two policies each
+    has a quarter of the renders, and the better one the other half.
 
-    A policy that cannot search the domain (it says so with an InputError: a grid over a texture) is left out; if none
-    can, the first one's error is passed on.
+    A policy that cannot search the domain (it says so with an InputError: a grid over a
+    texture) is left out; if none can, the first one's error is passed on.
 
     Attributes:
-        policies: at least one; in `make_policy` a list of names, or of mappings with a name and options.
+        policies: at least one; in `make_policy` a list of names, or of mappings with a
+            name and options.
     """
 
     policies: tuple[Policy[Any], ...] = (Auto(), CMAES())
@@ -286,8 +378,13 @@ class Portfolio(Raced[Race]):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "policies", tuple(self.policies))
-        if not self.policies or not all(isinstance(policy, Policy) for policy in self.policies):
-            raise InputError(f"policies of portfolio: expected one policy or more, got {self.policies!r}")
+        if not self.policies or not all(
+            isinstance(policy, Policy) for policy in self.policies
+        ):
+            raise InputError(
+                "policies of portfolio: expected one policy or more, got "
+                f"{self.policies!r}"
+            )
 
     @property
     def uses_gradient(self) -> bool:
@@ -298,11 +395,14 @@ class Portfolio(Raced[Race]):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         seed = draw_seed(generator)
-        searches, errors = [], []
+        searches = []
+        errors = []
         for policy in self.policies:
             whole = with_choices(policy, domain)
             try:
-                whole.start(domain, seeded(seed, 0), max(1, steps // len(self.policies)))
+                whole.start(
+                    domain, seeded(seed, 0), max(1, steps // len(self.policies))
+                )
             except InputError as error:
                 errors.append(error)
             else:

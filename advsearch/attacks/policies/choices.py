@@ -1,7 +1,10 @@
-"""Discrete choices around a policy that knows only numbers: options outside, the continuous search inside. Searches
-race by successive halving (Karnin, Koren and Somekh 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson
-and Talwalkar 2016): 1 + ceil(log2 n) rounds with equal shares of the renders, and within a round equal shares for all
-that are still in, who take turns, whoever has most left first. A share counts what a proposal may cost."""
+"""Discrete choices around a policy that knows only numbers: options outside, the
+continuous search inside. Searches race by successive halving (Karnin, Koren and Somekh
+2013, "Almost optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016):
+1 + ceil(log2 n) rounds with equal shares of the renders, and within a round equal
+shares for all that are still in, who take turns, whoever has most left first. A share
+counts what a proposal may cost.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,24 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.evaluation import (
+    NO_COUNTS,
+    Counts,
+    Evaluated,
+    Policy,
+    Proposal,
+    draw_seed,
+    seeded,
+)
 from advsearch.attacks.policies.sampling import Random
 
 
 @dataclass(frozen=True, eq=False)
 class Runner:
-    """One search in a race: a policy and its state, renders left of its share of this round, the largest objective it
-    has met, and whether it has nothing more to propose (`over`)."""
+    """One search in a race: a policy and its state, renders left of its share of this
+    round, the largest objective it has met, and whether it has nothing more to propose
+    (`over`).
+    """
 
     policy: Policy[Any]
     domain: Domain
@@ -38,8 +51,10 @@ Racing = TypeVar("Racing", bound="Race")
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """Where a race of so many steps and rounds stands: the numbers of those that are in this round, the best first
-    (`field`), renders that the evaluations so far took, and the searches whose proposals wait for theirs (`asked`)."""
+    """Where a race of so many steps and rounds stands: the numbers of those that are in
+    this round, the best first (`field`), renders that the evaluations so far took, and
+    the searches whose proposals wait for theirs (`asked`).
+    """
 
     runners: tuple[Runner, ...]
     steps: int
@@ -51,44 +66,69 @@ class Race:
 
     @property
     def leader(self) -> int:
-        """The number of the search that has met the largest objective so far, the first of equals."""
+        """The number of the search that has met the largest objective so far, the first
+        of equals.
+        """
         return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
 
     def begun(self: Racing, field: Iterable[int], number: int) -> Racing:
-        """Return the race at the beginning of a round, with equal shares for those that are in it."""
+        """Return the race at the beginning of a round, with equal shares for those that
+        are in it.
+        """
         field = tuple(field)
-        share = max(1, (self.steps - self.spent) // (self.rounds - number) // len(field))
-        runners = [replace(runner, left=share if k in field else 0) for k, runner in enumerate(self.runners)]
+        share = max(
+            1, (self.steps - self.spent) // (self.rounds - number) // len(field)
+        )
+        runners = [
+            replace(runner, left=share if k in field else 0)
+            for k, runner in enumerate(self.runners)
+        ]
         return replace(self, runners=tuple(runners), field=field, round=number)
 
     def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return up to n proposals of this round that do not wait for each other; none where it is done."""
-        runners, waiting = list(self.runners), [k for k in self.field if self.runners[k].left]
+        """Return up to n proposals of this round that do not wait for each other; none
+        where it is done.
+        """
+        runners = list(self.runners)
+        waiting = [k for k in self.field if self.runners[k].left]
         each = -(-n // max(1, len(waiting)))
-        proposals, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
-        batch, asked = list[Proposal](), list[int]()
+        proposals = dict[int, tuple[Proposal, ...]]()
+        taken = Counter[int]()
+        batch = list[Proposal]()
+        asked = list[int]()
         while waiting and len(batch) < n:
             k = max(waiting, key=lambda k: runners[k].left)  # the first of equals
             runner = runners[k]
             if k not in proposals:
-                proposals[k], state = runner.policy.propose(runner.state, min(each, runner.left))
+                proposals[k], state = runner.policy.propose(
+                    runner.state, min(each, runner.left)
+                )
                 runner = replace(runner, state=state)
             if not proposals[k]:
-                # take out a search that has nothing more to propose; its share is for those left in the round
+                # take out a search that has nothing more to propose; its share is for
+                # those left in the round
                 runners[k] = replace(runners[k], left=0, over=True)
                 others = [other for other in self.field if not runners[other].over]
                 for other in others:
-                    runners[other] = replace(runners[other], left=runners[other].left + runner.left // len(others))
-            elif taken[k] == len(proposals[k]):  # what it proposes next, these evaluations say
+                    runners[other] = replace(
+                        runners[other],
+                        left=runners[other].left + runner.left // len(others),
+                    )
+            elif taken[k] == len(
+                proposals[k]
+            ):  # what it proposes next, these evaluations say
                 break
             else:
                 wanted = proposals[k][taken[k]]
                 capped = replace(wanted, samples=min(runner.left, wanted.samples))
-                later = self.round + 1 < self.rounds  # there will be renders to use a gradient
+                # there will be renders to use a gradient
+                later = self.round + 1 < self.rounds
                 batch.append(capped.affordable(runner.domain, runner.left + later))
                 asked.append(k)
                 taken[k] += 1
-                runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
+                runners[k] = replace(
+                    runner, left=runner.left - batch[-1].cost(runner.domain)
+                )
             waiting = [k for k in self.field if runners[k].left]
         for k, count in taken.items():
             if count < len(proposals[k]):  # it shall not count on more than was taken
@@ -103,7 +143,9 @@ def count_rounds(runners: int) -> int:
 
 
 def most_runners(steps: int, each: int, limit: int) -> int:
-    """Return how many searches, at least 1 and at most `limit`, can have `each` renders in every round."""
+    """Return how many searches, at least 1 and at most `limit`, can have `each` renders
+    in every round.
+    """
     count = 1
     while count < limit and (count + 1) * count_rounds(count + 1) * each <= steps:
         count += 1
@@ -111,17 +153,29 @@ def most_runners(steps: int, each: int, limit: int) -> int:
 
 
 def line_up(
-    searches: Sequence[tuple[Policy[Any], Domain]], steps: int, seed: int, *, rounds: int | None = None
+    searches: Sequence[tuple[Policy[Any], Domain]],
+    steps: int,
+    seed: int,
+    *,
+    rounds: int | None = None,
 ) -> Race:
-    """Return a race before its first proposal, of `count_rounds` rounds where no other number is given; each search
-    plans for the renders that it gets if it stays in to the end."""
-    steps, rounds = max(1, steps), rounds or count_rounds(len(searches))
-    planned, count = 0.0, len(searches)
+    """Return a race before its first proposal, of `count_rounds` rounds where no other
+    number is given; each search plans for the renders that it gets if it stays in to
+    the end.
+    """
+    steps = max(1, steps)
+    rounds = rounds or count_rounds(len(searches))
+    planned = 0.0
+    count = len(searches)
     for _ in range(rounds):
         planned += steps / rounds / count
         count = -(-count // 2)
     runners = tuple(
-        Runner(policy, domain, policy.start(domain, seeded(seed, number), max(1, int(planned))))
+        Runner(
+            policy,
+            domain,
+            policy.start(domain, seeded(seed, number), max(1, int(planned))),
+        )
         for number, (policy, domain) in enumerate(searches)
     )
     return Race(runners, steps, rounds).begun(range(len(runners)), 0)
@@ -131,7 +185,9 @@ class Raced(Policy[Racing]):
     """A policy that is a race; its `start` lines it up."""
 
     def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return the next proposals of this round, up to n; of the next round where this one is done."""
+        """Return the next proposals of this round, up to n; of the next round where
+        this one is done.
+        """
         while True:
             batch, state = state.asking(n)
             runners = state.runners
@@ -139,19 +195,23 @@ class Raced(Policy[Racing]):
                 return batch, state
             ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
             able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
-            if state.round + 1 >= state.rounds or not able:  # nobody left who can go on: the rest is for whoever can
+            # nobody left who can go on: the rest is for whoever can
+            if state.round + 1 >= state.rounds or not able:
                 left = (k for k, runner in enumerate(runners) if not runner.over)
                 able = sorted(left, key=lambda k: -runners[k].best)[:1]
             state = state.begun(able, min(state.round + 1, state.rounds - 1))
 
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
-        """Tell each search what came of its proposals, or of the first of them; both as its own domain has them."""
+        """Tell each search what came of its proposals, or of the first of them; both as
+        its own domain has them.
+        """
         by_runner = defaultdict[int, list[Any]](list)
         for number, (u, evaluation) in zip(state.asked, evaluated, strict=False):
             by_runner[number].append((u, evaluation))
         runners = list(state.runners)
         for number, own in by_runner.items():
-            runner, best = runners[number], max(evaluation.objective for _, evaluation in own)
+            runner = runners[number]
+            best = max(evaluation.objective for _, evaluation in own)
             told = runner.policy.update(runner.state, own)
             runners[number] = replace(runner, state=told, best=max(runner.best, best))
         spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
@@ -162,22 +222,31 @@ class Raced(Policy[Racing]):
         return runner.policy.distribution(runner.state)
 
     def failures(self, state: Racing) -> Failures | None:
-        """Return the different failures of the search that has met the most; None where none looks for such."""
+        """Return the different failures of the search that has met the most; None where
+        none looks for such.
+        """
         known = [runner.policy.failures(runner.state) for runner in state.runners]
-        return max(filter(None, known), key=lambda failures: failures.found, default=None)
+        return max(
+            filter(None, known), key=lambda failures: failures.found, default=None
+        )
 
     def counts(self, state: Racing) -> Counts:
-        return sum((runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS)
+        return sum(
+            (runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS
+        )
 
 
 MOST = 256  # no more combinations than this take part
-MOST_NUMBERS = 2**24  # nor more, but two, that have so many numbers together: each search keeps some such vectors
+# nor more, but two, that have so many numbers together: each search keeps some such
+# vectors
+MOST_NUMBERS = 2**24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChoicesState(Race):
-    """Where the search stands: a race over the numbers alone, positions in u of numbers (k,) and choices (c,), and the
-    choices' elements (n, c) of each search in it."""
+    """Where the search stands: a race over the numbers alone, positions in u of numbers
+    (k,) and choices (c,), and the choices' elements (n, c) of each search in it.
+    """
 
     domain: Domain
     numbers: Tensor
@@ -193,11 +262,14 @@ class ChoicesState(Race):
 
 @dataclass(frozen=True)
 class Choices(Raced[ChoicesState]):
-    """Searches combinations of options outside and, with another policy, the numbers inside.
+    """Searches combinations of options outside and, with another policy, the numbers
+    inside.
 
-    Every combination of options has a search of its own over the numbers, and the combinations race. If there are more
-    combinations than can have a whole evaluation in every round, a random choice of them takes part, the start's among
-    them always. `search` puts this around every policy whose `handles_choices` is false, a user's own included.
+    Every combination of options has a search of its own over the numbers, and the
+    combinations race. If there are more combinations than can have a whole evaluation
+    in every round, a random choice of them takes part, the start's among them always.
+    `search` puts this around every policy whose `handles_choices` is false, a user's
+    own included.
     """
 
     policy: Policy[Any]
@@ -212,32 +284,56 @@ class Choices(Raced[ChoicesState]):
     def takes_differences(self, domain: Domain, steps: int) -> bool:
         return self.policy.takes_differences(domain, steps)
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ChoicesState:
-        seed, options = draw_seed(generator), domain.options
-        numbers, choices = (options == 0).nonzero().flatten(), options.nonzero().flatten()
-        policy: Policy[Any] = Random()  # of one number that is dropped, where nothing but choices may vary
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> ChoicesState:
+        seed = draw_seed(generator)
+        options = domain.options
+        numbers = (options == 0).nonzero().flatten()
+        choices = options.nonzero().flatten()
+        # of one number that is dropped, where nothing but choices may vary
+        policy: Policy[Any] = Random()
         inner = Domain(torch.zeros(1), (Block(1),))
         if len(numbers):
             first = None if domain.first is None else domain.first[numbers]
             blocks = tuple(block for block in domain.blocks if not block.options)
-            policy, inner = self.policy, replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+            policy = self.policy
+            inner = replace(
+                domain, start=domain.start[numbers], blocks=blocks, first=first
+            )
         counts = options[choices].tolist()
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
         most = most_runners(steps, each, limit)
-        combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
+        combinations = _combinations(
+            counts, domain.begin[choices], most, seeded(seed, 0)
+        )
         race = line_up([(policy, inner)] * len(combinations), steps, seed)
-        return ChoicesState(**vars(race), domain=domain, numbers=numbers, choices=choices, combinations=combinations)
+        return ChoicesState(
+            **vars(race),
+            domain=domain,
+            numbers=numbers,
+            choices=choices,
+            combinations=combinations,
+        )
 
-    def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
+    def propose(
+        self, state: ChoicesState, n: int
+    ) -> tuple[tuple[Proposal, ...], ChoicesState]:
         proposals, state = super().propose(state, n)
         asked = zip(proposals, state.asked, strict=True)
-        return tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked), state
+        return tuple(
+            replace(proposal, u=state.whole(proposal.u, number))
+            for proposal, number in asked
+        ), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        inner, numbers = [], state.numbers
+        inner = []
+        numbers = state.numbers
         for u, evaluation in evaluated:
-            gradient = None if evaluation.gradient is None else evaluation.gradient[numbers]
+            gradient = (
+                None if evaluation.gradient is None else evaluation.gradient[numbers]
+            )
             inner.append((u[numbers], replace(evaluation, gradient=gradient)))
         return super().update(state, inner)
 
@@ -254,24 +350,38 @@ class Choices(Raced[ChoicesState]):
 
 
 def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
-    """Return the policy, inside `Choices` if the domain has discrete choices that it does not handle itself."""
+    """Return the policy, inside `Choices` if the domain has discrete choices that it
+    does not handle itself.
+    """
     discrete = any(block.options for block in domain.blocks)
     return Choices(policy) if discrete and not policy.handles_choices else policy
 
 
-def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    """Return (n, c) elements of u, that of the start first: all combinations in a random order, or `most` of them."""
-    sizes, total = torch.tensor(counts), math.prod(counts)
+def _combinations(
+    counts: list[int], begin: Tensor, most: int, generator: torch.Generator
+) -> Tensor:
+    """Return (n, c) elements of u, that of the start first: all combinations in a
+    random order, or `most` of them.
+    """
+    sizes = torch.tensor(counts)
+    total = math.prod(counts)
     start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):
-        every = torch.cartesian_prod(*(torch.arange(count) for count in counts)).reshape(total, len(counts))
+        every = torch.cartesian_prod(
+            *(torch.arange(count) for count in counts)
+        ).reshape(total, len(counts))
         every = every[torch.randperm(total, generator=generator)]
         picked = every[~(every == start).all(dim=1)][: most - 1]
     else:
         first = tuple(start.tolist())
         seen = {first}
         while len(seen) < most:
-            seen.add(tuple(int(torch.randint(count, (1,), generator=generator)) for count in counts))
+            seen.add(
+                tuple(
+                    int(torch.randint(count, (1,), generator=generator))
+                    for count in counts
+                )
+            )
         picked = torch.tensor(sorted(seen - {first})).reshape(-1, len(counts))
     middles = centre_of_option((picked + 0.5) / sizes, sizes)
     return torch.cat([begin[None], middles.to(begin.dtype)])

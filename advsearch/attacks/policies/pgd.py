@@ -1,6 +1,8 @@
-"""Ascents along gradients: projected gradient ascent with momentum, and Adam with projection. A gradient through a
-renderer has at times no useful variance, so outliers are cut to what is usual (Zhang et al. 2020, Why are adaptive
-methods good for attention models?), at the price of a bias."""
+"""Ascents along gradients: projected gradient ascent with momentum, and Adam with
+projection. A gradient through a renderer has at times no useful variance, so outliers
+are cut to what is usual (Zhang et al. 2020, Why are adaptive methods good for attention
+models?), at the price of a bias.
+"""
 
 from __future__ import annotations
 
@@ -13,54 +15,94 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain, half_widths
-from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.evaluation import (
+    NO_COUNTS,
+    Counts,
+    Evaluated,
+    Policy,
+    Proposal,
+    draw_seed,
+    seeded,
+)
 from advsearch.errors import InputError
 
 CLIP = 3.0  # what exceeds the median so many times is out of the usual
 MEMORY = 15  # latest gradients whose lengths say what is usual
-CLIP_L2 = 10.0  # the same of numbers in an l2 block, whose true gradient may be uneven: its direction is at stake
+# the same of numbers in an l2 block, whose true gradient may be uneven: its direction
+# is at stake
+CLIP_L2 = 10.0
 FEWEST_NUMBERS = 8  # fewer numbers than this have no median to speak of
 
 
-def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...], Counts]:
-    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones, and what was an outlier.
+def clipped(
+    domain: Domain, gradient: Tensor, lengths: tuple[float, ...]
+) -> tuple[Tensor, tuple[float, ...], Counts]:
+    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones,
+    and what was an outlier.
 
-    - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those that are not zero: `CLIP` in an
-      l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
-      step; `CLIP_L2` in an l2 ball.
-    - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is shortened to that.
+    - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those
+      that are not zero: `CLIP` in an l-infinity ball, where the step follows the signs,
+      so that this changes how gradients are averaged and no single step; `CLIP_L2` in
+      an l2 ball.
+    - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is
+    shortened to that.
     - In a domain that is `exact` or `drawn` nothing is an outlier.
     """
     if domain.exact or domain.drawn:
         return gradient, lengths, NO_COUNTS
-    out, cut = gradient.clone(), False
+    out = gradient.clone()
+    cut = False
     for block, part in domain.parts():
-        if block.norm != "box" and block.size >= FEWEST_NUMBERS and bool(out[part].any()):
+        if (
+            block.norm != "box"
+            and block.size >= FEWEST_NUMBERS
+            and bool(out[part].any())
+        ):
             sizes = out[part].abs()
-            limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(sizes[sizes > 0].median())
+            limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(
+                sizes[sizes > 0].median()
+            )
             if float(sizes.amax()) > limit:
                 cut, out[part] = True, out[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(out))
     lengths = (*lengths, length)[-MEMORY:]
     usual = sorted(lengths)[len(lengths) // 2]
     shortened = length > CLIP * usual > 0.0
-    return out * (CLIP * usual / length) if shortened else out, lengths, Counts(int(cut), int(shortened))
+    return (
+        out * (CLIP * usual / length) if shortened else out,
+        lengths,
+        Counts(int(cut), int(shortened)),
+    )
 
 
-FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
-"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps."""
+FIRST_WINDOW = 0.22
+SHORTEN = 0.03
+SHORTEST = 0.06
+"""Length of the first window, how much each next one is shorter, and the shortest, as
+fractions of the steps.
+"""
 
 FEWEST = 3  # no window is shorter than this: two noisy values say nothing about a trend
-IMPROVING = 0.75  # fraction of a window's steps that must improve the objective to keep the step size (Auto-PGD's rho)
-SLOWEST = 0.05  # what is left of the step size at the end of a search without noise, as a fraction of the first
-FEWEST_EXACT = 5  # the same as `FEWEST` without noise, where all windows have the shortest length
-GAIN = 1e-3  # without noise, what a window must add to the best of the one before, as a fraction of all that was gained
+# fraction of a window's steps that must improve the objective to keep the step size
+# (Auto-PGD's rho)
+IMPROVING = 0.75
+# what is left of the step size at the end of a search without noise, as a fraction of
+# the first
+SLOWEST = 0.05
+# the same as `FEWEST` without noise, where all windows have the shortest length
+FEWEST_EXACT = 5
+# without noise, what a window must add to the best of the one before, as a fraction of
+# all that was gained
+GAIN = 1e-3
 ENOUGH = 3  # windows in a row that add less, after which there is nothing to gain
-PATIENCE = 5  # evaluations in a row without any gradient after which there is nothing to follow
+# evaluations in a row without any gradient after which there is nothing to follow
+PATIENCE = 5
 
 
 class Peak(NamedTuple):
-    """The best evaluation so far by its raw objective, and the direction in which the search stood to go on there."""
+    """The best evaluation so far by its raw objective, and the direction in which the
+    search stood to go on there.
+    """
 
     objective: float
     u: Tensor
@@ -69,9 +111,11 @@ class Peak(NamedTuple):
 
 @dataclass(frozen=True)
 class Window:
-    """The objectives since the last checkpoint, so many until the next, and the one before them, NaN at the start; how
-    many exceed their predecessor; the best at the checkpoint, without noise of the window before it; and whether the
-    step size was halved there."""
+    """The objectives since the last checkpoint, so many until the next, and the one
+    before them, NaN at the start; how many exceed their predecessor; the best at the
+    checkpoint, without noise of the window before it; and whether the step size was
+    halved there.
+    """
 
     length: int
     values: tuple[float, ...] = ()
@@ -82,21 +126,35 @@ class Window:
 
     def add(self, value: float) -> Window:
         last = self.values[-1] if self.values else self.before
-        return replace(self, values=(*self.values, value), improved=self.improved + (value > last))
+        return replace(
+            self, values=(*self.values, value), improved=self.improved + (value > last)
+        )
 
     def stalled(self, best: float) -> bool:
-        """Return whether the step size is due for halving: too few steps improved the objective, or the best has not
-        moved since the last checkpoint although the step size was kept there (conditions 1 and 2 of Auto-PGD)."""
-        return self.improved < IMPROVING * len(self.values) or (not self.halved and best <= self.best)
+        """Return whether the step size is due for halving: too few steps improved the
+        objective, or the best has not moved since the last checkpoint although the step
+        size was kept there (conditions 1 and 2 of Auto-PGD).
+        """
+        return self.improved < IMPROVING * len(self.values) or (
+            not self.halved and best <= self.best
+        )
 
     def lags(self, best: float) -> bool:
-        """Return whether `best` beats this window by more than noise explains: by two of its standard deviations."""
+        """Return whether `best` beats this window by more than noise explains: by two
+        of its standard deviations.
+        """
         mean = sum(self.values) / len(self.values)
-        spread = math.sqrt(sum((v - mean) ** 2 for v in self.values) / max(1, len(self.values) - 1))
+        spread = math.sqrt(
+            sum((v - mean) ** 2 for v in self.values) / max(1, len(self.values) - 1)
+        )
         return best > mean + 2.0 * spread
 
     def next(self, steps: int, best: float, halved: bool) -> Window:
-        length = max(FEWEST, round(SHORTEST * steps), self.length - max(1, round(SHORTEN * steps)))
+        length = max(
+            FEWEST,
+            round(SHORTEST * steps),
+            self.length - max(1, round(SHORTEN * steps)),
+        )
         return Window(length, (), self.values[-1], 0, best, halved)
 
 
@@ -105,10 +163,12 @@ NOTHING = torch.zeros(())
 
 @dataclass(frozen=True, eq=False)
 class Ascent:
-    """Where an ascent of so many evaluations stands: u (d,) to propose next, the accumulated gradient (d,), of Adam its
-    mean and the mean (d,) of squares, the step size, the best evaluation, evaluations so far (`count`), gradients in
-    these means (`taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped` wants them. PGD has
-    besides the objective at the start, a window, and windows in a row that added nothing (`idle`, without noise only).
+    """Where an ascent of so many evaluations stands: u (d,) to propose next, the
+    accumulated gradient (d,), of Adam its mean and the mean (d,) of squares, the step
+    size, the best evaluation, evaluations so far (`count`), gradients in these means
+    (`taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped`
+    wants them. PGD has besides the objective at the start, a window, and windows in a
+    row that added nothing (`idle`, without noise only).
     """
 
     domain: Domain
@@ -148,12 +208,24 @@ class Climbing(Policy[Ascent]):
         state = replace(state, count=state.count + 1)
         if not evaluation.finite:
             counts = state.counts + Counts(rejected=1)
-            return self.retreat(replace(state, step_size=state.step_size / 2, counts=counts))
-        if evaluation.gradient is not None:  # without one nothing is known: go on as before
-            gradient, lengths, outliers = clipped(state.domain, evaluation.gradient, state.lengths)
-            state = replace(state, lengths=lengths, counts=state.counts + outliers, flat=state.flat + 1)
+            return self.retreat(
+                replace(state, step_size=state.step_size / 2, counts=counts)
+            )
+        # without one nothing is known: go on as before
+        if evaluation.gradient is not None:
+            gradient, lengths, outliers = clipped(
+                state.domain, evaluation.gradient, state.lengths
+            )
+            state = replace(
+                state,
+                lengths=lengths,
+                counts=state.counts + outliers,
+                flat=state.flat + 1,
+            )
             if bool(gradient.any()):
-                state = replace(self.learn(state, gradient), taken=state.taken + 1, flat=0)
+                state = replace(
+                    self.learn(state, gradient), taken=state.taken + 1, flat=0
+                )
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         return self.step(state, u, evaluation.objective)
@@ -167,53 +239,68 @@ class Climbing(Policy[Ascent]):
 
     @abstractmethod
     def retreat(self, state: Ascent) -> Ascent:
-        """Return the state after an objective that could not be computed; the step size is halved already."""
+        """Return the state after an objective that could not be computed; the step size
+        is halved already.
+        """
 
     @abstractmethod
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
-        """Return the state with a gradient (d,), not all zero, among those accumulated."""
+        """Return the state with a gradient (d,), not all zero, among those
+        accumulated.
+        """
 
     @abstractmethod
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Return the state with the next configuration, after u with its objective."""
 
     def refused(self, field: str, expected: str, example: float) -> InputError:
-        return InputError(f"{field}: expected a number in {expected}, got {getattr(self, field)}; try {example}")
+        return InputError(
+            f"{field}: expected a number in {expected}, got "
+            f"{getattr(self, field)}; try {example}"
+        )
 
 
 @dataclass(frozen=True)
 class PGD(Climbing):
     """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
 
-    One step, with P the projection onto the domain and `steepest` the sign of a vector in an l-infinity block and the
-    vector over its norm in an l2 or box block, scaled by the block's radius:
+    One step, with P the projection onto the domain and `steepest` the sign of a vector
+    in an l-infinity block and the vector over its norm in an l2 or box block, scaled by
+    the block's radius:
 
         m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
         u <- P(u + step_size * steepest(m))
 
-    g is clipped first (see `clipped`). Accumulating gradients before the sign is taken matters here: each comes from
-    another seed, and the sign of one noisy gradient is a coin toss wherever the noise exceeds it.
+    g is clipped first (see `clipped`). Accumulating gradients before the sign is taken
+    matters here: each comes from another seed, and the sign of one noisy gradient is a
+    coin toss wherever the noise exceeds it.
 
-    The step size is halved at checkpoints when the objective stalls, by the two conditions of Auto-PGD (Croce and
-    Hein 2020, section 3.1; see `Window.stalled`). There we depart from Auto-PGD: it always goes on from the best
-    configuration after halving; a noisy best is often only a lucky one, so we go back only if the last window lags
-    behind it by two of the window's standard deviations.
+    The step size is halved at checkpoints when the objective stalls, by the two
+    conditions of Auto-PGD (Croce and Hein 2020, section 3.1; see `Window.stalled`).
+    There we depart from Auto-PGD: it always goes on from the best configuration after
+    halving; a noisy best is often only a lucky one, so we go back only if the last
+    window lags behind it by two of the window's standard deviations.
 
-    In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size falls in a line over the
-    planned steps, which came farther than Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). It is
-    halved besides after a window that added less than `GAIN` of what the search has gained; after `ENOUGH` of these in
-    a row there is nothing more to propose. In one whose evaluations draw conditions from a bank (`Domain.drawn`) the
-    step size falls likewise, and no window is looked at: what one gained says what it drew.
+    In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size
+    falls in a line over the planned steps, which came farther than Auto-PGD's rule at
+    every budget that was tried (docs/policies/pgd.md). It is halved besides after a
+    window that added less than `GAIN` of what the search has gained; after `ENOUGH` of
+    these in a row there is nothing more to propose. In one whose evaluations draw
+    conditions from a bank (`Domain.drawn`) the step size falls likewise, and no window
+    is looked at: what one gained says what it drew.
 
-    An evaluation with the objective -inf sends the search back to its best configuration, which is evaluated again
-    and left with half the step size. A gradient of zero leaves the accumulated one in charge; if that is zero too, the
-    step goes in a random direction; and after `PATIENCE` zero gradients in a row there is nothing more to propose.
+    An evaluation with the objective -inf sends the search back to its best
+    configuration, which is evaluated again and left with half the step size. A gradient
+    of zero leaves the accumulated one in charge; if that is zero too, the step goes in
+    a random direction; and after `PATIENCE` zero gradients in a row there is nothing
+    more to propose.
 
     Attributes:
-        step_size: the first step in units of each block's radius (epsilon; half the diagonal for a box), over 0, at
-            most 2.
+        step_size: the first step in units of each block's radius (epsilon; half the
+            diagonal for a box), over 0, at most 2.
         momentum: weight of the past, in [0, 1).
-        random_start: start from a uniform sample of the domain, not from where it begins.
+        random_start: start from a uniform sample of the domain, not from where it
+            begins.
     """
 
     step_size: float = 0.5
@@ -232,21 +319,34 @@ class PGD(Climbing):
         seed = draw_seed(generator)
         u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
         steps = max(1, steps // (1 + domain.gradient_cost))
-        fewest, share = (FEWEST_EXACT, SHORTEST) if domain.exact else (FEWEST, FIRST_WINDOW)
+        fewest, share = (
+            (FEWEST_EXACT, SHORTEST) if domain.exact else (FEWEST, FIRST_WINDOW)
+        )
         window = Window(max(fewest, round(share * steps)))
-        return Ascent(domain, steps, seed, u, torch.zeros_like(u), self.step_size, window=window)
+        return Ascent(
+            domain, steps, seed, u, torch.zeros_like(u), self.step_size, window=window
+        )
 
     def pace(self, state: Ascent) -> float:
-        return state.falling(state.count) if state.domain.exact or state.domain.drawn else state.step_size
+        return (
+            state.falling(state.count)
+            if state.domain.exact or state.domain.drawn
+            else state.step_size
+        )
 
     def retreat(self, state: Ascent) -> Ascent:
         if state.peak is None:
-            return self._moved(replace(state, direction=torch.zeros_like(state.u)), state.domain.begin)
+            return self._moved(
+                replace(state, direction=torch.zeros_like(state.u)), state.domain.begin
+            )
         return replace(state, u=state.peak.u, direction=state.peak.direction)
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
-        scaled = gradient / float(gradient.abs().amax())  # sums of huge or tiny elements stay within float32
-        direction = (state.direction * self.momentum).add_(scaled, alpha=1.0 / float(scaled.abs().mean()))
+        # sums of huge or tiny elements stay within float32
+        scaled = gradient / float(gradient.abs().amax())
+        direction = (state.direction * self.momentum).add_(
+            scaled, alpha=1.0 / float(scaled.abs().mean())
+        )
         return replace(state, direction=direction)
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
@@ -254,24 +354,39 @@ class PGD(Climbing):
             state = replace(state, first=objective)
         if state.domain.drawn:
             return self._moved(state, u)
-        window, peak, slower = state.window.add(objective), state.peak, replace(state, step_size=state.step_size / 2)
+        window = state.window.add(objective)
+        peak = state.peak
+        slower = replace(state, step_size=state.step_size / 2)
         if len(window.values) < window.length:
             return self._moved(replace(state, window=window), u)
-        if state.domain.exact:  # (the best of all may stem from another matrix of light transport)
+        # (the best of all may stem from another matrix of light transport)
+        if state.domain.exact:
             best = max(window.values)
             idle = best - window.best <= GAIN * (best - state.first)
-            state = replace(slower, idle=state.idle + 1) if idle else replace(state, idle=0)
-            return self._moved(replace(state, window=Window(window.length, best=best)), u)
+            state = (
+                replace(slower, idle=state.idle + 1) if idle else replace(state, idle=0)
+            )
+            return self._moved(
+                replace(state, window=Window(window.length, best=best)), u
+            )
         best = peak.objective if peak else -math.inf
         stalled = window.stalled(best)
         state = slower if stalled else state
         if peak is not None and stalled and window.lags(best):
             u = peak.u
-            state = replace(state, direction=peak.direction, counts=state.counts + Counts(rejected=1))
-        return self._moved(replace(state, window=window.next(state.steps, best, stalled)), u)
+            state = replace(
+                state,
+                direction=peak.direction,
+                counts=state.counts + Counts(rejected=1),
+            )
+        return self._moved(
+            replace(state, window=window.next(state.steps, best, stalled)), u
+        )
 
     def _moved(self, state: Ascent, u: Tensor) -> Ascent:
-        """Move from u along the accumulated gradient, or at random where there is none."""
+        """Move from u along the accumulated gradient, or at random where there is
+        none.
+        """
         uphill = state.direction
         if not bool(uphill.any()):
             uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
@@ -281,19 +396,24 @@ class PGD(Climbing):
 
 @dataclass(frozen=True)
 class Adam(Climbing):
-    """Adam (Kingma and Ba 2015, algorithm 1) uphill, projected onto the domain after every step:
+    """Adam (Kingma and Ba 2015, algorithm 1) uphill, projected onto the domain after
+    every step:
 
         m <- beta1 m + (1 - beta1) g,   v <- beta2 v + (1 - beta2) g^2
         u <- P(u + rate * scale * m' / (sqrt(v') + tiny)),   m' = m / (1 - beta1^t), v' = v / (1 - beta2^t)
 
-    `scale` is half of each number's range (half of what a ball leaves), so a step means the same in every block. The
-    rate falls in a line from `step_size` to a twentieth of it over the planned evaluations. We depart from the paper in
-    beta2, 0.9 by default, since a search has tens of steps and not thousands; and in an l2 ball g^2 is the mean over
-    the block, since there the best step for a constant gradient is along it and not along its signs.
+    `scale` is half of each number's range (half of what a ball leaves), so a step means
+    the same in every block. The rate falls in a line from `step_size` to a twentieth of
+    it over the planned evaluations. We depart from the paper in beta2, 0.9 by default,
+    since a search has tens of steps and not thousands; and in an l2 ball g^2 is the
+    mean over the block, since there the best step for a constant gradient is along it
+    and not along its signs.
 
-    g is clipped first (see `pgd.clipped`). An evaluation without a gradient goes on along m. One whose objective could
-    not be computed sends the search back to its best configuration, with m = v = 0 and half the rate. While there is
-    no gradient but zero the step is random; after five zero gradients in a row there is nothing more to propose.
+    g is clipped first (see `pgd.clipped`). An evaluation without a gradient goes on
+    along m. One whose objective could not be computed sends the search back to its best
+    configuration, with m = v = 0 and half the rate. While there is no gradient but zero
+    the step is random; after five zero gradients in a row there is nothing more to
+    propose.
 
     Attributes:
         step_size: the first rate, over 0, at most 2.
@@ -316,14 +436,18 @@ class Adam(Climbing):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         steps = max(1, steps // (1 + domain.gradient_cost))
         zero = torch.zeros_like(domain.start)
-        return Ascent(domain, steps, draw_seed(generator), domain.begin, zero, self.step_size)
+        return Ascent(
+            domain, steps, draw_seed(generator), domain.begin, zero, self.step_size
+        )
 
     def pace(self, state: Ascent) -> float:
         return state.falling(state.count)
 
     def retreat(self, state: Ascent) -> Ascent:
         u = state.domain.begin if state.peak is None else state.peak.u
-        return replace(state, u=u, direction=torch.zeros_like(u), square=NOTHING, taken=0)
+        return replace(
+            state, u=u, direction=torch.zeros_like(u), square=NOTHING, taken=0
+        )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
         squares = gradient.square()
@@ -331,13 +455,25 @@ class Adam(Climbing):
             if block.norm == "l2":
                 squares[part] = squares[part].mean()
         mean = torch.lerp(gradient, state.direction, self.beta1)
-        return replace(state, direction=mean, square=torch.lerp(squares, state.square, self.beta2))
+        return replace(
+            state, direction=mean, square=torch.lerp(squares, state.square, self.beta2)
+        )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         if state.taken:
             mean = state.direction / (1.0 - self.beta1**state.taken)
-            way = mean / (state.square / (1.0 - self.beta2**state.taken)).sqrt_().clamp_(min=1e-30)
+            way = mean / (
+                state.square / (1.0 - self.beta2**state.taken)
+            ).sqrt_().clamp_(min=1e-30)
         else:  # at random as long as nothing is known
-            way = torch.randn(u.numel(), generator=seeded(state.seed, state.count)).sign_()
-        rate = state.falling(state.count - 1)  # of the evaluation that this step follows
-        return replace(state, u=state.domain.project(torch.addcmul(u, half_widths(state.domain), way, value=rate)))
+            way = torch.randn(
+                u.numel(), generator=seeded(state.seed, state.count)
+            ).sign_()
+        # of the evaluation that this step follows
+        rate = state.falling(state.count - 1)
+        return replace(
+            state,
+            u=state.domain.project(
+                torch.addcmul(u, half_widths(state.domain), way, value=rate)
+            ),
+        )

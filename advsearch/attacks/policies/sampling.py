@@ -1,5 +1,7 @@
-"""Policies that look without learning: random search, the baseline of every worst-case claim; quasi-random points,
-which fill the domain more evenly; and a grid, as fine as the renders allow."""
+"""Policies that look without learning: random search, the baseline of every worst-case
+claim; quasi-random points, which fill the domain more evenly; and a grid, as fine as
+the renders allow.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 
 MOST = 21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
-CHUNK = 2**20  # numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at least
+# numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at
+# least
+CHUNK = 2**20
 
 
 NONE = torch.empty(0, 0)
@@ -24,15 +28,19 @@ NONE = torch.empty(0, 0)
 
 @dataclass(frozen=True, eq=False)
 class PointsState:
-    """Where a search stands that does not look at evaluations: how many configurations are done, and what the next ones
-    come from, if not from the seed alone: points (n, k), the whole grid or so many of a sequence."""
+    """Where a search stands that does not look at evaluations: how many configurations
+    are done, and what the next ones come from, if not from the seed alone: points (n,
+    k), the whole grid or so many of a sequence.
+    """
 
     domain: Domain
     seed: int = 0
     points: Tensor = NONE
     done: int = 0
 
-    def proposing(self, us: Iterable[Tensor]) -> tuple[tuple[Proposal, ...], PointsState]:
+    def proposing(
+        self, us: Iterable[Tensor]
+    ) -> tuple[tuple[Proposal, ...], PointsState]:
         proposals = tuple(map(Proposal, us))
         return proposals, replace(self, done=self.done + len(proposals))
 
@@ -49,58 +57,81 @@ class Unlearning(Policy[PointsState]):
 
 @dataclass(frozen=True)
 class Random(Unlearning):
-    """Independent samples within the budget, by turns at the extremes of the norm balls and in their interior.
+    """Independent samples within the budget, by turns at the extremes of the norm balls
+    and in their interior.
 
-    The first is an extreme one: in many dimensions the corners of an l-infinity ball beat its interior (a random
-    corner moves a linear objective sqrt(3) times as far as a uniform sample), so a baseline without them would be too
-    easy to win against. See `Domain.sample`.
+    The first is an extreme one: in many dimensions the corners of an l-infinity ball
+    beat its interior (a random corner moves a linear objective sqrt(3) times as far as
+    a uniform sample), so a baseline without them would be too easy to win against. See
+    `Domain.sample`.
     """
 
     name: ClassVar[str] = "random"
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> PointsState:
         return PointsState(domain, draw_seed(generator))
 
-    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
+    def propose(
+        self, state: PointsState, n: int
+    ) -> tuple[tuple[Proposal, ...], PointsState]:
         numbers = range(state.done, state.done + n)
-        return state.proposing(state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
+        return state.proposing(
+            state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0]
+            for k in numbers
+        )
 
 
 @dataclass(frozen=True)
 class Sobol(Unlearning):
-    """A scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by Owen 1998, Matousek 1998).
+    """A scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by
+    Owen 1998, Matousek 1998).
 
-    - bounds and l-infinity balls: the sequence's number, stretched to what bounds and ball leave;
+    - bounds and l-infinity balls: the sequence's number, stretched to what bounds and
+    ball leave;
     - a discrete choice: the middle of the option it falls on;
-    - an l2 ball: a direction from the normal quantiles of the block's numbers, and a radius from one number more, so
-      that points are uniform in the ball; then projected onto the bounds.
+    - an l2 ball: a direction from the normal quantiles of the block's numbers, and a
+      radius from one number more, so that points are uniform in the ball; then
+      projected onto the bounds.
 
-    In a few dimensions it finds what `random` finds in fewer renders; the advantage is gone after a dozen. The points
-    of one sequence do not depend on what they are worth, so they are a fair sample of the domain's average too.
+    In a few dimensions it finds what `random` finds in fewer renders; the advantage is
+    gone after a dozen. The points of one sequence do not depend on what they are worth,
+    so they are a fair sample of the domain's average too.
     """
 
     name: ClassVar[str] = "sobol"
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> PointsState:
         size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
         if size > MOST:
             raise InputError(
-                f"policy 'sobol': expected at most {MOST} dimensions, got {size}; use policy random, nes, pgd or auto"
+                f"policy 'sobol': expected at most {MOST} dimensions, got {size}; use "
+                "policy random, nes, pgd or auto"
             )
-        seed, most = draw_seed(generator), max(1, CHUNK // size)
+        seed = draw_seed(generator)
+        most = max(1, CHUNK // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
         return PointsState(domain, seed, draw(size, seed, 0, count))
 
-    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
+    def propose(
+        self, state: PointsState, n: int
+    ) -> tuple[tuple[Proposal, ...], PointsState]:
         count, size = state.points.shape
         if state.done and state.done % count == 0:
             state = replace(state, points=draw(size, state.seed, state.done, count))
-        return state.proposing(to_domain(state.domain, x) for x in state.points[state.done % count :][:n])
+        return state.proposing(
+            to_domain(state.domain, x) for x in state.points[state.done % count :][:n]
+        )
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
-    """Return `count` points of the scrambled sequence of that seed from number `begin` on: (count, size) float32. The
-    first call takes a power of two, which is what keeps the points balanced."""
+    """Return `count` points of the scrambled sequence of that seed from number `begin`
+    on: (count, size) float32. The first call takes a power of two, which is what keeps
+    the points balanced.
+    """
     from scipy.stats import qmc  # takes most of a second, and few runs need it
 
     engine = qmc.Sobol(size, scramble=True, seed=seed)
@@ -110,7 +141,9 @@ def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
 
 
 def to_domain(domain: Domain, x: Tensor) -> Tensor:
-    """Return the configuration (d,) for a point (d + number of l2 blocks,) of the unit cube; see `Sobol`."""
+    """Return the configuration (d,) for a point (d + number of l2 blocks,) of the unit
+    cube; see `Sobol`.
+    """
     u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
     radii = iter(x[domain.dim :].tolist())
     for block, part in domain.parts():
@@ -128,13 +161,15 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
 class Grid(Unlearning):
     """Every combination of evenly spaced values, then nothing more.
 
-    A number takes both its ends and what lies evenly between; an angle does not repeat its end; a discrete choice takes
-    every option. Without `points`, numbers get one more value by turns as long as the whole grid fits into the renders.
-    Points come coarse to fine: ends first, then middles, then quarters, so that a grid that is cut short has looked
-    everywhere.
+    A number takes both its ends and what lies evenly between; an angle does not repeat
+    its end; a discrete choice takes every option. Without `points`, numbers get one
+    more value by turns as long as the whole grid fits into the renders. Points come
+    coarse to fine: ends first, then middles, then quarters, so that a grid that is cut
+    short has looked everywhere.
 
-    An l-infinity ball is a box to a grid. Points outside an l2 ball are projected onto it, so they are not evenly
-    spaced there. Either is of use in a few numbers only: a grid that does not fit into the renders is refused.
+    An l-infinity ball is a box to a grid. Points outside an l2 ball are projected onto
+    it, so they are not evenly spaced there. Either is of use in a few numbers only: a
+    grid that does not fit into the renders is refused.
 
     Attributes:
         points: values for each number, at least 2; 0 for as many as fit.
@@ -146,17 +181,27 @@ class Grid(Unlearning):
 
     def __post_init__(self) -> None:
         if self.points < 0 or self.points == 1:
-            raise InputError(f"points: expected at least 2, or 0 for as many as fit, got {self.points}")
+            raise InputError(
+                "points: expected at least 2, or 0 for as many as fit, "
+                f"got {self.points}"
+            )
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
-        counts, low, high = _counts(domain, steps, self.points), domain.lower.clone(), domain.upper.clone()
+    def start(
+        self, domain: Domain, generator: torch.Generator, steps: int
+    ) -> PointsState:
+        counts = _counts(domain, steps, self.points)
+        low = domain.lower.clone()
+        high = domain.upper.clone()
         for block, part in domain.parts():
-            if block.norm == "l2" and block.epsilon is not None:  # the cube around the ball
+            # the cube around the ball
+            if block.norm == "l2" and block.epsilon is not None:
                 low[part] = low[part].maximum(domain.start[part] - block.epsilon)
                 high[part] = high[part].minimum(domain.start[part] + block.epsilon)
         blocks = [block for block in domain.blocks for _ in range(block.size)]
         axes = []
-        for block, count, least, most in zip(blocks, counts, low.tolist(), high.tolist(), strict=True):
+        for block, count, least, most in zip(
+            blocks, counts, low.tolist(), high.tolist(), strict=True
+        ):
             if block.options:
                 axes.append((torch.arange(count) + 0.5) / count)
             elif block.periodic:  # its end is its beginning and comes once
@@ -164,7 +209,8 @@ class Grid(Unlearning):
             else:
                 axes.append(torch.linspace(least, most, count))
         points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
-        # coarse to fine: by the largest, then the sum of the levels of a point, whose last axis runs fastest
+        # coarse to fine: by the largest, then the sum of the levels of a point, whose
+        # last axis runs fastest
         largest = total = torch.zeros(1, dtype=torch.long)
         for level in map(_levels, blocks, counts):
             largest = torch.maximum(largest[:, None], level).flatten()
@@ -172,35 +218,50 @@ class Grid(Unlearning):
         order = (largest * (int(total.max()) + 1) + total).argsort(stable=True)
         return PointsState(domain, points=points[order])
 
-    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
-        return state.proposing(map(state.domain.project, state.points[state.done : state.done + n]))
+    def propose(
+        self, state: PointsState, n: int
+    ) -> tuple[tuple[Proposal, ...], PointsState]:
+        return state.proposing(
+            map(state.domain.project, state.points[state.done : state.done + n])
+        )
 
 
 def _counts(domain: Domain, steps: int, points: int) -> list[int]:
     options = domain.options.tolist()
-    numbers, combinations = options.count(0), math.prod(n for n in options if n)
+    numbers = options.count(0)
+    combinations = math.prod(n for n in options if n)
     least = combinations * (points or 2) ** min(numbers, 64)
     if least > steps:
-        more = f" and {combinations} combinations of options" if combinations > 1 else ""
+        more = (
+            f" and {combinations} combinations of options" if combinations > 1 else ""
+        )
         many = str(least) if least < 10**9 else "billions of"
         raise InputError(
-            f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} are {many} renders, and "
-            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
+            f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} "
+            f"are {many} renders, and "
+            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give "
+            "more `steps`"
         )
-    each = points or max(2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9)))
+    each = points or max(
+        2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9))
+    )
     counts = [n or each for n in options]
-    total, grew = math.prod(counts), not points
+    total = math.prod(counts)
+    grew = not points
     while grew:
         grew = False
         for j, fixed in enumerate(options):
             if not fixed and total // counts[j] * (counts[j] + 1) <= steps:
-                total, grew = total // counts[j] * (counts[j] + 1), True
+                total = total // counts[j] * (counts[j] + 1)
+                grew = True
                 counts[j] += 1
     return counts
 
 
 def _levels(block: Block, count: int) -> Tensor:
-    """Return (count,) how often an axis must be halved until a value is met: 0 for both ends and for every option."""
+    """Return (count,) how often an axis must be halved until a value is met: 0 for both
+    ends and for every option.
+    """
     level = torch.zeros(count, dtype=torch.long)
     gaps = [] if block.options else [(0, count if block.periodic else count - 1, 1)]
     while gaps:

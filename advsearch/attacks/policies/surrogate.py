@@ -1,6 +1,8 @@
-"""A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box blocks of a domain as one unit box.
-All is fitted by maximum likelihood over fixed grids, and every proposal is one of finitely many, so that last bits of a
-factorisation do not change a result."""
+"""A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box
+blocks of a domain as one unit box. All is fitted by maximum likelihood over fixed
+grids, and every proposal is one of finitely many, so that last bits of a factorisation
+do not change a result.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,23 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain, centre_of_option, wraps
 from advsearch.attacks.evaluation import Evaluated, seeded
 
-MOST_SOBOL = 1000  # more coordinates than this are screened with independent points; Sobol's advantage is long gone
-MOVED = 4  # about so many coordinates change in one local move; all, where there are no more
+# more coordinates than this are screened with independent points; Sobol's advantage is
+# long gone
+MOST_SOBOL = 1000
+# about so many coordinates change in one local move; all, where there are no more
+MOVED = 4
 ANOTHER = 0.3  # share of moved choices that are drawn anew
-NEAREST, FARTHEST = 0.01, 0.3  # deviations of local moves, in a coordinate's whole range; between them log-uniform
+# deviations of local moves, in a coordinate's whole range; between them log-uniform
+NEAREST = 0.01
+FARTHEST = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which elements of u these are (k,), and what a point x in [0, 1]^k means: u[where] = low + width * x. At the ends
-    of `periodic` ones is the same place; a discrete choice has `options`, others 0."""
+    """Which elements of u these are (k,), and what a point x in [0, 1]^k means:
+    u[where] = low + width * x. At the ends of `periodic` ones is the same place; a
+    discrete choice has `options`, others 0.
+    """
 
     where: Tensor
     low: Tensor
@@ -41,13 +50,19 @@ class Coordinates:
     def put(self, u: Tensor, x: Tensor) -> Tensor:
         """Return a copy of configurations (..., d), moved to points (..., k)."""
         u = u.clone()
-        u[..., self.where] = torch.clamp(self.low + self.width * x, self.low, self.low + self.width)
+        u[..., self.where] = torch.clamp(
+            self.low + self.width * x, self.low, self.low + self.width
+        )
         return u
 
     def tidy(self, x: Tensor) -> Tensor:
-        """Return points (n, k) brought back: angles wrap, choices go to the middle of their option, the rest clips."""
+        """Return points (n, k) brought back: angles wrap, choices go to the middle of
+        their option, the rest clips.
+        """
         x = torch.where(self.periodic, torch.remainder(x, 1.0), x).clamp_(0.0, 1.0)
-        return torch.where(self.options > 0, centre_of_option(x, self.options.clamp(min=1)), x)
+        return torch.where(
+            self.options > 0, centre_of_option(x, self.options.clamp(min=1)), x
+        )
 
     def screen(self, seed: int, n: int) -> Tensor:
         """Return points (n, k) spread evenly: a scrambled Sobol sequence."""
@@ -59,28 +74,39 @@ class Coordinates:
         return self.tidy(engine.draw(n))
 
     def moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
-        """Return points (n, k), each near its own in x: a few coordinates of each moved, near or far."""
+        """Return points (n, k), each near its own in x: a few coordinates of each
+        moved, near or far.
+        """
         n, k = x.shape
         far = math.log(FARTHEST / NEAREST)
         size = NEAREST * torch.exp(far * torch.rand(n, 1, generator=generator))
         moved = torch.rand(n, k, generator=generator) < MOVED / k
         moved[torch.arange(n), torch.randint(k, (n,), generator=generator)] = True
         near = x + moved * size * torch.randn(n, k, generator=generator)
-        anew = moved & (self.options > 0) & (torch.rand(n, k, generator=generator) < ANOTHER)
+        anew = (
+            moved
+            & (self.options > 0)
+            & (torch.rand(n, k, generator=generator) < ANOTHER)
+        )
         x = torch.where(self.options > 0, x, near)
         return self.tidy(torch.where(anew, torch.rand(n, k, generator=generator), x))
 
     def embed(self, x: Tensor, lengths: Tensor) -> Tensor:
-        """Return points (n, k) as points (n, f) whose ordinary distances are what a surrogate needs.
+        """Return points (n, k) as points (n, f) whose ordinary distances are what a
+        surrogate needs.
 
-        Differences are divided by (k,) lengths. An angle becomes a circle of circumference 2, an option the corner of
-        a simplex with edges of length 1.
+        Differences are divided by (k,) lengths. An angle becomes a circle of
+        circumference 2, an option the corner of a simplex with edges of length 1.
         """
         x = x.double()
         plain = ~self.periodic & (self.options == 0)
         angle = 2.0 * math.pi * x[:, self.periodic]
         radius = math.pi * lengths[self.periodic]
-        parts = [x[:, plain] / lengths[plain], angle.cos() / radius, angle.sin() / radius]
+        parts = [
+            x[:, plain] / lengths[plain],
+            angle.cos() / radius,
+            angle.sin() / radius,
+        ]
         for j in torch.nonzero(self.options).flatten().tolist():
             count = int(self.options[j])
             number = (x[:, j] * count).long().clamp_(max=count - 1)
@@ -90,28 +116,47 @@ class Coordinates:
 
 
 def box_coordinates(domain: Domain) -> Coordinates:
-    """Return the coordinates of a domain that belong to no norm ball; there may be none."""
-    boxes = [torch.arange(part.start, part.stop) for block, part in domain.parts() if block.norm == "box"]
+    """Return the coordinates of a domain that belong to no norm ball; there may be
+    none.
+    """
+    boxes = [
+        torch.arange(part.start, part.stop)
+        for block, part in domain.parts()
+        if block.norm == "box"
+    ]
     where = torch.cat([torch.empty(0, dtype=torch.long), *boxes])
-    low, width = domain.lower[where], domain.upper[where] - domain.lower[where]
+    low = domain.lower[where]
+    width = domain.upper[where] - domain.lower[where]
     return Coordinates(where, low, width, wraps(domain)[where], domain.options[where])
 
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Candidate lengths, times the square root of the number of coordinates (as distances between points grow)."""
+"""Candidate lengths, times the square root of the number of coordinates (as distances
+between points grow).
+"""
 
-NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)  # candidate variances of the noise, as shares of the signal's
+# candidate variances of the noise, as shares of the signal's
+NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
 STRETCHES = (0.5, 2.0, 4.0)  # by how much one coordinate's length is changed on trial
-LONGEST = 8.0  # no length is more than this many times the root of the number of coordinates: it no longer matters then
-EVIDENCE = 1.0  # gain in log-likelihood that a coordinate's own length must bring; less would fit the noise
-REFIT = 5  # lengths and noise are fitted again after so many new points, or a tenth of all if that is more
-MEMORY = 100  # so many of the best points and so many of the latest count, unless more are asked for
+# no length is more than this many times the root of the number of coordinates: it no
+# longer matters then
+LONGEST = 8.0
+# gain in log-likelihood that a coordinate's own length must bring; less would fit the
+# noise
+EVIDENCE = 1.0
+# lengths and noise are fitted again after so many new points, or a tenth of all if that
+# is more
+REFIT = 5
+# so many of the best points and so many of the latest count, unless more are asked for
+MEMORY = 100
 MOST_OWN = 16  # up to so many coordinates have lengths of their own; more share one
 
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """What is fitted: (k,) lengths, and the noise's variance as a share of the signal's."""
+    """What is fitted: (k,) lengths, and the noise's variance as a share of the
+    signal's.
+    """
 
     lengths: Tensor
     noise: float
@@ -119,8 +164,10 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """A fitted process at points (n, k) of the unit box: the Cholesky factor (n, n) of the kernel matrix with noise, of
-    signal variance 1; its inverse times the centred values (n,); mean and variance of the signal; log-likelihood."""
+    """A fitted process at points (n, k) of the unit box: the Cholesky factor (n, n) of
+    the kernel matrix with noise, of signal variance 1; its inverse times the centred
+    values (n,); mean and variance of the signal; log-likelihood.
+    """
 
     space: Coordinates
     x: Tensor
@@ -132,7 +179,9 @@ class Surrogate:
     likelihood: float
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation (m,) of the noise-free objective at points (m, k)."""
+        """Return mean and standard deviation (m,) of the noise-free objective at points
+        (m, k).
+        """
         lengths = self.scales.lengths
         cross = kernel(self.space.embed(x, lengths), self.space.embed(self.x, lengths))
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
@@ -142,9 +191,10 @@ class Surrogate:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was evaluated, points (n, k) and n objectives, not finite where it could not be, and the scales of the
-    process behind it, fitted to the first `fitted`. The best and the latest points count, so many of each; for the
-    scales `MEMORY`."""
+    """What was evaluated, points (n, k) and n objectives, not finite where it could not
+    be, and the scales of the process behind it, fitted to the first `fitted`. The best
+    and the latest points count, so many of each; for the scales `MEMORY`.
+    """
 
     space: Coordinates
     points: Tensor
@@ -158,29 +208,41 @@ class Observed:
         return any(math.isfinite(value) for value in self.values)
 
     def extended(self, evaluated: Evaluated) -> Observed:
-        points = torch.cat([self.points, *(self.space.take(u)[None] for u, _ in evaluated)])
-        return replace(self, points=points, values=(*self.values, *(one.objective for _, one in evaluated)))
+        points = torch.cat(
+            [self.points, *(self.space.take(u)[None] for u, _ in evaluated)]
+        )
+        return replace(
+            self,
+            points=points,
+            values=(*self.values, *(one.objective for _, one in evaluated)),
+        )
 
     def surrogate(self) -> tuple[Surrogate, Observed]:
-        """Return the process behind what was seen, its scales fitted again if it is time; something is finite.
+        """Return the process behind what was seen, its scales fitted again if it is
+        time; something is finite.
 
-        What could not be evaluated counts as the smallest value; of many points the best and the latest count.
+        What could not be evaluated counts as the smallest value; of many points the
+        best and the latest count.
         """
         n = len(self.values)
         values = torch.tensor(self.values, dtype=torch.float64)
         finite = torch.isfinite(values)
         values = torch.where(finite, values, values[finite].min())
-        scales, fitted = self.scales, self.fitted
+        scales = self.scales
+        fitted = self.fitted
         if scales is None or n - fitted >= max(REFIT, fitted // 10):
             kept = _best_and_latest(values, MEMORY)
-            scales, fitted = _best_scales(self.space, self.points[kept], values[kept]), n
+            scales = _best_scales(self.space, self.points[kept], values[kept])
+            fitted = n
         kept = _best_and_latest(values, self.memory)
         surrogate = fit(self.space, self.points[kept], values[kept], scales)
         return surrogate, replace(self, scales=scales, fitted=fitted)
 
 
 def _best_and_latest(values: Tensor, memory: int) -> Tensor:
-    """Return places of so many of the largest values and so many of the last; of all if there are no more."""
+    """Return places of so many of the largest values and so many of the last; of all if
+    there are no more.
+    """
     last = len(values) - memory
     if last <= memory:
         return torch.arange(len(values))
@@ -194,14 +256,22 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
     return (1.0 + r + r.square() / 3.0) * torch.exp(-r)
 
 
-def fit(space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None) -> Surrogate:
-    """Return the process given values (n,) at points (n, k), mean and variance at their best; the scales too are fitted
-    unless they are given."""
+def fit(
+    space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None
+) -> Surrogate:
+    """Return the process given values (n,) at points (n, k), mean and variance at their
+    best; the scales too are fitted unless they are given.
+    """
     scales = scales or _best_scales(space, x, y)
-    points, n = space.embed(x, scales.lengths), len(x)
-    matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(n, dtype=torch.float64)
+    points = space.embed(x, scales.lengths)
+    n = len(x)
+    matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(
+        n, dtype=torch.float64
+    )
     factor = torch.linalg.cholesky(matrix)
-    both = torch.cholesky_solve(torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1), factor)
+    both = torch.cholesky_solve(
+        torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1), factor
+    )
     mean = float(both[:, 0].sum() / both[:, 1].sum())
     weights = both[:, 0] - mean * both[:, 1]
     variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
@@ -210,15 +280,24 @@ def fit(space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None) 
 
 
 def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
-    """The most likely common length and noise, then length by length what the evidence asks for."""
+    """The most likely common length and noise, then length by length what the evidence
+    asks for.
+    """
     k = x.shape[1]
     unit = math.sqrt(k)
 
     def most_likely(tried: list[Scales]) -> Surrogate:
-        return max((fit(space, x, y, scales) for scales in tried), key=lambda fitted: fitted.likelihood)
+        return max(
+            (fit(space, x, y, scales) for scales in tried),
+            key=lambda fitted: fitted.likelihood,
+        )
 
     best = most_likely(
-        [Scales(torch.full((k,), unit * length).double(), noise) for length in LENGTHS for noise in NOISES]
+        [
+            Scales(torch.full((k,), unit * length).double(), noise)
+            for length in LENGTHS
+            for noise in NOISES
+        ]
     )
     for j in range(k if 1 < k <= MOST_OWN else 0):
         changed = []

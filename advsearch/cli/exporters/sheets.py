@@ -8,7 +8,8 @@ from typing import Any
 
 from advsearch.extend import Exported, Exporter, Progress, writing
 
-USUAL_SIZE = 100.0  # longest side of a printed object whose size is not known, in millimetres
+# longest side of a printed object whose size is not known, in millimetres
+USUAL_SIZE = 100.0
 
 
 class Sheets(Exporter):
@@ -20,10 +21,14 @@ class Sheets(Exporter):
     suffix = "pdf"
     options = ("size", "sheets", "paper", "icc")
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         from advsearch.extend import exports  # takes seconds
 
-        known_size = exports.real_size(run) if options["size"] is None else options["size"]
+        known_size = (
+            exports.real_size(run) if options["size"] is None else options["size"]
+        )
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.printable(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])
@@ -32,12 +37,26 @@ class Sheets(Exporter):
         most = exports.MOST_SHEETS if options["sheets"] is None else options["sheets"]
         with writing.placed_by("out"), writing.replacing(out) as part:
             pages = exports.write_sheets(
-                part, pieces, title, paper=paper, profile=profile, most=most, last=exports.chart_page
+                part,
+                pieces,
+                title,
+                paper=paper,
+                profile=profile,
+                most=most,
+                last=exports.chart_page,
             )
-        sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
-        text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
+        sizes = [
+            {"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]}
+            for piece in pieces
+        ]
+        text = (
+            f"{pages} pages in {out}; print them at 100 % and measure the square "
+            "on "
+            "the first"
+        )
         if known_size is None:
             text += (
-                f"\nThe real object's longest side is taken for {exports.rounded(longest)} mm; --size says otherwise."
+                "\nThe real object's longest side is taken for "
+                f"{exports.rounded(longest)} mm; --size says otherwise."
             )
         return Exported({"pages": pages, "size_mm": longest, "pieces": sizes}, text)

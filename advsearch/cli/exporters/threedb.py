@@ -1,7 +1,8 @@
 """A sweep as a folder of 3DB (Leclerc et al. 2021), for its dashboard.
 
-`details.log` has a JSON object a line, `class_maps.json` the names of classes, and ``images/<id>_rgb.png`` the images.
-`advsearch.runs.export.read_threedb` reads such a folder.
+`details.log` has a JSON object a line, `class_maps.json` the names of classes, and
+``images/<id>_rgb.png`` the images. `advsearch.runs.export.read_threedb` reads such a
+folder.
 """
 
 from __future__ import annotations
@@ -11,18 +12,33 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import Exported, Exporter, InputError, Progress, Store, directory, writing
+from advsearch.extend import (
+    Exported,
+    Exporter,
+    InputError,
+    Progress,
+    Store,
+    directory,
+    writing,
+)
 
-DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
+DETAILS = "details.log"
+CLASSES = "class_maps.json"
+IMAGES = "images"
 PLACED = ("environment", "object")  # values that have a place of their own in a line
 
 
-def write_threedb(rows: Callable[[], Iterable[Any]], out: Path, picture: Callable[[int], bytes | None]) -> int:
-    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
-    how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
-    parameter ``network`` tells what several networks predict apart."""
+def write_threedb(
+    rows: Callable[[], Iterable[Any]], out: Path, picture: Callable[[int], bytes | None]
+) -> int:
+    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each,
+    where one was kept, and return how many there were. ``loss`` is the margin with its
+    sign turned: over 0 where a prediction is not right. The parameter ``network`` tells
+    what several networks predict apart.
+    """
     writing.check_free_folder(out, "out")
-    names, classes = dict[str, None](), dict[str, int | None]()
+    names = dict[str, None]()
+    classes = dict[str, int | None]()
     for row in rows():
         names |= dict.fromkeys(name for name in row.values if name not in PLACED)
         classes.setdefault(row.label or Store.NOT_A_NUMBER, row.label_index)
@@ -34,22 +50,31 @@ def write_threedb(rows: Callable[[], Iterable[Any]], out: Path, picture: Callabl
     called = {number: name for name, number in numbers.items()}
     with writing.placed_by("out"):
         count = 0
-        with writing.replacing(out / DETAILS) as part, part.open("w", encoding="utf-8") as file:
+        with (
+            writing.replacing(out / DETAILS) as part,
+            part.open("w", encoding="utf-8") as file,
+        ):
             for row in rows():
                 line = make_line(row, names, numbers[row.label or Store.NOT_A_NUMBER])
                 file.write(json.dumps(line, allow_nan=False) + "\n")
                 data = picture(row.step)
                 if data is not None:
-                    writing.write_bytes(out / IMAGES / f"{line['id']}_rgb.png", data, durable=False)
+                    writing.write_bytes(
+                        out / IMAGES / f"{line['id']}_rgb.png", data, durable=False
+                    )
                 count += 1
-        listed = [called.get(number, f"class {number}") for number in range(max(called) + 1)]
+        listed = [
+            called.get(number, f"class {number}") for number in range(max(called) + 1)
+        ]
         writing.write_text(out / CLASSES, json.dumps(listed))
     return count
 
 
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
     said = {name: one["value"] for name, one in row.values.items()}
-    parameters = {"network" if name == "model" else name: said.get(name, "none") for name in names}
+    parameters = {
+        "network" if name == "model" else name: said.get(name, "none") for name in names
+    }
     environment, model = (str(said.get(name, "none")) for name in PLACED)
     return {
         "id": f"{row.step}",
@@ -71,12 +96,19 @@ class ThreeDB(Exporter):
     example = "export mug-sweep-001 --format 3db --out folder"
     options = ("kind",)
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)
         kept = exports.thumbnails.kept_pictures(run_path)
         with Store(run_path / Store.FILE, read_only=True) as store:
             picture = kept.png_of if kept else lambda _: None
-            count = write_threedb(lambda: store.rows(options["kind"] or "sweep"), out, picture)
-        return Exported({"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}")
+            count = write_threedb(
+                lambda: store.rows(options["kind"] or "sweep"), out, picture
+            )
+        return Exported(
+            {"rows": count},
+            f"{count} rows in {out}; look at them with: python -m threedboard {out}",
+        )

@@ -1,10 +1,12 @@
-"""The `corruption` control: one of the common image corruptions, by name and severity, on the finished picture.
+"""The `corruption` control: one of the common image corruptions, by name and severity,
+on the finished picture.
 
     severity 0: the picture as it is;  0 to 1: mixed with that of severity 1;  1 to 5: the published severities, and
     between two of them their parameters interpolated
 
-They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4 and appendix A) as functions of
-the picture in torch; those by noise, blur, shifted pixels and weather are in `filters`.
+They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4
+and appendix A) as functions of the picture in torch; those by noise, blur, shifted
+pixels and weather are in `filters`.
 """
 
 from __future__ import annotations
@@ -19,20 +21,25 @@ from torch import Tensor
 from advsearch.controls.corruption import filters
 from advsearch.extend import Choice, Control, Parameter, Value, Values, images
 
-BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))  # added to the value of hue, saturation and value
-CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))  # factor on the distance from the mean
+# added to the value of hue, saturation and value
+BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
+# factor on the distance from the mean
+CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))
 SATURATE = ((0.3, 0.0), (0.1, 0.0), (2.0, 0.0), (5.0, 0.1), (20.0, 0.2))
 """Factor on the saturation, and what is added to it."""
 PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)  # pixels left along a side, as a share
 JPEG = (25, 18, 15, 10, 7)  # quality
-_GREY = 1.0 / 512.0  # values and saturations this small have no hue to speak of; keeps quotients finite
+# values and saturations this small have no hue to speak of; keeps quotients finite
+_GREY = 1.0 / 512.0
 
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
     (more,) = filters.at_level(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
-    return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (value + _GREY)
+    return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (
+        value + _GREY
+    )
 
 
 def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -54,13 +61,16 @@ def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def pixelate(image: Tensor, whole: int) -> Tensor:
     """Average the picture over square cells; linear in the picture.
 
-    A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one, and as many in a smaller one.
+    A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one,
+    and as many in a smaller one.
     """
     height, width = image.shape[:2]
     share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
     cells = (max(1, int(height * share)), max(1, int(width * share)))
     averaged = F.interpolate(images.planes(image), cells, mode="area")
-    return images.picture(F.interpolate(averaged, (height, width), mode="nearest-exact"))
+    return images.picture(
+        F.interpolate(averaged, (height, width), mode="nearest-exact")
+    )
 
 
 def jpeg(image: Tensor, whole: int) -> Tensor:
@@ -76,43 +86,70 @@ SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
         filters.snow, filters.frost, filters.fog, brightness, contrast, saturate,
     )
 }  # fmt: skip
-"""Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity and the seed."""
-FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": filters.elastic}
-"""Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture would show the object twice."""
-STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {"pixelate": pixelate, "jpeg": jpeg}
+"""Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity
+and the seed.
+"""
+FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
+    "elastic": filters.elastic
+}
+"""Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture
+would show the object twice.
+"""
+STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {
+    "pixelate": pixelate,
+    "jpeg": jpeg,
+}
 """Corruptions of whole severities only: of the picture and the severity."""
 NAMES = (*SMOOTH, *FROM_NOTHING, *STEPPED)
 
 
 class CorruptionControl(Control):
-    """A common image corruption (noise, blur, weather, digital) by name and severity."""
+    """A common image corruption (noise, blur, weather, digital) by name and
+    severity.
+    """
 
     kind = "corruption"
     amount = "severity"
     parameters = (
         replace(Parameter.named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
         Parameter.number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
-                         "How strong it is: 0 is none, 1 to 5 are the published severities.",
+                         "How strong it is: 0 is none, 1 to 5 are the published "
+                         "severities.",
                          (0.0, float(filters.LEVELS))),
     )  # fmt: skip
-    choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
+    choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a "
+                                 "whole number from 0.",
                       whole=(0, 2**32 - 1)),)  # fmt: skip
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
-        # a name without a severity does nothing, and a severity needs a name: what is not given is searched
+        # a name without a severity does nothing, and a severity needs a name: what is
+        # not given is searched
         self.asked = False
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        stepped = parameter.name == "severity" and {*self.allowed("which", *NAMES)} <= {*STEPPED}
+        stepped = parameter.name == "severity" and {*self.allowed("which", *NAMES)} <= {
+            *STEPPED
+        }
         return replace(parameter, estimators=()) if stepped else parameter
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return corrupted(image, NAMES[int(values["which"])], values["severity"], int(self.chosen["seed"]))
+        return corrupted(
+            image,
+            NAMES[int(values["which"])],
+            values["severity"],
+            int(self.chosen["seed"]),
+        )
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         severity = values["severity"]
-        applied = nearest(severity) if NAMES[int(values["which"])] in STEPPED else float(severity)
+        applied = (
+            nearest(severity)
+            if NAMES[int(values["which"])] in STEPPED
+            else float(severity)
+        )
         return {"applied": Value(value=float(applied), unit="1")}
 
 
@@ -126,14 +163,18 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         seed: chooses the noise.
 
     Returns:
-        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and the severity, as `docs/controls/corruption.md` says.
+        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and the severity, as
+        `docs/controls/corruption.md` says.
     """
     if which in STEPPED:
-        at, whole = STEPPED[which], nearest(severity)
+        at = STEPPED[which]
+        whole = nearest(severity)
         out = at(image, whole) if whole else image
-        if severity.requires_grad:  # by the straight lines between the steps: a staircase has no slope
+        # by the straight lines between the steps: a staircase has no slope
+        if severity.requires_grad:
             below = min(int(severity.detach()), filters.LEVELS - 1)
-            low, high = at(image, below).detach() if below else image.detach(), at(image, below + 1).detach()
+            low = at(image, below).detach() if below else image.detach()
+            high = at(image, below + 1).detach()
             out = out + (severity - severity.detach()) * (high - low)
         return out.clamp(0.0, 1.0)
     if which in FROM_NOTHING:

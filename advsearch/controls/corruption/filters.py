@@ -1,8 +1,10 @@
-"""Corruptions by noise, blur, shifted pixels and weather, and what all share: tables by severity, blurs, warps.
+"""Corruptions by noise, blur, shifted pixels and weather, and what all share: tables by
+severity, blurs, warps.
 
-Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs, and here it is grown from noise.
-Pictures are (H, W, 3) float32 display-referred sRGB in [0, 1]. Lengths in the tables are pixels of a picture whose
-smaller side has `REFERENCE` pixels. Noise is one fixed draw, chosen by the seed: the same at every severity.
+Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs,
+and here it is grown from noise. Pictures are (H, W, 3) float32 display-referred sRGB in
+[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has `REFERENCE`
+pixels. Noise is one fixed draw, chosen by the seed: the same at every severity.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from torch import Tensor
 
 from advsearch.extend import images, seeds
 
-REFERENCE = 224  # smaller side in pixels of the pictures that the published tables were made for
+# smaller side in pixels of the pictures that the published tables were made for
+REFERENCE = 224
 LEVELS = 5  # severities run from 1 to this
 
 
@@ -31,7 +34,9 @@ def scale(image: Tensor) -> float:
 
 
 def reference_size(height: int, width: int) -> tuple[int, int]:
-    """Return the size of a picture of the same shape whose smaller side has `REFERENCE` pixels."""
+    """Return the size of a picture of the same shape whose smaller side has `REFERENCE`
+    pixels.
+    """
     side = min(height, width)
     return round(height * REFERENCE / side), round(width * REFERENCE / side)
 
@@ -42,63 +47,90 @@ def generator(seed: int, name: str) -> torch.Generator:
 
 
 def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
-    """Interpolate the five rows of n numbers of a table linearly at a severity () in [1, 5]; returns n differentiable
-    tensors ()."""
+    """Interpolate the five rows of n numbers of a table linearly at a severity () in
+    [1, 5]; returns n differentiable tensors ().
+    """
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
     return between(level, lambda whole: rows[whole - 1]).unbind()
 
 
 def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
-    """Mix what `make` returns for the two whole severities around one in [1, 5], on its device; differentiable."""
+    """Mix what `make` returns for the two whole severities around one in [1, 5], on its
+    device; differentiable.
+    """
     below = min(int(level.detach()), LEVELS - 1)
     share = level - below
     if float(share.detach()) == 0.0 and not share.requires_grad:
         return make(below).to(level.device)
-    low, high = make(below).to(level.device), make(below + 1).to(level.device)
+    low = make(below).to(level.device)
+    high = make(below + 1).to(level.device)
     return low + share * (high - low)
 
 
 def blurred(image: Tensor, sigma: Tensor) -> Tensor:
-    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels; edges are continued."""
+    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels;
+    edges are continued.
+    """
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
     weights = weights / weights.sum()
     channels = image.shape[2]
     padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
-    rows = F.conv2d(padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
-    return images.picture(F.conv2d(rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels))
+    rows = F.conv2d(
+        padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels
+    )
+    return images.picture(
+        F.conv2d(
+            rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels
+        )
+    )
 
 
-def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float) -> Tensor:
-    """Blur an (H, W, C) picture along a line at an `angle` in radians: a one-sided Gaussian, cut off at twice the
-    `radius`.
+def streaked(
+    image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float
+) -> Tensor:
+    """Blur an (H, W, C) picture along a line at an `angle` in radians: a one-sided
+    Gaussian, cut off at twice the `radius`.
 
-    Radius () and standard deviation `sigma` () are in reference pixels, of which one is `step` pixels of this picture.
+    Radius () and standard deviation `sigma` () are in reference pixels, of which one is
+    `step` pixels of this picture.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
     along = torch.arange(count, device=image.device) / step
-    weights = torch.exp(-0.5 * (along / sigma) ** 2) * (2.0 * radius + 1.0 - along).clamp(0.0, 1.0)
+    weights = torch.exp(-0.5 * (along / sigma) ** 2) * (
+        2.0 * radius + 1.0 - along
+    ).clamp(0.0, 1.0)
     weights = weights / weights.sum()
     height, width = image.shape[:2]
     padded = F.pad(images.planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
     for number, weight in enumerate(weights):
-        down, across = round(number * math.sin(angle)), round(number * math.cos(angle))
-        moved = padded[:, :, count + down : count + down + height, count + across : count + across + width]
+        down = round(number * math.sin(angle))
+        across = round(number * math.cos(angle))
+        moved = padded[
+            :,
+            :,
+            count + down : count + down + height,
+            count + across : count + across + width,
+        ]
         total = total + weight * images.picture(moved)
     return total
 
 
 GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))  # standard deviation, sRGB
 SHOT = ((60.0,), (25.0,), (12.0,), (5.0,), (3.0,))  # photons in a white pixel
-IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))  # share of the values that are lost
-SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))  # standard deviation relative to the value
+# share of the values that are lost
+IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))
+# standard deviation relative to the value
+SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))
 _DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
 def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
-    return images.drawn(image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal).to(image.device)
+    return images.drawn(
+        image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal
+    ).to(image.device)
 
 
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -114,10 +146,12 @@ def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Count photons: Poisson numbers with the picture as their mean, by inverting the distribution function.
+    """Count photons: Poisson numbers with the picture as their mean, by inverting the
+    distribution function.
 
-    The values are exact. Counts have no derivative, so each is taken to keep its place in the distribution, a number
-    of standard deviations from the mean, when the mean or the spread changes a little.
+    The values are exact. Counts have no derivative, so each is taken to keep its place
+    in the distribution, a number of standard deviations from the mean, when the mean or
+    the spread changes a little.
     """
     (photons,) = at_level(SHOT, level)
     share = _noise(image, seed, "shot noise", normal=False)
@@ -128,10 +162,12 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def poisson(mean: Tensor, share: Tensor) -> Tensor:
-    """Return the Poisson numbers of means, 0 to about 80, at given shares of the distribution in [0, 1), of the same
-    shape; no derivative."""
+    """Return the Poisson numbers of means, 0 to about 80, at given shares of the
+    distribution in [0, 1), of the same shape; no derivative.
+    """
     chance = torch.exp(-mean.double())
-    total, count = chance.clone(), torch.zeros_like(chance)
+    total = chance.clone()
+    count = torch.zeros_like(chance)
     for number in range(1, 400):
         short = share > total
         if not bool(short.any()):
@@ -145,8 +181,8 @@ def poisson(mean: Tensor, share: Tensor) -> Tensor:
 def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Replace a share of the values by 0 or 1 ("salt and pepper").
 
-    A value is lost at once, which has no derivative by the share of lost ones; taken instead is that of the average
-    over all draws of which ones are lost.
+    A value is lost at once, which has no derivative by the share of lost ones; taken
+    instead is that of the average over all draws of which ones are lost.
     """
     (lost,) = at_level(IMPULSE, level)
     turn = _noise(image, seed, "impulse noise", normal=False)
@@ -155,16 +191,27 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     return kept + (lost - lost.detach()) * (extreme - image.detach())
 
 
-GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))  # standard deviation, reference pixels
-DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))  # radius of the disc, reference pixels
+# standard deviation, reference pixels
+GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))
+# radius of the disc, reference pixels
+DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))
 GLASS = ((0.7, 1, 2), (0.9, 2, 1), (1.0, 2, 3), (1.1, 3, 2), (1.5, 4, 2))
 """Standard deviation and farthest neighbour, reference pixels; number of passes."""
 MOTION = ((10.0, 3.0), (15.0, 5.0), (15.0, 8.0), (15.0, 12.0), (20.0, 15.0))
 """Radius and standard deviation, reference pixels."""
 ZOOM = ((1.11,), (1.15,), (1.2,), (1.24,), (1.3,))  # largest magnification
-ZOOM_STEPS = 16  # magnified pictures that are averaged; the published ones take 11 to 16
-ELASTIC = ((488.0, 170.8, 24.4), (488.0, 19.52, 48.8), (12.2, 2.44, 4.88), (17.08, 2.44, 4.88), (29.28, 2.44, 4.88))
-"""Height of the wrinkles, their width, and how far a corner of the middle third moves; reference pixels."""
+# magnified pictures that are averaged; the published ones take 11 to 16
+ZOOM_STEPS = 16
+ELASTIC = (
+    (488.0, 170.8, 24.4),
+    (488.0, 19.52, 48.8),
+    (12.2, 2.44, 4.88),
+    (17.08, 2.44, 4.88),
+    (29.28, 2.44, 4.88),
+)
+"""Height of the wrinkles, their width, and how far a corner of the middle third moves;
+reference pixels.
+"""
 
 
 def gaussian_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -184,24 +231,38 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     height, width = image.shape[:2]
     padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
-    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(disc / disc.sum(), s=size)
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
+        disc / disc.sum(), s=size
+    )
     whole = torch.fft.irfft2(product, s=size)
-    return images.picture(whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width])
+    return images.picture(
+        whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
+    )
 
 
 def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Blur along a line, within 45 degrees of the horizontal, as of a camera that moves."""
+    """Blur along a line, within 45 degrees of the horizontal, as of a camera that
+    moves.
+    """
     radius, sigma = at_level(MOTION, level)
     turn = float(torch.rand((), generator=generator(seed, "motion blur")))
-    return streaked(image, radius, sigma, math.radians(90.0 * turn - 45.0), scale(image))
+    return streaked(
+        image, radius, sigma, math.radians(90.0 * turn - 45.0), scale(image)
+    )
 
 
 def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Average the picture with magnified ones, as of a camera that moves towards the object."""
+    """Average the picture with magnified ones, as of a camera that moves towards the
+    object.
+    """
     (largest,) = at_level(ZOOM, level)
-    zooms = 1.0 + (largest - 1.0) * torch.linspace(0.0, 1.0, ZOOM_STEPS, device=level.device)
+    zooms = 1.0 + (largest - 1.0) * torch.linspace(
+        0.0, 1.0, ZOOM_STEPS, device=level.device
+    )
     matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
-    theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
+    theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(
+        image.device
+    )
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
     copies = images.planes(image).expand(ZOOM_STEPS, -1, -1, -1)
@@ -210,17 +271,22 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur again."""
+    """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur
+    again.
+    """
     sigma = at_level(GLASS, level)[0] * scale(image)
-    shift = between(level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole))
+    shift = between(
+        level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole)
+    )
     return blurred(images.warped(blurred(image, sigma), shift * scale(image)), sigma)
 
 
 @lru_cache(maxsize=8)
 def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels. One pixel after another, from the
-    bottom right, takes over what a random neighbour shows by then; so what is shown may come from further away than one
-    step."""
+    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels. One
+    pixel after another, from the bottom right, takes over what a random neighbour shows
+    by then; so what is shown may come from further away than one step.
+    """
     tall, wide = reference_size(height, width)
     _, reach, passes = (int(value) for value in GLASS[whole - 1])
     source = generator(seed, "glass blur")
@@ -231,8 +297,10 @@ def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
         for row in range(tall - reach, reach, -1):
             for place in range(row * wide + wide - reach, row * wide + reach, -1):
                 shown[place] = shown[place + to_neighbour[place]]
-    came, place_of = torch.tensor(shown), torch.arange(tall * wide)
-    across, down = came % wide - place_of % wide, came // wide - place_of // wide
+    came = torch.tensor(shown)
+    place_of = torch.arange(tall * wide)
+    across = came % wide - place_of % wide
+    down = came // wide - place_of // wide
     shift = torch.stack([across, down]).view(1, 2, tall, wide).float()
     return images.picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
@@ -243,7 +311,9 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     if float(severity.detach()) < 1.0:
         shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
-        shift = between(severity, lambda whole: _elastic_shift(height, width, seed, whole))
+        shift = between(
+            severity, lambda whole: _elastic_shift(height, width, seed, whole)
+        )
     return images.warped(image, scale(image) * shift)
 
 
@@ -255,7 +325,9 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
     source = generator(seed, "elastic")
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner
     noise = torch.rand(tall, wide, 2, generator=source) * 2.0 - 1.0
-    waves = ndimage.gaussian_filter(noise.numpy(), (smooth, smooth, 0.0), mode="reflect", truncate=3.0)
+    waves = ndimage.gaussian_filter(
+        noise.numpy(), (smooth, smooth, 0.0), mode="reflect", truncate=3.0
+    )
     third = REFERENCE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
@@ -267,9 +339,12 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
 
 
 FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # how dense the fog is
-FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)  # how fast its details lose height: less is rougher
-FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))  # weight of the picture and of the frost
-FEATHER_AREA = 260  # square half-pixels of the reference picture for each feather of ice
+# how fast its details lose height: less is rougher
+FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)
+# weight of the picture and of the frost
+FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))
+# square half-pixels of the reference picture for each feather of ice
+FEATHER_AREA = 260
 ICE = (0.86, 0.95, 1.0)  # colour of the ice, sRGB
 SNOW = (
     (0.1, 0.3, 3.0, 0.5, 10.0, 4.0),
@@ -278,8 +353,11 @@ SNOW = (
     (0.55, 0.3, 4.5, 0.85, 12.0, 8.0),
     (0.55, 0.3, 2.5, 0.85, 12.0, 12.0),
 )
-"""Mean and spread of the noise, size of a flake, noise over which there is one, radius and spread of its streak."""
-SNOW_KEEP = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))  # weight of the picture; the rest is a paler one
+"""Mean and spread of the noise, size of a flake, noise over which there is one, radius
+and spread of its streak.
+"""
+# weight of the picture; the rest is a paler one
+SNOW_KEEP = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
 LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
 
 
@@ -287,35 +365,48 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add drifts of white, and scale the brightest value back to what it was."""
     height, width = image.shape[:2]
     (density,) = at_level(FOG, level)
-    drift = between(level, lambda whole: _drift(height, width, seed, FOG_DECAY[whole - 1]))
+    drift = between(
+        level, lambda whole: _drift(height, width, seed, FOG_DECAY[whole - 1])
+    )
     brightest = image.max()
-    return (image + density * drift.to(image.device)) * brightest / (brightest + density)
+    return (
+        (image + density * drift.to(image.device)) * brightest / (brightest + density)
+    )
 
 
 @lru_cache(maxsize=8)
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """(H, W, 1) fog in [0, 1]."""
     tall, wide = reference_size(height, width)
-    return images.resized(fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None], height, width)
+    return images.resized(
+        fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None],
+        height,
+        width,
+    )
 
 
 def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
-    """Return fractal noise in [0, 1], at least side x side, made by midpoint displacement on a torus.
+    """Return fractal noise in [0, 1], at least side x side, made by midpoint
+    displacement on a torus.
 
-    Each step doubles the grid: new points are the mean of their four neighbours plus noise, whose height falls by
-    `decay` squared from step to step (Fournier, Fussell, Carpenter 1982, Computer rendering of stochastic models).
+    Each step doubles the grid: new points are the mean of their four neighbours plus
+    noise, whose height falls by `decay` squared from step to step (Fournier, Fussell,
+    Carpenter 1982, Computer rendering of stochastic models).
     """
-    grid, height = torch.zeros(1, 1), 1.0
+    grid = torch.zeros(1, 1)
+    height = 1.0
     while grid.shape[0] < side:
         size = grid.shape[0]
         noise = (torch.rand(3, size, size, generator=source) * 2.0 - 1.0) * height
-        right, down = grid.roll(-1, 1), grid.roll(-1, 0)
+        right = grid.roll(-1, 1)
+        down = grid.roll(-1, 0)
         middle = (grid + right + down + right.roll(-1, 0)) / 4.0 + noise[0]
         finer = torch.empty(2 * size, 2 * size)
         finer[::2, ::2], finer[1::2, 1::2] = grid, middle
         finer[::2, 1::2] = (grid + right + middle + middle.roll(1, 0)) / 4.0 + noise[1]
         finer[1::2, ::2] = (grid + down + middle + middle.roll(1, 1)) / 4.0 + noise[2]
-        grid, height = finer, height / decay**2
+        grid = finer
+        height = height / decay**2
     grid = grid - grid.min()
     return grid / grid.max()
 
@@ -323,12 +414,16 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
 def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
     keep, ice = at_level(FROST, level)
-    return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed).to(image.device)
+    return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed).to(
+        image.device
+    )
 
 
 @lru_cache(maxsize=4)
 def _crystals(height: int, width: int, seed: int) -> Tensor:
-    """(H, W, 3) ice in [0, 1]: feathers of crystals over a film that is thicker in places, a little blue."""
+    """(H, W, 3) ice in [0, 1]: feathers of crystals over a film that is thicker in
+    places, a little blue.
+    """
     tall, wide = reference_size(height, width)
     source = generator(seed, "frost")
     film = fractal(max(tall, wide), 1.4, source)[:tall, :wide, None]
@@ -338,19 +433,27 @@ def _crystals(height: int, width: int, seed: int) -> Tensor:
 
 
 def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
-    """Return (height, width, 1) in [0, 1]: ice needles with barbs at 60 degrees, as ice grows on glass."""
+    """Return (height, width, 1) in [0, 1]: ice needles with barbs at 60 degrees, as ice
+    grows on glass.
+    """
     canvas = Image.new("L", (width, height))
     pen = ImageDraw.Draw(canvas)
     drawn = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
     for shine, across, down, turn, size in sorted(drawn):
-        start, along = complex(across * width, down * height), cmath.rect(1.0, 2.0 * math.pi * turn)
+        start = complex(across * width, down * height)
+        along = cmath.rect(1.0, 2.0 * math.pi * turn)
         length = 12.0 + 110.0 * size**3
         _line(pen, start, start + length * along, shine)
         for step in range(4, int(length), 4):
             uneven = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
             barb = (0.2 + 0.35 * uneven) * (length - step) * along
             for side in (math.pi / 3.0, -math.pi / 3.0):
-                _line(pen, start + step * along, start + step * along + barb * cmath.rect(1.0, side), 0.7 * shine)
+                _line(
+                    pen,
+                    start + step * along,
+                    start + step * along + barb * cmath.rect(1.0, side),
+                    0.7 * shine,
+                )
     return torch.from_numpy(np.asarray(canvas, dtype=np.float32) / 255.0)[..., None]
 
 
@@ -361,7 +464,9 @@ def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) 
 def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
     (keep,) = at_level(SNOW_KEEP, level)
-    layer = between(level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole)).to(image.device)
+    layer = between(
+        level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole)
+    ).to(image.device)
     grey = (image * image.new_tensor(LUMA)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
     return keep * image + (1.0 - keep) * pale + layer + layer.rot90(2)
@@ -374,7 +479,9 @@ def _snowfall(height: int, width: int, seed: int, whole: int) -> Tensor:
     mean, spread, flake, over, radius, sigma = SNOW[whole - 1]
     source = generator(seed, "snow")
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
-    noise = mean + spread * torch.randn(math.ceil(tall / flake), math.ceil(wide / flake), 1, generator=source)
+    noise = mean + spread * torch.randn(
+        math.ceil(tall / flake), math.ceil(wide / flake), 1, generator=source
+    )
     flakes = images.resized(noise, tall, wide)
     flakes = torch.where(flakes < over, torch.zeros_like(flakes), flakes)
     streaks = streaked(flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0)

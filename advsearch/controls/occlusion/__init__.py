@@ -1,7 +1,9 @@
-"""The `occlusion` control: a second object between the camera and the object, hiding a wanted share of it.
+"""The `occlusion` control: a second object between the camera and the object, hiding a
+wanted share of it.
 
-The occluder comes in from one side of the picture, on a sphere around the camera, and stops where it hides as much as
-was asked for (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4):
+The occluder comes in from one side of the picture, on a sphere around the camera, and
+stops where it hides as much as was asked for (3DB, Leclerc et al. 2021, arXiv
+2106.03805, section 4):
 
     place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
 
@@ -41,18 +43,25 @@ MADE = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*MADE, *BUNDLED)
 EASE = 0.02
-"""Below this coverage the occluder slides in from outside the frame, so that the picture changes without a jump."""
-CLEARANCE = 0.05  # smallest distance in object sizes between the camera and the occluder
+"""Below this coverage the occluder slides in from outside the frame, so that the
+picture changes without a jump.
+"""
+# smallest distance in object sizes between the camera and the occluder
+CLEARANCE = 0.05
 
 
 @cache
 def loaded(spec: str) -> assets.ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin. Raises InputError
-    where there is no such object, or the file cannot be used."""
+    """Return a bundled object or one from a mesh file, its largest extent 1, centred on
+    the origin. Raises InputError where there is no such object, or the file cannot be
+    used.
+    """
     asset = SceneDescription.load_object(spec)
     mesh = assets.normalised(asset.mesh)
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
-    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
+    return replace(
+        asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32))
+    )
 
 
 def _asset(option: str) -> assets.ObjectAsset:
@@ -61,25 +70,47 @@ def _asset(option: str) -> assets.ObjectAsset:
 
 @cache
 def made(name: str) -> assets.ObjectAsset:
-    """Return one of the occluders made here, one object size large around the origin: "card" or "sphere"."""
+    """Return one of the occluders made here, one object size large around the origin:
+    "card" or "sphere".
+    """
     generator = np.random.Generator(np.random.PCG64(7))
     if name == "card":
-        texels = np.array([0.70, 0.53, 0.36]) + generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
-        texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
-        uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
-        vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
+        texels = np.array([0.70, 0.53, 0.36]) + generator.normal(
+            0.0, 0.012, (64, 64, 1)
+        ) * np.ones(3)
+        # the flutes under the paper
+        texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]
+        uvs = np.array(
+            [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32
+        )
+        vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(
+            np.float32
+        )
         normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-        card = assets.Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
-        return assets.ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), assets.Material(roughness=0.9))
+        card = assets.Mesh(
+            vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs
+        )
+        return assets.ObjectAsset(
+            name,
+            card,
+            texels.clip(0.0, 1.0).astype(np.float32),
+            assets.Material(roughness=0.9),
+        )
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
-    return assets.ObjectAsset(name, parts.sphere(24, 48), grey, assets.Material(roughness=0.6))
+    return assets.ObjectAsset(
+        name, parts.sphere(24, 48), grey, assets.Material(roughness=0.6)
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an occluder goes, in the camera's coordinates; lengths are in object sizes."""
+    """Where an occluder goes, in the camera's coordinates; lengths are in object
+    sizes.
+    """
 
-    axes: assets.Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
+    # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is
+    # seen
+    axes: assets.Doubles
     angle: float  # from that middle to the occluder, radians
     size: float  # made smaller where it would not fit
     distance: float  # from the camera, changed where it would not fit
@@ -88,7 +119,9 @@ class Placement:
 
 
 class OcclusionControl(Control):
-    """A second object between the camera and the object, hiding a wanted share of it."""
+    """A second object between the camera and the object, hiding a wanted share of
+    it.
+    """
 
     kind = "occlusion"
     amount = "coverage"
@@ -96,21 +129,31 @@ class OcclusionControl(Control):
     refines = frozenset(geometry.SURROUNDINGS)
     parameters = (
         Parameter.named("which", OPTIONS, "card",
-                        "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+                        "What it is: a piece of cardboard, a grey sphere, or a bundled "
+                        "object.",
                         estimators=("differences",), moves_silhouettes=True),
         _moving("coverage", "1", 0.0, 0.9, 0.0,
-                "Share of the object's picture area that it hides; at 0 it is out of the frame.", (0.0, 0.5)),
+                "Share of the object's picture area that it hides; at 0 it is out of "
+                "the frame.", (0.0, 0.5)),
         _moving("direction", "degrees", -3600.0, 3600.0, 0.0,
-                "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.", (0.0, 360.0),
+                "Side of the picture it comes in from: 0 is the right, 90 the top, "
+                "counter-clockwise.", (0.0, 360.0),
                 periodic=True),
         _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", (0.3, 1.0), log=True),
         _moving("distance", "1", 0.1, 0.9, 0.5,
-                "Where between the camera and the object's middle: 0 is the camera, 1 the middle.", (0.3, 0.7)),
-        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder about its own upright axis.",
+                "Where between the camera and the object's middle: 0 is the camera, 1 "
+                "the middle.", (0.3, 0.7)),
+        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder "
+                                                         "about its own upright axis.",
                 periodic=True),
     )  # fmt: skip
     choices = (
-        Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
+        Choice(
+            "object",
+            None,
+            "Another occluder in place of `which`: any bundled "
+            "object, or a path to a mesh file.",
+        ),
     )
 
     def check_choices(self) -> None:
@@ -119,37 +162,57 @@ class OcclusionControl(Control):
             return
         if not isinstance(occluder, (str, Path)) or not str(occluder).strip():
             raise InputError(
-                f"{self.name}.object: expected the name of a bundled object or a path to a mesh file, got {occluder!r}"
+                f"{self.name}.object: expected the name of a bundled object or a path "
+                f"to a mesh file, got {occluder!r}"
             )
         if "which" in self._given:
-            raise InputError(f"{self.name}: object and which both say what the occluder is; leave one of them out")
+            raise InputError(
+                f"{self.name}: object and which both say what the "
+                "occluder is; leave one of them out"
+            )
         self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        away = geometry.put_away(torch.from_numpy(geometry.camera_to_world(scene))).numpy()
+        away = geometry.put_away(
+            torch.from_numpy(geometry.camera_to_world(scene))
+        ).numpy()
         for option in self._candidates():
             asset = _asset(option)
             looks = asset.base_color, asset.material, asset.label
-            scene = scene.with_part(parts.MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
+            scene = scene.with_part(
+                parts.MeshPart(self._part(option), asset.mesh, *looks, to_world=away)
+            )
         return scene
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         chosen = self._option(values)
         camera = geometry.camera_in(self.scene, so_far).to(values["turn"])
-        inputs = {f"{self._part(one)}.to_world": geometry.put_away(camera) for one in self._candidates()}
+        inputs = {
+            f"{self._part(one)}.to_world": geometry.put_away(camera)
+            for one in self._candidates()
+        }
         placed = self.placement(values, so_far)
         if not placed.away:
             inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
         return inputs
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        """What is hidden of the object, and what became of the size and the distance that were asked for."""
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
+        """What is hidden of the object, and what became of the size and the distance
+        that were asked for.
+        """
         placed = self.placement(values, so_far)
         hidden = {"hidden": Value(value=float(placed.hidden), unit="1")}
         if placed.away:
             return hidden
         sizes = {"true_size": placed.size, "true_distance": placed.distance}
-        return hidden | {name: Value(value=float(value), unit="object sizes") for name, value in sizes.items()}
+        return hidden | {
+            name: Value(value=float(value), unit="object sizes")
+            for name, value in sizes.items()
+        }
 
     def _candidates(self) -> tuple[str, ...]:
         """Every occluder that can be chosen; each is a part of the scene."""
@@ -158,36 +221,63 @@ class OcclusionControl(Control):
         return tuple(map(str, self.allowed("which", MADE[0])))
 
     def _option(self, values: Values) -> str:
-        return self._candidates()[0] if self.chosen["object"] is not None else OPTIONS[int(values["which"])]
+        return (
+            self._candidates()[0]
+            if self.chosen["object"] is not None
+            else OPTIONS[int(values["which"])]
+        )
 
     def _part(self, option: str) -> str:
-        """The name of an occluder's part: the instance's, with the option where there are several."""
+        """The name of an occluder's part: the instance's, with the option where there
+        are several.
+        """
         return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
 
     def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes, with camera and object where other controls put them; without
-        derivatives."""
+        """Work out where the occluder goes, with camera and object where other controls
+        put them; without derivatives.
+        """
         asked = {name: float(value.detach()) for name, value in values.items()}
         seen = _Seen.of(self.scene, so_far)
         mesh = _asset(self._option(values)).mesh
         if seen.directions is None or asked["coverage"] <= 0.0:
-            return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
-        points = mesh.vertices.astype(np.float64) @ geometry.rotation(asked["turn"], 0.0, 0.0).T
-        size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
-        ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
+            return Placement(
+                np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True
+            )
+        points = (
+            mesh.vertices.astype(np.float64)
+            @ geometry.rotation(asked["turn"], 0.0, 0.0).T
+        )
+        size, distance = _fitting(
+            points, asked["size"], asked["distance"] * seen.far, seen.near
+        )
+        ahead = np.stack(
+            [points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size],
+            axis=1,
+        )
         cover = silhouettes.silhouette(ahead, mesh.faces)
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
         axes = silhouettes.middle_axes(seen.directions)
         sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
-        outside = silhouettes.angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
+        outside = silhouettes.angle_outside(
+            seen.shown, seen.rim, cover, axes, asked["direction"]
+        )
         angle = sweep.solve(max(asked["coverage"], EASE), outside)
         if asked["coverage"] < EASE:
             angle = outside + (angle - outside) * asked["coverage"] / EASE
-        return Placement(axes, angle, size, distance, float(sweep.coverage(np.array([angle]))[0]), False)
+        return Placement(
+            axes,
+            angle,
+            size,
+            distance,
+            float(sweep.coverage(np.array([angle]))[0]),
+            False,
+        )
 
 
-# ---- what the camera sees -------------------------------------------------------------------------------------------
+# ---- what the camera sees
+# -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,38 +297,56 @@ class _Seen:
         camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
         pose = _numpy(so_far, "object.to_world", geometry.object_to_world(scene))
         mesh = scene.object.mesh
-        vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
+        vertices = mesh.vertices.astype(np.float64) + _numpy(
+            so_far, "object.offsets", np.zeros(3)
+        )
         world = vertices @ pose[:3, :3].T + pose[:3, 3]
         # right, up, forward: a sensor's own x axis points to the left
         points = (world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0)
         if (model := scene.camera_model) is not None:
-            model = model.with_numbers(so_far["camera.lens"].detach().cpu()) if "camera.lens" in so_far else model
+            model = (
+                model.with_numbers(so_far["camera.lens"].detach().cpu())
+                if "camera.lens" in so_far
+                else model
+            )
             shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
             directions = _through(model, points, mesh.faces)
         else:
-            fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
+            fov = float(
+                _numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0]
+            )
             shift = _numpy(so_far, "camera.shift", np.zeros(2))
-            frame = geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+            frame = geometry.Frame.of(
+                fov, scene.aspect, (float(shift[0]), float(shift[1]))
+            )
             silhouette = silhouettes.silhouette(points, mesh.faces, frame)
-            shown, rim = silhouettes.spread_directions(frame), frame.corners()
+            shown = silhouettes.spread_directions(frame)
+            rim = frame.corners()
             directions = None if silhouette is None else silhouette.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        near, far = float(np.linalg.norm(points, axis=1).min()), float(np.linalg.norm(middle))
+        near = float(np.linalg.norm(points, axis=1).min())
+        far = float(np.linalg.norm(middle))
         return _Seen(directions, shown, rim, near, far)
 
 
 def _through(
     model: geometry.CameraModel, points: assets.Doubles, faces: npt.NDArray[np.uint32]
 ) -> assets.Doubles | None:
-    """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
-    for the same area of the picture, or None."""
-    axes = silhouettes.middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
+    """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera
+    coordinates, is seen through a lens, each for the same area of the picture, or None.
+    """
+    axes = silhouettes.middle_axes(
+        points / np.linalg.norm(points, axis=1, keepdims=True)
+    )
     cover = silhouettes.silhouette(points @ axes.T, faces)
     if cover is None:
         return None
     places, seen = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
     (left, top), (right, bottom) = (
-        (places.amin(dim=0).clamp(0.0, 1.0).tolist(), places.amax(dim=0).clamp(0.0, 1.0).tolist())
+        (
+            places.amin(dim=0).clamp(0.0, 1.0).tolist(),
+            places.amax(dim=0).clamp(0.0, 1.0).tolist(),
+        )
         if bool(seen.all())
         else ((0.0, 0.0), (1.0, 1.0))
     )
@@ -248,33 +356,49 @@ def _through(
 
 
 def _looked(
-    model: geometry.CameraModel, across: tuple[float, float], down: tuple[float, float], count: int
+    model: geometry.CameraModel,
+    across: tuple[float, float],
+    down: tuple[float, float],
+    count: int,
 ) -> assets.Doubles:
-    """Unit directions (N, 3) in which a lens sees a part of the picture: as `Silhouette.directions`, in it."""
+    """Unit directions (N, 3) in which a lens sees a part of the picture: as
+    `Silhouette.directions`, in it.
+    """
     row, column = np.divmod(np.arange(count * count), count)
     number = np.arange(count * count)
     x, y = (
         low + (index + (0.5 + step * number) % 1.0) / count * (high - low)
-        for (low, high), index, step in ((across, column, 0.7548777), (down, row, 0.5698403))
+        for (low, high), index, step in (
+            (across, column, 0.7548777),
+            (down, row, 0.5698403),
+        )
     )
     directions, inside = model.rays(torch.from_numpy(np.stack([x, y], axis=1)))
     found = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles) -> assets.Doubles:
+def _numpy(
+    inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles
+) -> assets.Doubles:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
-# ---- where the occluder goes ----------------------------------------------------------------------------------------
+# ---- where the occluder goes
+# ----------------------------------------------------------------------------------------
 
 
-def _fitting(points: assets.Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
-    """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
-    large around the origin, is between the camera and the object, whose nearest vertex is at `near`. It keeps
-    `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where its size
-    leaves no such place, it is made smaller."""
-    front, back = float(points[:, 0].max()), float(-points[:, 0].min())
+def _fitting(
+    points: assets.Doubles, size: float, distance: float, near: float
+) -> tuple[float, float]:
+    """Return a size and a distance close to those asked for with which an occluder with
+    points (V, 3), one object size large around the origin, is between the camera and
+    the object, whose nearest vertex is at `near`. It keeps `CLEARANCE` from the camera,
+    and no vertex is farther from the camera than the object's nearest one. Where its
+    size leaves no such place, it is made smaller.
+    """
+    front = float(points[:, 0].max())
+    back = float(-points[:, 0].min())
     aside = float(np.hypot(points[:, 1], points[:, 2]).max())
     near = max(near, 3.0 * CLEARANCE)
     for _ in range(200):
@@ -288,13 +412,16 @@ def _fitting(points: assets.Doubles, size: float, distance: float, near: float) 
 
 
 def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
-    """The occluder's pose (4, 4). Differentiable in the camera, the direction and the turn at the angle that was found;
-    nothing else has a derivative here, which is why the control is differentiated by differences."""
+    """The occluder's pose (4, 4). Differentiable in the camera, the direction and the
+    turn at the angle that was found; nothing else has a derivative here, which is why
+    the control is differentiated by differences.
+    """
     right, up, forward = torch.from_numpy(placed.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
     along = torch.cos(direction) * right + torch.sin(direction) * up
     across = -torch.sin(direction) * right + torch.cos(direction) * up
-    sine, cosine = math.sin(placed.angle), math.cos(placed.angle)
+    sine = math.sin(placed.angle)
+    cosine = math.cos(placed.angle)
     ahead = cosine * forward + sine * along
     along = cosine * along - sine * forward
     right = torch.cos(direction) * along - torch.sin(direction) * across

@@ -1,11 +1,13 @@
-"""How much of one thing another hides in the picture: silhouettes, rasterised in numpy, without a renderer.
+"""How much of one thing another hides in the picture: silhouettes, rasterised in numpy,
+without a renderer.
 
-The second thing moves on a sphere around the camera and keeps its side towards it. So its outline, as a set of
-directions from the camera, turns rigidly: it is rasterised once, and every position afterwards is a rotation of the
-directions in which the first thing is seen and a lookup.
+The second thing moves on a sphere around the camera and keeps its side towards it. So
+its outline, as a set of directions from the camera, turns rigidly: it is rasterised
+once, and every position afterwards is a rotation of the directions in which the first
+thing is seen and a lookup.
 
-Coordinates here are the camera's: to the right, upwards and forwards, in object sizes; "tangents" are the first two
-over the third.
+Coordinates here are the camera's: to the right, upwards and forwards, in object sizes;
+"tangents" are the first two over the third.
 """
 
 from __future__ import annotations
@@ -19,62 +21,112 @@ from numpy.typing import NDArray
 from advsearch.extend import assets, geometry, images
 
 RASTER = 128  # pixels along the longer side of a silhouette
-SCAN = 48  # angles at which the coverage is looked up before the crossing is narrowed down
+# angles at which the coverage is looked up before the crossing is narrowed down
+SCAN = 48
 HALVINGS = 12  # steps that narrow it down
 GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row 0 at its low end."""
+    """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row
+    0 at its low end.
+    """
 
     mask: NDArray[np.bool_]
     window: geometry.Frame
 
     def directions(self) -> assets.Doubles:
-        """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture. Their places
-        within pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns."""
+        """Unit directions (N, 3), one in each covered pixel; all stand for the same
+        area of the picture. Their places within pixels are a low-discrepancy sequence
+        (Roberts 2018), or an upright edge would hide whole columns.
+        """
         row, column = np.nonzero(self.mask)
-        (height, width), window = self.mask.shape, self.window
+        (height, width) = self.mask.shape
+        window = self.window
         number = np.arange(len(row))
-        x = window.left + (column + (0.5 + 0.7548777 * number) % 1.0) * (window.right - window.left) / width
-        y = window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (window.high - window.low) / height
+        x = (
+            window.left
+            + (column + (0.5 + 0.7548777 * number) % 1.0)
+            * (window.right - window.left)
+            / width
+        )
+        y = (
+            window.low
+            + (row + (0.5 + 0.5698403 * number) % 1.0)
+            * (window.high - window.low)
+            / height
+        )
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
-    def contains(self, x: assets.Doubles, y: assets.Doubles, forwards: assets.Doubles) -> NDArray[np.bool_]:
+    def contains(
+        self, x: assets.Doubles, y: assets.Doubles, forwards: assets.Doubles
+    ) -> NDArray[np.bool_]:
         """Whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
         depth = np.maximum(forwards, geometry.NEAREST)
-        column = np.floor((x / depth - self.window.left) / (self.window.right - self.window.left) * width)
-        row = np.floor((y / depth - self.window.low) / (self.window.high - self.window.low) * height)
-        inside = (forwards > geometry.NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column = np.floor(
+            (x / depth - self.window.left)
+            / (self.window.right - self.window.left)
+            * width
+        )
+        row = np.floor(
+            (y / depth - self.window.low)
+            / (self.window.high - self.window.low)
+            * height
+        )
+        inside = (
+            (forwards > geometry.NEAREST)
+            & (column >= 0)
+            & (column < width)
+            & (row >= 0)
+            & (row < height)
+        )
         row, column = (np.where(inside, at, 0).astype(np.int64) for at in (row, column))
         return np.asarray(inside & self.mask[row, column])
 
 
 def silhouette(
-    points: assets.Doubles, faces: NDArray[np.uint32], frame: geometry.Frame | None = None
+    points: assets.Doubles,
+    faces: NDArray[np.uint32],
+    frame: geometry.Frame | None = None,
 ) -> Silhouette | None:
-    """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it within a frame, None for all in
-    front; faces (F, 3) that reach behind the camera are left out. None if nothing is seen of it."""
+    """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it
+    within a frame, None for all in front; faces (F, 3) that reach behind the camera are
+    left out. None if nothing is seen of it.
+    """
     corners = points[faces.astype(np.int64)]
     corners = corners[(corners[..., 2] > geometry.NEAREST).all(axis=1)]
     if len(corners) == 0:
         return None
     tangents = corners[..., :2] / corners[..., 2:]
-    (left, low), (right, high) = tangents.min(axis=(0, 1)), tangents.max(axis=(0, 1))
+    (left, low) = tangents.min(axis=(0, 1))
+    (right, high) = tangents.max(axis=(0, 1))
     if frame is not None:
-        left, right = max(left, frame.left), min(right, frame.right)
-        low, high = max(low, frame.low), min(high, frame.high)
+        left = max(left, frame.left)
+        right = min(right, frame.right)
+        low = max(low, frame.low)
+        high = min(high, frame.high)
     if not (right > left and high > low):
         return None
     pixel = max(right - left, high - low) / RASTER
-    width, height = (max(1, math.ceil((b - a) / pixel)) for a, b in ((left, right), (low, high)))
-    scaled = (tangents - (left, low)) * (width / (right - left), height / (high - low)) - 0.5
+    width, height = (
+        max(1, math.ceil((b - a) / pixel)) for a, b in ((left, right), (low, high))
+    )
+    scaled = (tangents - (left, low)) * (
+        width / (right - left),
+        height / (high - low),
+    ) - 0.5
     _, row, column, _ = images.pixels_in(scaled, (height, width))
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
-    return Silhouette(mask, geometry.Frame(float(left), float(right), float(low), float(high))) if mask.any() else None
+    return (
+        Silhouette(
+            mask, geometry.Frame(float(left), float(right), float(low), float(high))
+        )
+        if mask.any()
+        else None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +135,16 @@ class Passage:
 
     hidden: assets.Doubles  # directions (N, 3) in which what is to be hidden is seen
     cover: Silhouette  # of the moving thing, straight ahead of the camera
-    axes: assets.Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
-    direction: float  # from which side it comes: degrees, 0 from the right of the picture, 90 from above
+    # (3, 3) rows: where its right, up and forward point when it is in the middle of the
+    # other
+    axes: assets.Doubles
+    # from which side it comes: degrees, 0 from the right of the picture, 90 from above
+    direction: float
 
     def coverage(self, angles: assets.Doubles) -> assets.Doubles:
-        """Return the hidden share (K,) at angles (K,) in radians away from the middle."""
+        """Return the hidden share (K,) at angles (K,) in radians away from the
+        middle.
+        """
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
         along = math.cos(turn) * right + math.sin(turn) * up
@@ -102,8 +159,10 @@ class Passage:
         return np.array(shares)
 
     def solve(self, wanted: float, outside: float) -> float:
-        """Return the largest angle in radians at which the wanted share is hidden: the thing comes in from `outside`,
-        and stops where it first hides as much. If it never does, the angle at which it hides most is returned."""
+        """Return the largest angle in radians at which the wanted share is hidden: the
+        thing comes in from `outside`, and stops where it first hides as much. If it
+        never does, the angle at which it hides most is returned.
+        """
         angles = np.linspace(outside, 0.0, SCAN)
         shares = self.coverage(angles)
         enough = np.nonzero(shares >= wanted)[0]
@@ -111,7 +170,8 @@ class Passage:
             return float(angles[int(np.argmax(shares))])
         if enough[0] == 0:
             return float(angles[0])
-        out, within = float(angles[enough[0] - 1]), float(angles[enough[0]])
+        out = float(angles[enough[0] - 1])
+        within = float(angles[enough[0]])
         for _ in range(HALVINGS):
             middle = 0.5 * (out + within)
             if float(self.coverage(np.array([middle]))[0]) >= wanted:
@@ -127,25 +187,36 @@ def spread_directions(frame: geometry.Frame) -> assets.Doubles:
 
 
 def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
-    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows right, up, forward."""
+    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows
+    right, up, forward.
+    """
     forward = hidden.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
-    right = np.cross((0.0, 1.0, 0.0), forward)  # forward is never straight up: it is in front of the camera
+    # forward is never straight up: it is in front of the camera
+    right = np.cross((0.0, 1.0, 0.0), forward)
     right = right / max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(forward, right), forward])
 
 
 def angle_outside(
-    shown: assets.Doubles, rim: assets.Doubles, cover: Silhouette, axes: assets.Doubles, direction: float
+    shown: assets.Doubles,
+    rim: assets.Doubles,
+    cover: Silhouette,
+    axes: assets.Doubles,
+    direction: float,
 ) -> float:
-    """Return the angle in radians beyond which a thing that comes from a direction, degrees, is out of the picture on
-    its side: of directions (N, 3) spread over the whole picture and (M, 3) at its edge; the others as of `Passage`."""
+    """Return the angle in radians beyond which a thing that comes from a direction,
+    degrees, is out of the picture on its side: of directions (N, 3) spread over the
+    whole picture and (M, 3) at its edge; the others as of `Passage`.
+    """
     radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
     angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)
     covered = Passage(shown, cover, axes, direction).coverage(angles)
     inside = np.nonzero(covered > 0.0)[0]
-    return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
+    return (
+        float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
+    )
 
 
 def _unit(vectors: assets.Doubles) -> assets.Doubles:

@@ -1,9 +1,11 @@
-"""The `path` control: the camera, the object or both travel, and `time` says where along the way they are.
+"""The `path` control: the camera, the object or both travel, and `time` says where
+along the way they are.
 
-Of several paths (`approach,orbit,own.csv`) one is drawn with each configuration: `way` is its name.
-A frame of a drive is one time. So `--over path` finds one configuration for a whole drive, and a grid over `path.time`
-has its frames in order. Where the scene as it is described is a frame, that is the clean one: the end of `approach`,
-the middle of `pass`, the beginning of `orbit`.
+Of several paths (`approach,orbit,own.csv`) one is drawn with each configuration: `way`
+is its name. A frame of a drive is one time. So `--over path` finds one configuration
+for a whole drive, and a grid over `path.time` has its frames in order. Where the scene
+as it is described is a frame, that is the clean one: the end of `approach`, the middle
+of `pass`, the beginning of `orbit`.
 """
 
 from __future__ import annotations
@@ -49,24 +51,39 @@ from advsearch.extend import (
     stored_files,
 )
 
-APPROACH, PASS, TURN = "approach", "pass", "orbit"
+APPROACH = "approach"
+PASS = "pass"
+TURN = "orbit"
 PATHS = (APPROACH, PASS, TURN)
 CAMERA, THING = MOVERS = "camera", "object"
-PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")  # of files with a path, in small letters
+# of files with a path, in small letters
+PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
 BOTH = "+"  # between the camera's path and the object's
 SEVERAL = ","  # between paths of which one is drawn
 MOST_PATHS = 64
-CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}  # share of the time at which the scene is as it is described
+# share of the time at which the scene is as it is described
+CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 
-REACH, SECONDS = 4.0, 10.0
-SHORTEST, LONGEST = 1e-3, 3600.0  # seconds between waypoints at least, and of a path at most
-ROUNDED = 1e-3  # share of the least time between waypoints that may be lost where times are written in decimals
-NEAREST = 1e-3  # object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
-LOOKS = 2048  # times at which curved paths are looked at; a file's waypoints are in addition
-TIME, PLACE, LOOKING, HEADING = "time", ("x", "y", "z"), ("look_x", "look_y", "look_z"), "heading"
-SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
+REACH = 4.0
+SECONDS = 10.0
+SHORTEST = 1e-3  # seconds between waypoints at least, and of a path at most
+LONGEST = 3600.0
+# share of the least time between waypoints that may be lost where times are written in
+# decimals
+ROUNDED = 1e-3
+# object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
+NEAREST = 1e-3
+# times at which curved paths are looked at; a file's waypoints are in addition
+LOOKS = 2048
+TIME = "time"
+PLACE = ("x", "y", "z")
+LOOKING = ("look_x", "look_y", "look_z")
+HEADING = "heading"
+SHIFT = ("object_x", "object_y", "object_z")
+TURNING = "object_heading"
 """Columns of the object in a file that is about both."""
-MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
+MOST_WAYPOINTS = 100_000
+MOST_BYTES = 16 * 2**20
 TRAJECTORY_CHOICES = ("axes", "up", "object_at")
 MAX_TILT = 60.0  # degrees from up, on average, over which other axes are likelier
 FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
@@ -74,36 +91,55 @@ FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """A way from a file; lengths are in metres where the object's size is known, in object sizes elsewhere."""
+    """A way from a file; lengths are in metres where the object's size is known, in
+    object sizes elsewhere.
+    """
 
     times: Tensor  # (n,) ascending, seconds from the first
-    places: Tensor  # (n, 3) from the middle of where the object stands; of an object that moves, its shift
-    targets: Tensor | None  # (n, 3) what the camera looks at, from the same middle; None for the middle itself
+    # (n, 3) from the middle of where the object stands; of an object that moves, its
+    # shift
+    places: Tensor
+    # (n, 3) what the camera looks at, from the same middle; None for the middle itself
+    targets: Tensor | None
     headings: Tensor | None  # (n,) degrees that the object is turned by; None for none
-    # (n, 4) quaternions x, y, z, w from the camera's axes (x right, y down, z ahead); None where it looks at targets
+    # (n, 4) quaternions x, y, z, w from the camera's axes (x right, y down, z ahead);
+    # None where it looks at targets
     rotations: Tensor | None = None
     has_times: bool = True
     is_trajectory: bool = False
     notes: tuple[str, ...] = ()  # sentences about how it is read
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
-        """Return a column, or several, at times (...,), linear between waypoints; differentiable in the times."""
-        place = torch.searchsorted(self.times, time.detach(), right=True).clamp(1, len(self.times) - 1)
-        begin, end = self.times[place - 1], self.times[place]
+        """Return a column, or several, at times (...,), linear between waypoints;
+        differentiable in the times.
+        """
+        place = torch.searchsorted(self.times, time.detach(), right=True).clamp(
+            1, len(self.times) - 1
+        )
+        begin = self.times[place - 1]
+        end = self.times[place]
         share = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
-        return torch.lerp(of[place - 1], of[place], share[..., None] if of.ndim > 1 else share)
+        return torch.lerp(
+            of[place - 1], of[place], share[..., None] if of.ndim > 1 else share
+        )
 
     def rotation_at(self, time: Tensor) -> Tensor:
-        """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's right, down and ahead."""
+        """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's
+        right, down and ahead.
+        """
         assert self.rotations is not None
         quaternion = self.at(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        entries = torch.stack(geometry.entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1)
+        entries = torch.stack(
+            geometry.entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1
+        )
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
 class Start(NamedTuple):
-    """A scene as it is described: poses (4, 4) of its camera and its object, and the middle (3,) of that; float32."""
+    """A scene as it is described: poses (4, 4) of its camera and its object, and the
+    middle (3,) of that; float32.
+    """
 
     camera: Tensor
     middle: Tensor
@@ -122,83 +158,134 @@ class PathControl(Control):
     travels = True
     parameters = (
         Parameter.moving(
-            Parameter.ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."
+            Parameter.ORBIT,
+            "time",
+            "s",
+            0.0,
+            LONGEST,
+            "where the scene is as it is",
+            "Time since the path began.",
         ),
     )
     choices = (
         Choice("path", APPROACH,
-               "approach (straight up to where it stands), pass (straight past it), orbit (once around), a .csv file "
-               "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. Two of them with a + between: the "
-               "camera's and the object's. Several with commas between: each configuration has one of them, `way`.",
+               "approach (straight up to where it stands), pass (straight past it), "
+               "orbit (once around), a .csv file "
+               "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
+               "Two of them with a + between: the "
+               "camera's and the object's. Several with commas between: each "
+               "configuration has one of them, `way`.",
                "path"),
         Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
-        Choice("seconds", SECONDS, "How long it takes; a file says so itself, but for KITTI's poses.", most=LONGEST),
+        Choice("seconds", SECONDS, "How long it takes; a file says so itself, but for "
+                                   "KITTI's poses.", most=LONGEST),
         Choice("reach", REACH,
-               "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass "
+               "How far it goes, in distances of the scene's own camera: where "
+               "approach begins, half of what pass "
                "takes.", most=1000.0),
         Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
-        Choice("rolling", None, "Seconds in which the rows are read, one after the other; below 0 from the bottom.",
+        Choice("rolling", None, "Seconds in which the rows are read, one after the "
+                                "other; below 0 from the bottom.",
                "rolling", most=60.0, signed=True),
         Choice("axes", None,
-               "The axes of a trajectory's poses: optical (x right, y down, z ahead), opengl (x right, y up, z back), "
-               "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x up, y right, z ahead), or none: "
+               "The axes of a trajectory's poses: optical (x right, y down, z ahead), "
+               "opengl (x right, y up, z back), "
+               "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
+               "up, y right, z ahead), or none: "
                "the camera looks at the object. By default optical.", options=tuple(AXES_MEAN)),
-        Choice("up", None, "What is up in a trajectory's world; by default z, of KITTI -y.",
+        Choice("up", None, "What is up in a trajectory's world; by default z, of KITTI "
+                           "-y.",
                options=tuple(WORLD_TO_Z_UP)),
-        Choice("object_at", None, "Where the object's middle is in a trajectory's world, as [x, y, z]; by default its "
+        Choice("object_at", None, "Where the object's middle is in a trajectory's "
+                                  "world, as [x, y, z]; by default its "
                "origin."),
     )  # fmt: skip
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """The time, and of several paths which it is."""
-        names = _names(settings.get("path", APPROACH)) if isinstance(settings, Mapping) else ()
+        names = (
+            _names(settings.get("path", APPROACH))
+            if isinstance(settings, Mapping)
+            else ()
+        )
         if len(names) < 2:
             return cls.parameters
-        return *cls.parameters, Parameter.named(Control.WAY, names, names[0], "Which of the paths.")
+        return *cls.parameters, Parameter.named(
+            Control.WAY, names, names[0], "Which of the paths."
+        )
 
     def check_choices(self) -> None:
         names = _names(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MOST_PATHS:
-            raise InputError(f"{self.name}.path: expected at most {MOST_PATHS} different paths, got {', '.join(names)}")
+            raise InputError(
+                f"{self.name}.path: expected at most {MOST_PATHS} "
+                f"different paths, got {', '.join(names)}"
+            )
         self._check_object_at()
         self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
         self._movers = {mover for ways in self._paths for mover in ways}
         every = [way for ways in self._paths for way in ways.values()]
         self._files = [way for way in every if isinstance(way, Waypoints)]
-        if "moves" in self._given and not any(len(one.split(BOTH)) == 1 for one in names):
-            raise InputError(f"{self.name}: {names[0]} says what the camera does and what the object; leave moves out")
+        if "moves" in self._given and not any(
+            len(one.split(BOTH)) == 1 for one in names
+        ):
+            raise InputError(
+                f"{self.name}: {names[0]} says what the camera does and "
+                "what the object; leave moves out"
+            )
         if "path" in self._given:  # otherwise the run may say it, later
             self._check_needless()
         timed = any(way.has_times for way in self._files)
-        for setting, said in (("seconds", timed), ("reach", len(self._files) == len(every))):
+        for setting, said in (
+            ("seconds", timed),
+            ("reach", len(self._files) == len(every)),
+        ):
             if said and setting in self._given:
                 asked = self.chosen["path"]
-                raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
+                raise InputError(
+                    f"{self.name}: {setting}: the file in {asked} says "
+                    "that itself; leave it out"
+                )
         if self._files:
             self.chosen["seconds"] = max(float(way.times[-1]) for way in self._files)
         self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
     def _read(self, name: str) -> Ways:
         """What a path makes of camera and object."""
-        names = two if len(two := name.split(BOTH)) == 2 and all(map(_is_path, two)) else [name]
+        names = (
+            two
+            if len(two := name.split(BOTH)) == 2 and all(map(_is_path, two))
+            else [name]
+        )
         alone = len(names) == 1
         if alone and not _is_path(name):
             raise InputError(
-                f"{self.name}.path: expected {', '.join(PATHS)}, a {' or '.join(PATH_ENDINGS)} file, or two of them as "
-                f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got {name!r}"
+                f"{self.name}.path: expected {', '.join(PATHS)}, a "
+                f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
+                f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got "
+                f"{name!r}"
             )
         ways: dict[str, Way] = {}
-        for mover, part in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
-            ways |= {mover: part} if part in PATHS else self._read_file(Path(part), mover, alone)
+        for mover, part in zip(
+            [str(self.chosen["moves"])] if alone else MOVERS, names, strict=True
+        ):
+            ways |= (
+                {mover: part}
+                if part in PATHS
+                else self._read_file(Path(part), mover, alone)
+            )
         return ways
 
     def _check_needless(self) -> None:
         """Refuse what is about trajectories where there is none."""
-        needless = [name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None]
+        needless = [
+            name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
+        ]
         if needless and not any(way.is_trajectory for way in self._files):
             raise InputError(
-                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or KITTI, and there is none; "
+                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or "
+                "KITTI, and there is none; "
                 "leave it out"
             )
 
@@ -207,8 +294,13 @@ class PathControl(Control):
         if given is None:
             return
         fits = isinstance(given, list | tuple) and len(given) == 3
-        if not fits or not all(Parameter.is_number(value) and math.isfinite(value) for value in given):
-            raise InputError(f"{self.name}.object_at: expected three numbers as in [20, 0, 0], got {given!r}")
+        if not fits or not all(
+            Parameter.is_number(value) and math.isfinite(value) for value in given
+        ):
+            raise InputError(
+                f"{self.name}.object_at: expected three numbers as in "
+                f"[20, 0, 0], got {given!r}"
+            )
 
     def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
         text = _read_text(path)
@@ -217,13 +309,16 @@ class PathControl(Control):
             return read_waypoints(path, mover, text=text, alone=alone)
         if mover != CAMERA:
             raise errors.FileFormatError(
-                f"{path}: {trajectory.format.value} is about the camera, and here the object moves; write its way as "
+                f"{path}: {trajectory.format.value} is about the camera, and here the "
+                "object moves; write its way as "
                 "time,x,y,z,heading"
             )
         return {mover: self._follow(path, trajectory)}
 
     def _follow(self, path: Path, trajectory: Trajectory) -> Waypoints:
-        """Return the way of the camera on a trajectory, with notes on what its file does not state."""
+        """Return the way of the camera on a trajectory, with notes on what its file
+        does not state.
+        """
         count = len(trajectory.positions)
         notes = list(trajectory.notes)
         assumed = dict[str, str]()
@@ -233,7 +328,9 @@ class PathControl(Control):
             if "seconds" in self._given:
                 seconds = float(self.chosen["seconds"])
             else:
-                assumed["seconds"] = f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
+                assumed["seconds"] = (
+                    f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
+                )
             times = np.linspace(0.0, seconds, count)
         check_times(path, times)
 
@@ -241,7 +338,9 @@ class PathControl(Control):
         up = str(self.chosen["up"] or trajectory.default_up)
         origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
         if trajectory.rotations is None and axes == UNUSED:
-            raise InputError(f"{self.name}: axes: {path} has no rotations; leave it out")
+            raise InputError(
+                f"{self.name}: axes: {path} has no rotations; leave it out"
+            )
         if self.chosen["axes"] is None and trajectory.rotations is not None:
             assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
         if self.chosen["up"] is None:
@@ -251,24 +350,30 @@ class PathControl(Control):
         positions, rotations = trajectory.orient(axes, up, origin)
         if np.abs(positions).max() > FARTHEST:
             raise errors.FileFormatError(
-                f"{path}: expected positions within {FARTHEST:g} of the object, got larger ones; object_at says where "
+                f"{path}: expected positions within {FARTHEST:g} of the object, got "
+                "larger ones; object_at says where "
                 "that is in the file's world"
             )
         if assumed:
             listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
             notes.append(
-                f"{path}: not everything is stated by {trajectory.format.value}. Assumed: {listed}. If that is wrong, "
-                f"say {', '.join(assumed)} of the control path; with axes none the camera looks at the object."
+                f"{path}: not everything is stated by {trajectory.format.value}. "
+                f"Assumed: {listed}. If that is wrong, "
+                f"say {', '.join(assumed)} of the control path; with axes none the "
+                "camera looks at the object."
             )
         quaternions = None
         if rotations is not None:
             tilt = measure_tilt(rotations)
             if tilt > MAX_TILT:
                 notes.append(
-                    f"{path}: the top of its pictures is {tilt:.0f} degrees from up, on average; another `axes` or "
+                    f"{path}: the top of its pictures is {tilt:.0f} degrees from up, "
+                    "on average; another `axes` or "
                     "`up` may be right."
                 )
-            quaternions = torch.from_numpy(align_quaternions(rotations.as_quat()).astype(np.float32))
+            quaternions = torch.from_numpy(
+                align_quaternions(rotations.as_quat()).astype(np.float32)
+            )
         return Waypoints(
             torch.from_numpy(times.astype(np.float32)),
             torch.from_numpy(positions.astype(np.float32)),
@@ -281,7 +386,8 @@ class PathControl(Control):
         )
 
     def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        if parameter.name == Control.WAY and Control.WAY not in self.specs:  # whatever else is asked for
+        # whatever else is asked for
+        if parameter.name == Control.WAY and Control.WAY not in self.specs:
             return OneOf(parameter.options)
         return super().spec(parameter)
 
@@ -289,8 +395,12 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and that rows are read in, below 0 from the bottom."""
-        return float(self.chosen["shutter"] or 0.0), float(self.chosen["rolling"] or 0.0)
+        """Seconds that the shutter is open, and that rows are read in, below 0 from the
+        bottom.
+        """
+        return float(self.chosen["shutter"] or 0.0), float(
+            self.chosen["rolling"] or 0.0
+        )
 
     def later(self, seconds: float) -> PathControl:
         then = copy.copy(self)
@@ -300,7 +410,8 @@ class PathControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if CAMERA in self._movers and not scene.is_seen_from_orbit:
             raise InputError(
-                f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
+                f"`controls` {self.name}: moves the camera, and the scene is seen by "
+                f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
             )
         self._check_needless()
@@ -309,30 +420,45 @@ class PathControl(Control):
             if CAMERA in ways:
                 there._check_looks(name, ways)
         notes = [note for way in self._files for note in way.notes]
-        shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
+        shortest = min(
+            (float(one.times[-1]) for one in self._files), default=self.seconds
+        )
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
-                f"path: the shortest of the files takes {_round_text(shortest)} s of {_round_text(self.seconds)}; who "
+                f"path: the shortest of the files takes {_round_text(shortest)} s of "
+                f"{_round_text(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
-        return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes)))) if notes else scene
+        return (
+            replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes))))
+            if notes
+            else scene
+        )
 
     def _check_looks(self, name: str, ways: Ways) -> None:
-        """Refuse a path on which the camera is at what it looks at, at a waypoint or between two."""
+        """Refuse a path on which the camera is at what it looks at, at a waypoint or
+        between two.
+        """
         files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = start_of(self.scene, time.device)
-        place, target = self._camera(ways, begin, time, self._object(ways, begin, time)[0])
+        place, target = self._camera(
+            ways, begin, time, self._object(ways, begin, time)[0]
+        )
         gap = (target - place).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
-        share = (-(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)).clamp(0.0, 1.0)
+        share = (
+            -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)
+        ).clamp(0.0, 1.0)
         away = (gap[:-1] + share[:, None] * step).norm(dim=1)
         if float(away.min()) < NEAREST:
             at = int(away.argmin())
             when = float(torch.lerp(time[at], time[at + 1], share[at].float()))
             raise InputError(
-                f"`controls` {self.name}: {name}: {when:.4g} s after its start the camera is where it "
-                "looks, so that it has no direction; lead it past that place, or say what it looks at (look_x, look_y, "
+                f"`controls` {self.name}: {name}: {when:.4g} s after its start the "
+                "camera is where it "
+                "looks, so that it has no direction; lead it past that place, or say "
+                "what it looks at (look_x, look_y, "
                 "look_z)"
             )
 
@@ -340,13 +466,19 @@ class PathControl(Control):
         if parameter.name == Control.WAY:
             return parameter
         first, *last = self._paths[0].values()
-        way = last[0] if last and first == TURN else first  # who goes around is back at the end
+        # who goes around is back at the end
+        way = last[0] if last and first == TURN else first
         clean = CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
-        return replace(parameter, default=clean, search=(0.0, self.seconds), estimators=estimators)
+        return replace(
+            parameter, default=clean, search=(0.0, self.seconds), estimators=estimators
+        )
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        time, ways = values["time"] + self._later, self._ways(values)
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        time = values["time"] + self._later
+        ways = self._ways(values)
         start = start_of(self.scene, time.device)
         shift, heading = self._object(ways, start, time)
         inputs = {}
@@ -355,21 +487,33 @@ class PathControl(Control):
             roll = self.scene.number("camera.roll")
             way = ways.get(CAMERA)
             if isinstance(way, Waypoints) and way.rotations is not None:
-                inputs["camera.to_world"] = pose_camera(place, way.rotation_at(time), roll)
+                inputs["camera.to_world"] = pose_camera(
+                    place, way.rotation_at(time), roll
+                )
             else:
                 inputs["camera.to_world"] = looking(place, target, roll)
         if THING in self._movers:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {"distance": Value(value=float(self._distance(self._ways(values), values["time"])), unit=unit)}
+        return {
+            "distance": Value(
+                value=float(self._distance(self._ways(values), values["time"])),
+                unit=unit,
+            )
+        }
 
     def distances(self, times: Tensor) -> Tensor:
-        """Return the distances (ways, n) of the camera from the object on each of the paths at times (n,), in the unit
-        of `measured`."""
-        return torch.stack([self._distance(ways, times).expand(times.shape) for ways in self._paths])
+        """Return the distances (ways, n) of the camera from the object on each of the
+        paths at times (n,), in the unit of `measured`.
+        """
+        return torch.stack(
+            [self._distance(ways, times).expand(times.shape) for ways in self._paths]
+        )
 
     def _distance(self, ways: Ways, time: Tensor) -> Tensor:
         start = start_of(self.scene, time.device)
@@ -379,11 +523,21 @@ class PathControl(Control):
         return distance
 
     def _ways(self, values: Values) -> Ways:
-        return self._paths[int(values[Control.WAY])] if Control.WAY in values else self._paths[0]
+        return (
+            self._paths[int(values[Control.WAY])]
+            if Control.WAY in values
+            else self._paths[0]
+        )
 
-    def _camera(self, ways: Ways, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
-        pose, center, way = begin.camera, begin.middle, ways.get(CAMERA)
+    def _camera(
+        self, ways: Ways, begin: Start, time: Tensor, shift: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where the camera is, and what it looks at: an object that is shifted, unless
+        a file says something else.
+        """
+        pose = begin.camera
+        center = begin.middle
+        way = ways.get(CAMERA)
         start = pose[:3, 3]
         if way is None:
             return start, center
@@ -391,41 +545,64 @@ class PathControl(Control):
             place = center + way.at(time, way.places) / self.scene.metres
             if way.rotations is not None:
                 return place, place + way.rotation_at(time)[..., 2]
-            target = center + (shift if way.targets is None else way.at(time, way.targets) / self.scene.metres)
+            target = center + (
+                shift
+                if way.targets is None
+                else way.at(time, way.targets) / self.scene.metres
+            )
             return place, target
-        away, reach = (start - center).norm(), float(self.chosen["reach"])
+        away = (start - center).norm()
+        reach = float(self.chosen["reach"])
         share = (time / self.seconds).clamp(0.0, 1.0)
         if way == APPROACH:
-            return start - _level(pose[:3, 2]) * away * (reach - 1.0) * (1.0 - share)[..., None], center + shift
+            return start - _level(pose[:3, 2]) * away * (reach - 1.0) * (1.0 - share)[
+                ..., None
+            ], center + shift
         if way == PASS:
-            return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[..., None], center + shift
+            return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[
+                ..., None
+            ], center + shift
         angle = 2.0 * math.pi * share
-        (x, y, z), cos, sin = start - center, angle.cos(), angle.sin()
-        around = torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1)
+        (x, y, z) = start - center
+        cos = angle.cos()
+        sin = angle.sin()
+        around = torch.stack(
+            [cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1
+        )
         return center + around, center + shift
 
     def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
-        own, way = begin.camera, ways.get(THING)
+        own = begin.camera
+        way = ways.get(THING)
         still = own.new_zeros(())
         if way is None:
             return own.new_zeros(3), still
         if isinstance(way, Waypoints):
             shift = way.at(time, way.places) / self.scene.metres
             return shift, still if way.headings is None else way.at(time, way.headings)
-        share, reach = (time / self.seconds).clamp(0.0, 1.0), float(self.chosen["reach"])
+        share = (time / self.seconds).clamp(0.0, 1.0)
+        reach = float(self.chosen["reach"])
         if way == TURN:
             return own.new_zeros(3), 360.0 * share
         away = (own[:3, 3] - begin.middle).norm()
         if way == APPROACH:
-            return _level(own[:3, 2]) * (away * (reach - 1.0) * (1.0 - share))[..., None], still
-        return _level(-own[:3, 0]) * (away * reach * (1.0 - 2.0 * share))[..., None], still
+            return _level(own[:3, 2]) * (away * (reach - 1.0) * (1.0 - share))[
+                ..., None
+            ], still
+        return _level(-own[:3, 0]) * (away * reach * (1.0 - 2.0 * share))[
+            ..., None
+        ], still
 
 
 @lru_cache(maxsize=4)
 def start_of(scene: SceneDescription, device: torch.device) -> Start:
     """Return how a scene stands; kept in memory, as it takes a look at every vertex."""
-    poses = geometry.camera_to_world(scene), geometry.middle(scene), geometry.object_to_world(scene)
+    poses = (
+        geometry.camera_to_world(scene),
+        geometry.middle(scene),
+        geometry.object_to_world(scene),
+    )
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
@@ -436,69 +613,101 @@ def _level(along: Tensor) -> Tensor:
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) that looks at a target (3,), rolled by degrees."""
+    """Return the pose (4, 4) of a camera at a place (3,) that looks at a target (3,),
+    rolled by degrees.
+    """
     ahead = (target - place) / (target - place).norm().clamp_min(1e-9)
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
-    aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)  # where it looks straight up or down
+    # where it looks straight up or down
+    aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
     left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
     return _rolled(place, left, torch.linalg.cross(ahead, left), ahead, roll)
 
 
 def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) whose right, down and ahead are the columns of a rotation,
-    rolled by degrees."""
+    """Return the pose (4, 4) of a camera at a place (3,) whose right, down and ahead
+    are the columns of a rotation, rolled by degrees.
+    """
     right, down, ahead = rotation.unbind(dim=-1)
     return _rolled(place, -right, -down, ahead, roll)
 
 
-def _rolled(place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float) -> Tensor:
-    cos, sin = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    return geometry.affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
+def _rolled(
+    place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
+) -> Tensor:
+    cos = math.cos(math.radians(roll))
+    sin = math.sin(math.radians(roll))
+    return geometry.affine(
+        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place
+    )
 
 
 def measure_tilt(rotations: Rotation) -> float:
-    """Return how far the top of a camera's pictures is from up, degrees, on average over its rotations."""
+    """Return how far the top of a camera's pictures is from up, degrees, on average
+    over its rotations.
+    """
     upwards = -rotations.as_matrix()[:, 2, 1]
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
 def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
-    """Return quaternions (n, 4) with signs such that each is nearer to the one before than its opposite is."""
+    """Return quaternions (n, 4) with signs such that each is nearer to the one before
+    than its opposite is.
+    """
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
     return np.asarray(quaternions * signs[:, None])
 
 
 def check_times(path: Path, times: assets.Doubles) -> None:
-    """Raise FileFormatError: times (n,) from the first on are too few or many, or do not ascend within limits."""
+    """Raise FileFormatError: times (n,) from the first on are too few or many, or do
+    not ascend within limits.
+    """
     if not 2 <= len(times) <= MOST_WAYPOINTS:
-        raise errors.FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
-    if not (np.isfinite(times).all() and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all() and times[-1] <= LONGEST):
         raise errors.FileFormatError(
-            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
+            f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}"
+        )
+    if not (
+        np.isfinite(times).all()
+        and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all()
+        and times[-1] <= LONGEST
+    ):
+        raise errors.FileFormatError(
+            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and "
+            f"{LONGEST:g} s in all, got others"
         )
 
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
-    """Return what turns the object about the vertical through its middle, in degrees, and shifts it: (4, 4)."""
-    about, center = geometry.euler(heading, *heading.new_zeros(2)), start.middle
-    posed: Tensor = geometry.affine(about, center - about @ center + shift) @ start.object
+    """Return what turns the object about the vertical through its middle, in degrees,
+    and shifts it: (4, 4).
+    """
+    about = geometry.euler(heading, *heading.new_zeros(2))
+    center = start.middle
+    posed: Tensor = (
+        geometry.affine(about, center - about @ center + shift) @ start.object
+    )
     return posed
 
 
 def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None]:
-    """Return headings (n,) so that one goes to the next the shorter way round, and what is said of it.
+    """Return headings (n,) so that one goes to the next the shorter way round, and what
+    is said of it.
 
-    Only where all are within one turn, from 0 to 360 or from -180 to 180: others count on, as 0 to 360 does for a whole
-    turn.
+    Only where all are within one turn, from 0 to 360 or from -180 to 180: others count
+    on, as 0 to 360 does for a whole turn.
     """
-    low, high = float(degrees.min()), float(degrees.max())
+    low = float(degrees.min())
+    high = float(degrees.max())
     places = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
     within = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
     if not len(places) or high - low >= 360.0 or not within:
         return degrees, None
     first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
-    note = f"it turns the shorter way from {first} to {last} degrees; for the longer one, add a waypoint between them"
+    note = (
+        f"it turns the shorter way from {first} to {last} degrees; for the longer "
+        "one, add a waypoint between them"
+    )
     return np.asarray(np.unwrap(degrees, period=360.0)), note
 
 
@@ -509,7 +718,12 @@ def _round_text(number: float) -> str:
 
 def _names(path: object) -> tuple[str, ...]:
     """The paths in a list, or in a text with commas between them."""
-    return tuple(str(one).strip() for one in (path if isinstance(path, list | tuple) else str(path).split(SEVERAL)))
+    return tuple(
+        str(one).strip()
+        for one in (
+            path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
+        )
+    )
 
 
 def _is_path(name: str) -> bool:
@@ -518,43 +732,74 @@ def _is_path(name: str) -> bool:
 
 def _read_text(path: Path) -> str:
     try:
-        return stored_files.read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
+        return stored_files.read_text(
+            path, "a table of waypoints", MOST_BYTES
+        ).removeprefix("\ufeff")
     except OSError as error:
-        raise errors.FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
+        raise errors.FileFormatError(
+            f"{path}: expected a table of waypoints, got {error.strerror}"
+        ) from error
 
 
-def read_waypoints(path: Path, mover: str, *, text: str, alone: bool = True) -> dict[str, Waypoints]:
-    """Return the way of all that travels, from the text of a .csv file with the columns time, x, y, z, and look_x,
-    look_y, look_z or heading. It is about the `mover`; unless `alone`, one about the camera may say what the object
-    does at the same times.
+def read_waypoints(
+    path: Path, mover: str, *, text: str, alone: bool = True
+) -> dict[str, Waypoints]:
+    """Return the way of all that travels, from the text of a .csv file with the columns
+    time, x, y, z, and look_x, look_y, look_z or heading. It is about the `mover`;
+    unless `alone`, one about the camera may say what the object does at the same times.
 
-    Raises FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
+    Raises FileFormatError: it is no table of numbers with the columns that a path
+    needs, or its times do not ascend.
     """
-    further = (HEADING,) if mover == THING else (*LOOKING, *SHIFT, TURNING) if alone else LOOKING
+    further = (
+        (HEADING,)
+        if mover == THING
+        else (*LOOKING, *SHIFT, TURNING)
+        if alone
+        else LOOKING
+    )
     try:
-        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
+        header, *rows = [
+            [cell.strip() for cell in row]
+            for row in csv.reader(text.splitlines())
+            if any(row)
+        ] or [[]]
     except csv.Error as error:
-        raise errors.FileFormatError(f"{path}: expected a table of waypoints, got one with a {error}") from error
-    columns, parts = (TIME, *PLACE), [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
-    missing, twice = set(columns) - set(header), len(set(header)) < len(header)
+        raise errors.FileFormatError(
+            f"{path}: expected a table of waypoints, got one with a {error}"
+        ) from error
+    columns = (TIME, *PLACE)
+    parts = [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
+    missing = set(columns) - set(header)
+    twice = len(set(header)) < len(header)
     if missing or twice or set(header) - {*columns, *further} or any(parts):
         raise errors.FileFormatError(
-            f"{path}: expected columns {', '.join(columns)}, and perhaps {', '.join(further)}, got "
-            f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or KITTI"
+            f"{path}: expected columns {', '.join(columns)}, and perhaps "
+            f"{', '.join(further)}, got "
+            f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or "
+            "KITTI"
         )
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
-        raise errors.FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}")
+        raise errors.FileFormatError(
+            f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}"
+        )
     try:
-        table = np.array([[float(one) for one in row] for row in rows], np.float64).reshape(len(rows), len(header))
+        table = np.array(
+            [[float(one) for one in row] for row in rows], np.float64
+        ).reshape(len(rows), len(header))
     except ValueError as error:
         raise errors.FileFormatError(
             f"{path}: expected {len(header)} numbers in each row, got something else"
         ) from error
     times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
     check_times(path, times)
-    column = {name: table[:, place] for place, name in enumerate(header) if name != TIME}
+    column = {
+        name: table[:, place] for place, name in enumerate(header) if name != TIME
+    }
     if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
-        raise errors.FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
+        raise errors.FileFormatError(
+            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
+        )
 
     notes = dict[str, tuple[str, ...]]()
     for heading in [name for name in (HEADING, TURNING) if name in column]:
@@ -567,11 +812,18 @@ def read_waypoints(path: Path, mover: str, *, text: str, alone: bool = True) -> 
         values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
         return torch.from_numpy(values if len(names) > 1 else values[:, 0])
 
-    places, seconds = read(*PLACE), torch.from_numpy(times.astype(np.float32))
+    places = read(*PLACE)
+    seconds = torch.from_numpy(times.astype(np.float32))
     assert places is not None
-    ways = {mover: Waypoints(seconds, places, read(*LOOKING), read(HEADING), notes=notes.get(HEADING, ()))}
+    ways = {
+        mover: Waypoints(
+            seconds, places, read(*LOOKING), read(HEADING), notes=notes.get(HEADING, ())
+        )
+    }
     shift = read(*SHIFT)
     if shift is not None or TURNING in column:
         shift = torch.zeros_like(places) if shift is None else shift
-        ways[THING] = Waypoints(seconds, shift, None, read(TURNING), notes=notes.get(TURNING, ()))
+        ways[THING] = Waypoints(
+            seconds, shift, None, read(TURNING), notes=notes.get(TURNING, ())
+        )
     return ways

@@ -4,8 +4,9 @@
     EuRoC   #timestamp [ns],p_RS_R_x [m],...,q_RS_w [],q_RS_x [],...   commas, real part first
     KITTI   12 numbers: the pose (3, 4), row by row    no times: 10 poses a second
 
-A header names the columns, in any order; without one, 8 numbers are TUM's and 12 KITTI's. Which
-axes the sensor has and where the world's up is stands in none of these files.
+A header names the columns, in any order; without one, 8 numbers are TUM's and 12
+KITTI's. Which axes the sensor has and where the world's up is stands in none of these
+files.
 """
 
 from __future__ import annotations
@@ -32,13 +33,19 @@ UNIT_BY_SIZE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
-OWN_COLUMNS = {"time", *POSITION}  # of a table of waypoints, which is none of these formats
+# of a table of waypoints, which is none of these formats
+OWN_COLUMNS = {"time", *POSITION}
 TIME_NAME = re.compile(r"(time_?)?stamp|time|t|sec(ond)?s?")
-POSITION_NAME = re.compile(r"(?:t|p|p_\w+_|pos(?:ition)?[._]?|translation[._]?)?([xyz])")
-QUATERNION_NAME = re.compile(r"q(?:uat(?:ernion)?)?(?:_\w+)?[._]?([wxyz])|(?:rotation|orientation)[._]?([wxyz])")
+POSITION_NAME = re.compile(
+    r"(?:t|p|p_\w+_|pos(?:ition)?[._]?|translation[._]?)?([xyz])"
+)
+QUATERNION_NAME = re.compile(
+    r"q(?:uat(?:ernion)?)?(?:_\w+)?[._]?([wxyz])|(?:rotation|orientation)[._]?([wxyz])"
+)
 UNIT = re.compile(r"\[([^\]]*)\]")
 
-OPTICAL, UNUSED = "optical", "none"
+OPTICAL = "optical"
+UNUSED = "none"
 SENSOR_AXES: Mapping[str, assets.Doubles] = {
     OPTICAL: np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -46,7 +53,9 @@ SENSOR_AXES: Mapping[str, assets.Doubles] = {
     "frd": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     "euroc": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""By name, what turns a camera's axes (x right, y down, z ahead) into those of the file's sensor."""
+"""By name, what turns a camera's axes (x right, y down, z ahead) into those of the
+file's sensor.
+"""
 AXES_MEAN: Mapping[str, str] = {
     OPTICAL: "x right, y down, z ahead",
     "opengl": "x right, y up, z back",
@@ -79,28 +88,37 @@ class Trajectory:
     format: PoseFormat
     times: assets.Doubles | None  # (n,) seconds; None where the file has none
     positions: assets.Doubles  # (n, 3)
-    rotations: Rotation | None  # from the sensor's axes to the world's; None where the file has none
+    # from the sensor's axes to the world's; None where the file has none
+    rotations: Rotation | None
     notes: tuple[str, ...]
 
     @property
     def default_up(self) -> str:
         return "-y" if self.format is PoseFormat.KITTI else "z"
 
-    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[assets.Doubles, Rotation | None]:
-        """Return positions (n, 3) from an origin, and rotations from a camera's axes (x right, y down, z ahead), both
-        in a world whose z is up; no rotations where the axes are `UNUSED` or the file has none."""
+    def orient(
+        self, axes: str, up: str, origin: Sequence[float]
+    ) -> tuple[assets.Doubles, Rotation | None]:
+        """Return positions (n, 3) from an origin, and rotations from a camera's axes (x
+        right, y down, z ahead), both in a world whose z is up; no rotations where the
+        axes are `UNUSED` or the file has none.
+        """
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
         positions = world.apply(self.positions - np.asarray(origin, np.float64))
         if axes == UNUSED or self.rotations is None:
             return positions, None
-        return positions, world * self.rotations * Rotation.from_matrix(SENSOR_AXES[axes])
+        return positions, world * self.rotations * Rotation.from_matrix(
+            SENSOR_AXES[axes]
+        )
 
 
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
-    """Return the poses in the text of a file, or None where it is in none of the formats.
+    """Return the poses in the text of a file, or None where it is in none of the
+    formats.
 
-    Raises FileFormatError: rows of different lengths, numbers that are not finite, quaternions that are not of length
-    1, matrices that are no rotations, or a table of numbers whose columns are not known.
+    Raises FileFormatError: rows of different lengths, numbers that are not finite,
+    quaternions that are not of length 1, matrices that are no rotations, or a table of
+    numbers whose columns are not known.
     """
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
@@ -108,28 +126,41 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first is None:
         return None
     leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
-    is_own = any(OWN_COLUMNS <= set(words) for words in leading) and not any(map(_find_columns, leading))
+    is_own = any(OWN_COLUMNS <= set(words) for words in leading) and not any(
+        map(_find_columns, leading)
+    )
     rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
     headers = [words for words in leading if _find_columns(words)]
     if is_own or (not headers and "," in lines[first] and leading):
         return None  # a table with a head of another kind
     if len(rows) > MAX_ROWS:
-        raise errors.FileFormatError(f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}")
+        raise errors.FileFormatError(
+            f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}"
+        )
     if headers:
         return _read_named_columns(path, headers[-1], rows, "," in lines[first])
     if "," in lines[first]:
         raise errors.FileFormatError(
-            f"{path}: expected a first line that names the columns, got numbers; add time,x,y,z, or that of EuRoC's "
-            "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+            f"{path}: expected a first line that names the columns, got numbers; add "
+            "time,x,y,z, or that of EuRoC's "
+            "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w "
+            "[],q_RS_x [],q_RS_y [],q_RS_z []"
         )
     count = len(rows[0])
     if count == 8:
-        return _read_named_columns(path, ["timestamp", "tx", "ty", "tz", *QUATERNION], rows, False)
+        return _read_named_columns(
+            path, ["timestamp", "tx", "ty", "tz", *QUATERNION], rows, False
+        )
     if count == 12:
         return _read_kitti(path, rows)
-    known = " (KITTI-360's first column is a number of a picture; leave it out)" if count in (13, 17) else ""
+    known = (
+        " (KITTI-360's first column is a number of a picture; leave it out)"
+        if count in (13, 17)
+        else ""
+    )
     raise errors.FileFormatError(
-        f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, or 12 as KITTI's poses, got "
+        f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
+        "or 12 as KITTI's poses, got "
         f"{count}{known}"
     )
 
@@ -143,8 +174,9 @@ def _is_row(line: str) -> bool:
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the columns by our names for them, or nothing unless there are a time, a position and either a quaternion
-    or a name that only these formats have."""
+    """Return the columns by our names for them, or nothing unless there are a time, a
+    position and either a quaternion or a name that only these formats have.
+    """
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
     columns = dict[str, int]()
@@ -162,17 +194,22 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
             return {}
         columns[column] = index
     has_quaternion = set(QUATERNION) <= set(columns)
-    if not {"time", *POSITION} <= set(columns) or (not has_quaternion and set(QUATERNION) & set(columns)):
+    if not {"time", *POSITION} <= set(columns) or (
+        not has_quaternion and set(QUATERNION) & set(columns)
+    ):
         return {}
     is_own = not has_quaternion and OWN_COLUMNS <= set(names)
     return {} if is_own else columns
 
 
-def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> assets.Doubles:
+def _read_table(
+    path: Path, rows: Sequence[Sequence[str]], count: int
+) -> assets.Doubles:
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(
-                f"{path}: expected {count} numbers in each row, got {reading.shown(' '.join(row))}"
+                f"{path}: expected {count} numbers in each row, got "
+                f"{reading.shown(' '.join(row))}"
             )
     table = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
@@ -193,12 +230,18 @@ def _read_named_columns(
     unit = stated[1].strip() if stated else "s"
     if unit not in UNITS:
         raise errors.FileFormatError(
-            f"{path}: expected times in {', '.join(UNITS)}, got {reading.shown(unit)}; correct the first line"
+            f"{path}: expected times in {', '.join(UNITS)}, got {reading.shown(unit)}; "
+            "correct the first line"
         )
     if not stated:
-        unit = next((unit for least, unit in UNIT_BY_SIZE if abs(times[0]) >= least), "s")
+        unit = next(
+            (unit for least, unit in UNIT_BY_SIZE if abs(times[0]) >= least), "s"
+        )
         if unit != "s":
-            notes.append(f"{path}: its times do not state a unit; by their size they are read as {unit}.")
+            notes.append(
+                f"{path}: its times do not state a unit; by their size they "
+                f"are read as {unit}."
+            )
     # differences first: a time since 1970 in nanoseconds has more digits than a float
     times = (times - times[0]) * UNITS[unit]
 
@@ -211,7 +254,8 @@ def _read_named_columns(
         if off.max() > QUATERNION_TOLERANCE:
             worst = int(off.argmax())
             raise errors.FileFormatError(
-                f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one of {lengths[worst]:.3g}"
+                f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one "
+                f"of {lengths[worst]:.3g}"
             )
         rotations = Rotation.from_quat(quaternions)
     known = PoseFormat.EUROC if has_commas else PoseFormat.TUM
@@ -225,6 +269,9 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     off = np.where(np.linalg.det(turns) > 0.0, off, np.inf)
     if off.max() > ROTATION_TOLERANCE:
         raise errors.FileFormatError(
-            f"{path}: pose {int(off.argmax()) + 1}: expected a rotation and a shift (3 rows of 4), got another map"
+            f"{path}: pose {int(off.argmax()) + 1}: expected a rotation and a shift (3 "
+            "rows of 4), got another map"
         )
-    return Trajectory(PoseFormat.KITTI, None, poses[:, :, 3], Rotation.from_matrix(turns), ())
+    return Trajectory(
+        PoseFormat.KITTI, None, poses[:, :, 3], Rotation.from_matrix(turns), ()
+    )

@@ -1,4 +1,6 @@
-"""The controls `projector` and `spot`: light thrown onto the object; a spot is a projector of a round image."""
+"""The controls `projector` and `spot`: light thrown onto the object; a spot is a
+projector of a round image.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,12 @@
-"""The `projector` control: a picture thrown onto the object, whose texels may be searched. It only adds light.
+"""The `projector` control: a picture thrown onto the object, whose texels may be
+searched. It only adds light.
 
-A projector of `lumens` that throws a picture of width `w` and height `h` at distance 1 puts the same light on all of a
-screen; at a distance of D metres that is `lumens / (w h D^2)` lux. How bright it is in the scene follows from the light
-that is there without it: `ambient` lux are the irradiance that the camera's exposure is metered for. So more ambient
-light is a darker projector in an equally bright picture, as a camera that meters would show it.
+A projector of `lumens` that throws a picture of width `w` and height `h` at distance 1
+puts the same light on all of a screen; at a distance of D metres that is `lumens / (w h
+D^2)` lux. How bright it is in the scene follows from the light that is there without
+it: `ambient` lux are the irradiance that the camera's exposure is metered for. So more
+ambient light is a darker projector in an equally bright picture, as a camera that
+meters would show it.
 
     pattern = linear(texels) (1 - black) + black,        E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
 """
@@ -42,15 +45,21 @@ from advsearch.extend import (
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-BESIDE = 15.0  # degrees around the object between the camera and a projector that nobody has placed
-AMBIENT = 100.0  # lux of a place whose brightness has no unit: a lit hall, a street at late dusk
-LUMENS, TIMES = 3000.0, 20.0
-"""Of a projector that nobody has described: it is dimmed to so many times the light of the place."""
+# degrees around the object between the camera and a projector that nobody has placed
+BESIDE = 15.0
+# lux of a place whose brightness has no unit: a lit hall, a street at late dusk
+AMBIENT = 100.0
+LUMENS = 3000.0
+TIMES = 20.0
+"""Of a projector that nobody has described: it is dimmed to so many times the light of
+the place.
+"""
 GREY = 0.5
 LIT_SHARE = 0.5  # of its period, in which a flashing light is on
 
 
-_lit, _moving = partial(Parameter.number, Parameter.LIT), partial(Parameter.moving, ("differences",))
+_lit = partial(Parameter.number, Parameter.LIT)
+_moving = partial(Parameter.moving, ("differences",))
 
 
 class ProjectorControl(PictureControl):
@@ -73,89 +82,151 @@ class ProjectorControl(PictureControl):
                 "Direction of the projector around the object.", periodic=True),
         _moving("elevation", "degrees", -89.0, 89.0, "the camera's", "Height of the projector above the ground plane."),
         _moving("distance", "object sizes", 0.01, 1e4, "the camera's",
-                "Distance to the object's middle; in metres where the object's size is known.", log=True),
-        _lit("lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+                "Distance to the object's middle; in metres where the object's size is "
+                "known.", log=True),
+        _lit("lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as "
+                                           "bright as the place",
              "Light of a white picture."),
         _lit("ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
              "Light on the object without the projector.", log=True),
         _lit("black", "1", 0.0, 1.0, 0.0,
-             "Share of white that a black texel still throws: 0.001 at a contrast of 1000."),
-        _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur."),
+             "Share of white that a black texel still throws: 0.001 at a contrast of "
+             "1000."),
+        _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard "
+                                               "deviation of the blur."),
         Parameter.number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
-                         "How often a second it flashes: light in one half of each period; at 0 it does not."),
+                         "How often a second it flashes: light in one half of each "
+                         "period; at 0 it does not."),
         Parameter.number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
-                         "Where in its period a flashing light is at the time of the picture; up to 180 it is on.",
+                         "Where in its period a flashing light is at the time of the "
+                         "picture; up to 180 it is on.",
                          periodic=True),
     )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
-        Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),
+        Choice("fov", None, "Angle of the picture's width, degrees; by default it just "
+                            "covers the object.", most=150.0),
         Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
-        Choice("norm", "linf", "Norm of the ball around that start: linf (per texel value) or l2 (over all of them).",
+        Choice("norm", "linf", "Norm of the ball around that start: linf (per texel "
+                               "value) or l2 (over all of them).",
                "norm", options=("linf", "l2")),
-        Choice("epsilon", None, "Radius of that ball, display-referred; by default every picture is inside.", "epsilon",
+        Choice("epsilon", None, "Radius of that ball, display-referred; by default "
+                                "every picture is inside.", "epsilon",
                most=PictureControl.LARGEST_EPSILON),
-        Choice("picture", None, "A picture file to project as it is; then the pattern is not searched.",
+        Choice("picture", None, "A picture file to project as it is; then the pattern "
+                                "is not searched.",
                fixes="pattern"),
     )  # fmt: skip
 
     def check_choices(self) -> None:
-        pattern, picture = self._given.get("pattern"), self.chosen["picture"]
-        if pattern is not None and [*pattern] != [0.0, 1.0] if isinstance(pattern, (list, tuple)) else pattern:
+        pattern = self._given.get("pattern")
+        picture = self.chosen["picture"]
+        if (
+            pattern is not None and [*pattern] != [0.0, 1.0]
+            if isinstance(pattern, (list, tuple))
+            else pattern
+        ):
             raise InputError(
-                f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; a file is {self.name}.picture, "
+                f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
+                f"a file is {self.name}.picture, "
                 f"and how far texels may go {self.name}.epsilon"
             )
         if picture is None:
             return
         if not isinstance(picture, (str, Path)):
-            raise InputError(f"{self.name}.picture: expected the path of a picture, got {picture!r}")
+            raise InputError(
+                f"{self.name}.picture: expected the path of a picture, got {picture!r}"
+            )
         self._given["picture"] = self.chosen["picture"] = str(picture)
-        beside = [one for one in ("pattern", "epsilon", "norm", "resolution", "aspect") if one in self._given]
+        beside = [
+            one
+            for one in ("pattern", "epsilon", "norm", "resolution", "aspect")
+            if one in self._given
+        ]
         if beside:
             raise InputError(
-                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; leave one of them out"
+                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; "
+                "leave one of them out"
             )
 
-    # ---- in a scene -------------------------------------------------------------------------------------------------
+    # ---- in a scene
+    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         picture = self.read_picture()
         rows = int(self.chosen["resolution"]) if picture is None else len(picture)
-        columns = max(2, round(rows * self.chosen["aspect"])) if picture is None else picture.shape[1]
+        columns = (
+            max(2, round(rows * self.chosen["aspect"]))
+            if picture is None
+            else picture.shape[1]
+        )
         fov = self.chosen["fov"]
-        if fov is None:  # with which the picture covers the object from where it stands at the start
-            farthest = float(np.linalg.norm(scene.base_vertices - geometry.middle(scene), axis=1).max())
+        # with which the picture covers the object from where it stands at the start
+        if fov is None:
+            farthest = float(
+                np.linalg.norm(
+                    scene.base_vertices - geometry.middle(scene), axis=1
+                ).max()
+            )
             reach = farthest * max(1.0, columns / rows) * scene.metres
-            fov = min(math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0)
+            fov = min(
+                math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0
+            )
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
             note = (
-                f"The place's brightness has no unit: its light is taken for {AMBIENT:g} lux; "
+                "The place's brightness has no unit: its light is taken for "
+                f"{AMBIENT:g} lux; "
                 f"{self.name}.ambient says otherwise."
             )
-            scene = scene if "ambient" in self.specs else replace(scene, remarks=(*scene.remarks, note))
+            scene = (
+                scene
+                if "ambient" in self.specs
+                else replace(scene, remarks=(*scene.remarks, note))
+            )
         return scene.with_part(part)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        parameter, scene = super().in_scene(parameter), self.scene
+        parameter = super().in_scene(parameter)
+        scene = self.scene
         away = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
         far = float(np.linalg.norm(away))
         match parameter.name:
             case "pattern":
-                return replace(parameter, default=GREY if self.chosen["start"] == "grey" else 0.0)
+                return replace(
+                    parameter, default=GREY if self.chosen["start"] == "grey" else 0.0
+                )
             case "ambient":
-                candelas = None if scene.environment is None else scene.environment.candelas
-                lux = AMBIENT if candelas is None else min(max(candelas * scene.metered_irradiance, 1e-3), 2e5)
+                candelas = (
+                    None if scene.environment is None else scene.environment.candelas
+                )
+                lux = (
+                    AMBIENT
+                    if candelas is None
+                    else min(max(candelas * scene.metered_irradiance, 1e-3), 2e5)
+                )
                 return replace(parameter, default=lux)
             case "lumens":
-                bright = TIMES * float(self.resting("ambient")) * self.part.area * self._far() ** 2
+                bright = (
+                    TIMES
+                    * float(self.resting("ambient"))
+                    * self.part.area
+                    * self._far() ** 2
+                )
                 return replace(parameter, default=min(LUMENS, bright))
             case "azimuth":
-                return replace(parameter, default=math.degrees(math.atan2(away[1], away[0])) + BESIDE)
+                return replace(
+                    parameter,
+                    default=math.degrees(math.atan2(away[1], away[0])) + BESIDE,
+                )
             case "elevation":
-                return replace(parameter, default=min(max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0))
+                return replace(
+                    parameter,
+                    default=min(
+                        max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0
+                    ),
+                )
             case "distance":
                 unit = "object sizes" if scene.object.metres is None else "metres"
                 return replace(parameter, default=far * scene.metres, unit=unit)
@@ -168,22 +239,34 @@ class ProjectorControl(PictureControl):
     def _far(self) -> float:
         """How far away it stands at the start."""
         spec = self.specs.get("distance")
-        return float(spec.value if isinstance(spec, Fixed) else self.resting("distance"))
+        return float(
+            spec.value if isinstance(spec, Fixed) else self.resting("distance")
+        )
 
     def fit(self) -> None:
         (self.part,) = (
-            part for part in self.scene.parts if isinstance(part, parts.ProjectorPart) and part.name == self.name
+            part
+            for part in self.scene.parts
+            if isinstance(part, parts.ProjectorPart) and part.name == self.name
         )
         self._picture = self.read_picture()
         super().fit()
-        rate = next(slot.spec for slot in self.slots if slot.parameter.name == "flicker")
-        self.flashes = rate.high if isinstance(rate, Range) else max(map(float, self.allowed("flicker", 0.0)))
+        rate = next(
+            slot.spec for slot in self.slots if slot.parameter.name == "flicker"
+        )
+        self.flashes = (
+            rate.high
+            if isinstance(rate, Range)
+            else max(map(float, self.allowed("flicker", 0.0)))
+        )
 
     def read_picture(self) -> Tensor | None:
         picture = super().read_picture()
         if picture is not None and min(picture.shape[:2]) < 2:
             got = f"{picture.shape[1]} x {picture.shape[0]}"
-            raise InputError(f"{self.name}.picture: expected at least 2 texels a side, got {got}")
+            raise InputError(
+                f"{self.name}.picture: expected at least 2 texels a side, got {got}"
+            )
         return picture
 
     @property
@@ -204,68 +287,110 @@ class ProjectorControl(PictureControl):
         then._later = self._later + seconds
         return then
 
-    # ---- at a configuration ------------------------------------------------------------------------------------------
+    # ---- at a configuration
+    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)
         pattern = values["pattern"]
-        rounded = pattern + (images.to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
+        # a projector gets 8 bits
+        rounded = pattern + (images.to_8_bit(pattern.detach()) - pattern.detach())
         return values | {"pattern": rounded}
 
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        place = (float(values[name].detach()) for name in ("azimuth", "elevation", "distance"))
+    def scene_inputs(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        place = (
+            float(values[name].detach())
+            for name in ("azimuth", "elevation", "distance")
+        )
         pose = looking_from(self.scene, *place).to(values["distance"], copy=True)
         light = self.thrown(values)
-        rate, phase = float(values["flicker"].detach()), float(values["phase"].detach()) / 360.0
+        rate = float(values["flicker"].detach())
+        phase = float(values["phase"].detach()) / 360.0
         if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:
             light = 0.0 * light
-        at_one = self._beside(values) * (values["distance"].detach() / self.scene.metres) ** 2
+        at_one = (
+            self._beside(values)
+            * (values["distance"].detach() / self.scene.metres) ** 2
+        )
         white = at_one * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def thrown(self, values: Values) -> Tensor:
         """Return the picture (h, w, 3) as it is thrown, of white, linear."""
-        light = color.srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
+        light = (
+            color.srgb_to_linear(values["pattern"]) * (1.0 - values["black"])
+            + values["black"]
+        )
         return out_of_focus(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
-        """Illuminance () of a white picture where it meets the object's middle head-on."""
+        """Illuminance () of a white picture where it meets the object's middle
+        head-on.
+        """
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
     def _beside(self, values: Values) -> Tensor:
         return self._lux(values) / values["ambient"]
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         return {
             "white": Value(value=float(self._lux(values)), unit="lux"),
-            "beside_ambient": Value(value=float(self._beside(values)), unit="times the ambient light"),
-            "mean": Value(value=float(color.srgb_to_linear(values["pattern"]).mean()), unit="of white"),
+            "beside_ambient": Value(
+                value=float(self._beside(values)), unit="times the ambient light"
+            ),
+            "mean": Value(
+                value=float(color.srgb_to_linear(values["pattern"]).mean()),
+                unit="of white",
+            ),
         }
 
-    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
         pattern = values["pattern"]
         return {
             self.name: pattern,
-            f"{self.name}-large": images.enlarged(pattern, -(-images.PRINT_SIDE // len(pattern))),
+            f"{self.name}-large": images.enlarged(
+                pattern, -(-images.PRINT_SIDE // len(pattern))
+            ),
         }
 
 
 def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
-    """Return a picture (h, w, 3) after a Gaussian blur of so many texels (); outside it there is no light."""
+    """Return a picture (h, w, 3) after a Gaussian blur of so many texels (); outside it
+    there is no light.
+    """
     sigma = float(blur.detach())
     if not sigma and not blur.requires_grad:
         return light
     reach = math.ceil(3.0 * sigma) + 1
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2)
+    kernel = torch.exp(
+        -0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2
+    )
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
     rows = functional.conv2d(images.planes(light), kernel, padding=(0, reach), groups=3)
-    return images.picture(functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3))
+    return images.picture(
+        functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
+    )
 
 
 @lru_cache(maxsize=64)
-def looking_from(scene: SceneDescription, azimuth: float, elevation: float, distance: float) -> Tensor:
-    """The pose (4, 4) of what looks at the object's middle along its own +z from somewhere around it; degrees, and the
-    distance as `ProjectorControl` has it. It is not to be written into."""
-    left, up, outwards = torch.from_numpy(geometry.camera_axes(azimuth, elevation, 0.0)).float()
-    place = torch.from_numpy(geometry.middle(scene)).float() + distance / scene.metres * outwards
+def looking_from(
+    scene: SceneDescription, azimuth: float, elevation: float, distance: float
+) -> Tensor:
+    """The pose (4, 4) of what looks at the object's middle along its own +z from
+    somewhere around it; degrees, and the distance as `ProjectorControl` has it. It is
+    not to be written into.
+    """
+    left, up, outwards = torch.from_numpy(
+        geometry.camera_axes(azimuth, elevation, 0.0)
+    ).float()
+    place = (
+        torch.from_numpy(geometry.middle(scene)).float()
+        + distance / scene.metres * outwards
+    )
     return geometry.affine(torch.stack([left, up, -outwards], dim=1), place)

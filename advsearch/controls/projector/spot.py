@@ -1,4 +1,5 @@
-"""The `spot` control: a torch or a laser from somewhere around the object. It only adds light.
+"""The `spot` control: a torch or a laser from somewhere around the object. It only adds
+light.
 
 It is a projector whose picture is a round spot, so that no outline moves and its numbers have an adjoint:
 
@@ -33,24 +34,41 @@ class SpotControl(ProjectorControl):
     kind = "spot"
     amount = "lumens"
     parameters = (
-        _lit("x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.",
+        _lit("x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, "
+                                                    "seen from the light.",
              (-0.5, 0.5)),
         _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
-        _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.", (0.05, 0.6),
+        _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of "
+                                                         "its light falls.", (0.05, 0.6),
              log=True),
         *Parameter.colors("of its light.", (0.0, 1.0)),
-        _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its light.",
+        _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the "
+                                           "place", "All of its light.",
              (0.0, LUMENS)),
         *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
     )  # fmt: skip
     choices = (
-        Choice("resolution", 64, "Rows of texels of the picture that it is made of.", whole=(2, 512)),
-        Choice("fov", None, "Angle in which it may fall, degrees; by default it just covers the object.", most=150.0),
+        Choice(
+            "resolution",
+            64,
+            "Rows of texels of the picture that it is made of.",
+            whole=(2, 512),
+        ),
+        Choice(
+            "fov",
+            None,
+            "Angle in which it may fall, degrees; by default it just "
+            "covers the object.",
+            most=150.0,
+        ),
     )
 
     # its numbers are a handful, and there is no picture among them
-    spec, budget_of, values = Control.spec, Control.budget_of, Control.values
-    describe, kept_pictures = Control.describe, Control.kept_pictures
+    spec = Control.spec
+    budget_of = Control.budget_of
+    values = Control.values
+    describe = Control.describe
+    kept_pictures = Control.kept_pictures
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
@@ -59,28 +77,48 @@ class SpotControl(ProjectorControl):
         if parameter.name != "lumens":
             return super().in_scene(parameter)
         area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
-        bright = min(LUMENS, TIMES * float(self.resting("ambient")) * area)  # of a spot of the default width
+        # of a spot of the default width
+        bright = min(LUMENS, TIMES * float(self.resting("ambient")) * area)
         return replace(
-            parameter, search=(0.0, bright), default=bright if self.asked and not self.searches("lumens") else 0.0
+            parameter,
+            search=(0.0, bright),
+            default=bright if self.asked and not self.searches("lumens") else 0.0,
         )
 
     def unchanged(self, parameter: Parameter) -> float | str:
         return 0.0  # of the lumens; see `amount`
 
     def thrown(self, values: Values) -> Tensor:
-        half = math.tan(math.radians(self.part.fov) / 2.0) * values["distance"].detach() / self.scene.metres
+        half = (
+            math.tan(math.radians(self.part.fov) / 2.0)
+            * values["distance"].detach()
+            / self.scene.metres
+        )
         rows, columns = self.part.sides
-        across, up = (torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half) * half for count in (columns, rows))
+        across, up = (
+            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half) * half
+            for count in (columns, rows)
+        )
         deviation = values["width"] / WIDTH_OF_ONE
         away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
-        spot = torch.exp(-0.5 * away / deviation**2) * (2.0 * half) ** 2 / (2.0 * math.pi * deviation**2)
+        spot = (
+            torch.exp(-0.5 * away / deviation**2)
+            * (2.0 * half) ** 2
+            / (2.0 * math.pi * deviation**2)
+        )
         return spot[..., None] * color.combine_channels(values)
 
-    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Value]:
         brightest = float(self.thrown(values).detach().max())
         return {
-            "lux": Value(value=float(brightest * float(self._lux(values))), unit="lux, where it is brightest"),
+            "lux": Value(
+                value=float(brightest * float(self._lux(values))),
+                unit="lux, where it is brightest",
+            ),
             "beside_ambient": Value(
-                value=float(brightest * float(self._beside(values))), unit="times the ambient light"
+                value=float(brightest * float(self._beside(values))),
+                unit="times the ambient light",
             ),
         }

@@ -1,4 +1,6 @@
-"""Images that controls scale, warp, save and read, (H, W, C) tensors; and meshes as the texels of an image."""
+"""Images that controls scale, warp, save and read, (H, W, C) tensors; and meshes as the
+texels of an image.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +24,32 @@ PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixe
 
 
 def resampled(image: Tensor, side: int) -> Tensor:
-    """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter; values stay in [0, 1]."""
+    """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter;
+    values stay in [0, 1].
+    """
     return resized(image, side, side).contiguous().clamp(0.0, 1.0)
 
 
 def enlarged(pixels: Tensor, factor: int) -> Tensor:
-    """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as the renderer does it."""
-    larger = F.interpolate(planes(srgb_to_linear(pixels)), scale_factor=factor, mode="bilinear", align_corners=False)
+    """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as
+    the renderer does it.
+    """
+    larger = F.interpolate(
+        planes(srgb_to_linear(pixels)),
+        scale_factor=factor,
+        mode="bilinear",
+        align_corners=False,
+    )
     return linear_to_srgb(picture(larger))
 
 
 def coded(image: Tensor, quality: int) -> Tensor:
-    """Save as a JPEG file and read it again, chroma subsampled; the derivative is that of the unchanged picture.
+    """Save as a JPEG file and read it again, chroma subsampled; the derivative is that
+    of the unchanged picture.
 
-    For changes that are smooth over three pixels or more this is within about a third of what the file does with
-    them (measured at qualities of 7 to 25); of finer ones the file keeps less than it says.
+    For changes that are smooth over three pixels or more this is within about a third
+    of what the file does with them (measured at qualities of 7 to 25); of finer ones
+    the file keeps less than it says.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
@@ -61,26 +74,43 @@ def picture(stack: Tensor) -> Tensor:
 
 
 def warped(image: Tensor, shift: Tensor) -> Tensor:
-    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2) pixels to the right and down;
-    places outside are mirrored inwards."""
+    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2)
+    pixels to the right and down; places outside are mirrored inwards.
+    """
     height, width = image.shape[:2]
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
+    rows, columns = torch.meshgrid(
+        torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
+    )
+    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
+        image.device
+    )
     grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
-    return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
+    return picture(
+        F.grid_sample(
+            planes(image), grid[None], padding_mode="reflection", align_corners=False
+        )
+    )
 
 
-def resized(field: Tensor, height: int, width: int, *, antialias: bool = True) -> Tensor:
+def resized(
+    field: Tensor, height: int, width: int, *, antialias: bool = True
+) -> Tensor:
     """Resize an (h, w, C) field to (height, width, C), bilinearly; differentiable."""
     if field.shape[:2] == (height, width):
         return field
     size = (height, width)
-    stack = F.interpolate(planes(field), size, mode="bilinear", antialias=antialias, align_corners=False)
+    stack = F.interpolate(
+        planes(field), size, mode="bilinear", antialias=antialias, align_corners=False
+    )
     return picture(stack).contiguous()
 
 
 @lru_cache(maxsize=8)
-def drawn(height: int, width: int, seed: int, stream: str, *, normal: bool = True) -> Tensor:
-    """Return the noise (height, width, 3) of a stream of random numbers: standard normal, or uniform in [0, 1)."""
+def drawn(
+    height: int, width: int, seed: int, stream: str, *, normal: bool = True
+) -> Tensor:
+    """Return the noise (height, width, 3) of a stream of random numbers: standard
+    normal, or uniform in [0, 1).
+    """
     source = torch.Generator().manual_seed(seeds.stream(seed, stream))
     return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)

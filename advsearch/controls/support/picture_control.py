@@ -11,7 +11,15 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import LARGEST_EPSILON, NOTHING, WHOLE_RANGE, Budget, Control, Value, changed
+from advsearch.controls.base import (
+    LARGEST_EPSILON,
+    NOTHING,
+    WHOLE_RANGE,
+    Budget,
+    Control,
+    Value,
+    changed,
+)
 from advsearch.controls.ranges import Fixed, Range, Spec
 from advsearch.controls.support.norms import DEFAULT_EPSILON, radius
 from advsearch.errors import FileFormatError
@@ -20,14 +28,17 @@ from advsearch.scene.settings import Parameter
 
 
 class PictureControl(Control):
-    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given.
+    """A control of a picture, searched or from a file, and of numbers, which are fixed
+    where they are not given.
 
-    Its choices are `resolution`, `picture`, `norm` ("box" for any color, "linf" or "l2") and `epsilon`.
+    Its choices are `resolution`, `picture`, `norm` ("box" for any color, "linf" or
+    "l2") and `epsilon`.
     """
 
     LARGEST_EPSILON: ClassVar[float] = LARGEST_EPSILON
     shown: ClassVar[str]  # the parameter that is the picture
-    default_epsilon: ClassVar[float] = DEFAULT_EPSILON  # of colors, where none is chosen
+    # of colors, where none is chosen
+    default_epsilon: ClassVar[float] = DEFAULT_EPSILON
     _picture: Tensor | None
 
     @property
@@ -38,14 +49,23 @@ class PictureControl(Control):
     @property
     def free(self) -> bool:
         """Whether the picture is searched."""
-        return self.chosen["picture"] is None and not isinstance(self.specs.get(self.shown), Fixed)
+        return self.chosen["picture"] is None and not isinstance(
+            self.specs.get(self.shown), Fixed
+        )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        return replace(parameter, shape=(*self.sides, 3), default=0.0) if parameter.name == self.shown else parameter
+        return (
+            replace(parameter, shape=(*self.sides, 3), default=0.0)
+            if parameter.name == self.shown
+            else parameter
+        )
 
     def spec(self, parameter: Parameter) -> Spec:
         picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
-        return self.specs.get(parameter.name, picture if parameter.name == self.shown else Fixed(parameter.default))
+        return self.specs.get(
+            parameter.name,
+            picture if parameter.name == self.shown else Fixed(parameter.default),
+        )
 
     def budget_of(self, parameter: Parameter) -> Budget:
         norm = self.chosen["norm"]
@@ -58,13 +78,19 @@ class PictureControl(Control):
         return Budget(norm, reach / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        values, picture = super().values(u), self._picture
-        shown = values[self.shown].reshape(*self.sides, 3) if picture is None else picture.to(u.device, copy=True)
+        values = super().values(u)
+        picture = self._picture
+        shown = (
+            values[self.shown].reshape(*self.sides, 3)
+            if picture is None
+            else picture.to(u.device, copy=True)
+        )
         return values | {self.shown: shown}
 
     def read_picture(self) -> Tensor | None:
-        """Return the picture (h, w, 3) sRGB that was chosen; None where none was. Raises FileFormatError: it cannot be
-        read."""
+        """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
+        Raises FileFormatError: it cannot be read.
+        """
         if self.chosen["picture"] is None:
             return None
         try:
@@ -72,9 +98,13 @@ class PictureControl(Control):
         except FileFormatError as error:
             raise FileFormatError(f"{self.name}.picture: {error}") from error
 
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+    def describe(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Value]:
         described = super().describe(u, so_far)
         if not self.free:
             return described
-        here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
+        here, start = (
+            self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device))
+        )
         return {**changed(self.name, here - start), **described}

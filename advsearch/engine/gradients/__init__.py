@@ -1,10 +1,12 @@
 """Measure gradients of a scene, and plan how a search gets them (docs/gradients.md).
 
-    bench = gradients.Bench(renderer, loss, gradients.interior_point(renderer), seed=0, spp=16)
-    rows = list(gradients.measure_derivatives(bench, reference_spp=64, seeds_of_reference=(6, 16)))
+    bench = gradients.Bench(renderer, loss, gradients.interior_point(renderer), seed=0,
+    spp=16) rows = list(gradients.measure_derivatives(bench, reference_spp=64,
+    seeds_of_reference=(6, 16)))
 
-A `Bench` takes gradients of a loss, by any plan. `derivatives` compares estimators with differences of many samples,
-which experiments about gradients do and a search does not; `planning` chooses what a search takes, by measurement.
+A `Bench` takes gradients of a loss, by any plan. `derivatives` compares estimators with
+differences of many samples, which experiments about gradients do and a search does not;
+`planning` chooses what a search takes, by measurement.
 """
 
 from __future__ import annotations

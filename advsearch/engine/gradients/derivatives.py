@@ -1,5 +1,7 @@
-"""Measures gradient estimators on a scene as it is: error, noise and cost, along *probes*, directions in u, against
-central differences with common random numbers at two step sizes (docs/gradients.md)."""
+"""Measures gradient estimators on a scene as it is: error, noise and cost, along
+*probes*, directions in u, against central differences with common random numbers at two
+step sizes (docs/gradients.md).
+"""
 
 from __future__ import annotations
 
@@ -19,23 +21,32 @@ from advsearch.engine.gradients.bench import Bench, Loss, restrict_plan
 from advsearch.runs.results import GradientStatus, Measured
 from advsearch.scene.gradients import STEP_RANGE, Group, compared
 
-SMALL = 0.1  # share of a control's largest derivative that each of its derivatives counts as, at least
+# share of a control's largest derivative that each of its derivatives counts as, at
+# least
+SMALL = 0.1
 COORDINATEWISE = 8  # groups of at most this many coordinates are probed one by one
-TOLERANCE = 0.05  # relative error that the mean of an estimator may have beyond the noise
+# relative error that the mean of an estimator may have beyond the noise
+TOLERANCE = 0.05
 LOUD = 0.2  # noise of one gradient, relative to its size, from which it is called noisy
-SURE = 0.02  # standard error of a reference, relative to its size, from which on it gets no more seeds
+# standard error of a reference, relative to its size, from which on it gets no more
+# seeds
+SURE = 0.02
 CONFIDENCE = 2.5  # standard errors within which two means agree
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
-"""Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
-as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline
-has a share of its range for a step, which may be too wide."""
+"""Steps of differences that are tried in turn, as multiples of the plan's. A step that
+moves an outline by a pixel is as wide as a classifier's loss allows; a smooth loss
+allows more, and noise falls with the step. What moves no outline has a share of its
+range for a step, which may be too wide.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A `direction` (d,) along which a derivative is measured, largest element 1, zero outside the group; a difference
-    along it has the half-width `step`. The name is `control.parameter`, with the coordinate's number if a group has
-    several and they are probed singly."""
+    """A `direction` (d,) along which a derivative is measured, largest element 1, zero
+    outside the group; a difference along it has the half-width `step`. The name is
+    `control.parameter`, with the coordinate's number if a group has several and they
+    are probed singly.
+    """
 
     group: Group
     name: str
@@ -44,9 +55,11 @@ class Probe:
 
 
 class Reference(NamedTuple):
-    """A derivative by high-sample central differences: the mean over seeds, extrapolated from two `steps` to zero
-    (Richardson). Its `noise` is the standard error together with a quarter of the steps' disagreement; `factor` is the
-    larger step as a multiple of the probe's."""
+    """A derivative by high-sample central differences: the mean over seeds,
+    extrapolated from two `steps` to zero (Richardson). Its `noise` is the standard
+    error together with a quarter of the steps' disagreement; `factor` is the larger
+    step as a multiple of the probe's.
+    """
 
     value: float
     noise: float
@@ -55,8 +68,10 @@ class Reference(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What one estimator says along a probe: the mean over seeds, the standard deviation (`noise`) and median seconds
-    of one estimate. Differences are `factor` times as wide as planned."""
+    """What one estimator says along a probe: the mean over seeds, the standard
+    deviation (`noise`) and median seconds of one estimate. Differences are `factor`
+    times as wide as planned.
+    """
 
     estimator: str
     value: float
@@ -67,10 +82,12 @@ class Estimate(NamedTuple):
 
 
 def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
-    """Return a linear loss with smooth weights: a sum of a few waves of the picture's size, other in each channel.
+    """Return a linear loss with smooth weights: a sum of a few waves of the picture's
+    size, other in each channel.
 
-    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss would be as rough as whatever
-    moves across it, a photographed interior above all, and its differences would depend on the step.
+    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss
+    would be as rough as whatever moves across it, a photographed interior above all,
+    and its differences would depend on the step.
     """
     generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
     height, width = resolution
@@ -78,9 +95,16 @@ def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
     weights = torch.zeros(height, width, 3)
     for _ in range(6):
-        across, down, phase, size = (torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4))
-        weights += size * torch.cos(math.pi * (1.2 * across * columns + 1.2 * down * rows + phase))
-    window = torch.cos(0.5 * math.pi * rows).square() * torch.cos(0.5 * math.pi * columns).square()
+        across, down, phase, size = (
+            torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4)
+        )
+        weights += size * torch.cos(
+            math.pi * (1.2 * across * columns + 1.2 * down * rows + phase)
+        )
+    window = (
+        torch.cos(0.5 * math.pi * rows).square()
+        * torch.cos(0.5 * math.pi * columns).square()
+    )
     weights *= window / (height * width)
 
     def loss(image: Tensor) -> Tensor:
@@ -93,16 +117,21 @@ def compare_with_reference(
     estimate: Estimate, reference: Reference, others: Sequence[Reference] = (), probe: Probe | None = None,
     spp: int = 0,
 ) -> Measured:  # fmt: skip
-    """Say how good an estimate is along a probe, from so many samples a pixel: "reference unusable" where the
-    reference's noise exceeds `LOUD` and doubt (`CONFIDENCE` standard errors of both) covers the error; "biased" where
-    the error of the mean exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`; otherwise "ok".
+    """Say how good an estimate is along a probe, from so many samples a pixel:
+    "reference unusable" where the reference's noise exceeds `LOUD` and doubt
+    (`CONFIDENCE` standard errors of both) covers the error; "biased" where the error of
+    the mean exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`;
+    otherwise "ok".
 
-    The size that this is relative to is the reference's, or `SMALL` of the largest of the `others` of its control: a
-    derivative that happens to be near zero has no size of its own to speak of.
+    The size that this is relative to is the reference's, or `SMALL` of the largest of
+    the `others` of its control: a derivative that happens to be near zero has no size
+    of its own to speak of.
     """
     size = max([abs(reference.value), *(SMALL * abs(other.value) for other in others)])
     difference = abs(estimate.value - reference.value)
-    doubt = CONFIDENCE * math.hypot(estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise)
+    doubt = CONFIDENCE * math.hypot(
+        estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise
+    )
     status: GradientStatus
     if difference <= doubt and reference.noise > LOUD * size:
         status = "reference unusable"
@@ -129,12 +158,19 @@ def as_planned(group: Group) -> list[tuple[str, float]]:
 
 
 def list_attempts(group: Group) -> list[tuple[str, float]]:
-    """Return every estimator to measure on a group, with the multiple of the step; then other steps.
+    """Return every estimator to measure on a group, with the multiple of the step; then
+    other steps.
 
-    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
+    Differences of the loss and of the picture are the same for a linear loss, so that
+    wider steps are tried with one.
     """
-    forced, steps = group.is_forced, {group.step}
-    tries = as_planned(group) if forced else [(name, 1.0) for name in compared(group.valid, group.size)]
+    forced = group.is_forced
+    steps = {group.step}
+    tries = (
+        as_planned(group)
+        if forced
+        else [(name, 1.0) for name in compared(group.valid, group.size)]
+    )
     wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
@@ -145,14 +181,18 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
 
 
 def find_probes(bench: Bench) -> list[Probe]:
-    """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
+    """Return what is worth measuring in a renderer's space: every continuous
+    coordinate, or a direction in many.
+    """
     probes = []
     for group in bench.renderer.plan.groups:
         if group.estimator == "none":
             continue
         if group.size > COORDINATEWISE:
             step = group.step if group.size <= 64 else 0.03
-            probes.append(Probe(group, group.name, _mixed_direction(bench, group), step))
+            probes.append(
+                Probe(group, group.name, _mixed_direction(bench, group), step)
+            )
             continue
         for number in range(group.size):
             direction = torch.zeros_like(bench.u)
@@ -163,12 +203,20 @@ def find_probes(bench: Bench) -> list[Probe]:
 
 
 def _mixed_direction(bench: Bench, group: Group) -> Tensor:
-    """Return a direction (d,) in a group: mostly the signs of the estimator's own gradient, so that there is something
-    to see, and a share of random signs, so that what the estimator leaves out shows too."""
+    """Return a direction (d,) in a group: mostly the signs of the estimator's own
+    gradient, so that there is something to see, and a share of random signs, so that
+    what the estimator leaves out shows too.
+    """
     plan = restrict_plan(bench.renderer.plan, [group.name])
-    gradient = bench.gradient(plan, seeds.stream(bench.seed, "probe"))[group.coordinates]
+    gradient = bench.gradient(plan, seeds.stream(bench.seed, "probe"))[
+        group.coordinates
+    ]
     generator = torch.Generator().manual_seed(seeds.stream(bench.seed, "probe signs"))
-    random_signs = torch.randint(0, 2, gradient.shape, generator=generator).to(gradient.dtype) * 2.0 - 1.0
+    random_signs = (
+        torch.randint(0, 2, gradient.shape, generator=generator).to(gradient.dtype)
+        * 2.0
+        - 1.0
+    )
     mixed = gradient.sign() + 0.5 * random_signs
     direction = torch.zeros_like(bench.u)
     direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
@@ -176,22 +224,35 @@ def _mixed_direction(bench: Bench, group: Group) -> Tensor:
 
 
 def measure_reference(
-    bench: Bench, probe: Probe, *, repeats: tuple[int, int] = (3, 16), factors: Sequence[float] = (1.0,)
+    bench: Bench,
+    probe: Probe,
+    *,
+    repeats: tuple[int, int] = (3, 16),
+    factors: Sequence[float] = (1.0,),
 ) -> Reference:
-    """Return the derivative along a probe by central differences at two steps, with its noise.
+    """Return the derivative along a probe by central differences at two steps, with its
+    noise.
 
-    Seeds are added until the standard error is below `SURE` of the value, between the two numbers of `repeats`. With
-    several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
-    if none is, the one with the least noise goes on.
+    Seeds are added until the standard error is below `SURE` of the value, between the
+    two numbers of `repeats`. With several `factors`, each gets the smaller number of
+    seeds, both steps so many times wider, until one is sure enough; if none is, the one
+    with the least noise goes on.
     """
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
     def measure(factor: float, count: int) -> tuple[Reference, float]:
-        """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
+        """Take differences at a step and at half of it until there are so many pairs,
+        of the same seeds each.
+        """
         step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
         for number in range(len(pairs[factor]), count):
             noise = seeds.stream(bench.seed, "reference", number)
-            pairs[factor].append((_difference(bench, probe, step, noise), _difference(bench, probe, 0.5 * step, noise)))
+            pairs[factor].append(
+                (
+                    _difference(bench, probe, step, noise),
+                    _difference(bench, probe, 0.5 * step, noise),
+                )
+            )
         extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
         coarse_mean = statistics.fmean(coarse for coarse, _ in pairs[factor])
         fine_mean = statistics.fmean(fine for _, fine in pairs[factor])
@@ -199,7 +260,12 @@ def measure_reference(
         if len(extrapolated) > 1:
             error = statistics.stdev(extrapolated) / math.sqrt(len(extrapolated))
         noise_of_both = math.hypot(error, 0.25 * (coarse_mean - fine_mean))
-        return Reference(statistics.fmean(extrapolated), noise_of_both, (coarse_mean, fine_mean), factor), error
+        return Reference(
+            statistics.fmean(extrapolated),
+            noise_of_both,
+            (coarse_mean, fine_mean),
+            factor,
+        ), error
 
     measured = dict[float, tuple[Reference, float]]()
     for factor in factors:
@@ -215,25 +281,33 @@ def measure_reference(
 
 
 def _difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
-    """Return one central difference of the loss along a probe, with one seed on both sides."""
+    """Return one central difference of the loss along a probe, with one seed on both
+    sides.
+    """
     move = step * probe.direction
     width = 2.0 * step
     if probe.group.periodic:
-        above, below = (bench.u + move).remainder(1.0), (bench.u - move).remainder(1.0)
+        above = (bench.u + move).remainder(1.0)
+        below = (bench.u - move).remainder(1.0)
     else:
-        above, below = (bench.u + move).clamp(0.0, 1.0), (bench.u - move).clamp(0.0, 1.0)
+        above = (bench.u + move).clamp(0.0, 1.0)
+        below = (bench.u - move).clamp(0.0, 1.0)
         if probe.group.size <= COORDINATEWISE:
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
-        high, low = (float(bench.loss(bench.renderer(at, seed, bench.spp))) for at in (above, below))
+        high, low = (
+            float(bench.loss(bench.renderer(at, seed, bench.spp)))
+            for at in (above, below)
+        )
     return (high - low) / width
 
 
 def measure_estimates(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[Estimate]:
-    """Measure one estimator of one control's groups along some probes of them, its differences `factor` times as wide
-    as planned."""
+    """Measure one estimator of one control's groups along some probes of them, its
+    differences `factor` times as wide as planned.
+    """
     names = {probe.group.name for probe in probes}
     plan = restrict_plan(bench.renderer.plan.with_steps(factor), names, estimator)
     stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
@@ -242,7 +316,11 @@ def measure_estimates(
     for probe in probes:
         slopes = [float(gradient @ probe.direction) for gradient in gradients]
         mean = statistics.fmean(slopes)
-        estimates.append(Estimate(estimator, mean, statistics.stdev(slopes), repeats, seconds, factor))
+        estimates.append(
+            Estimate(
+                estimator, mean, statistics.stdev(slopes), repeats, seconds, factor
+            )
+        )
     return estimates
 
 
@@ -252,57 +330,86 @@ def measure_derivatives(
     tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned, repeats: tuple[int, int] = (6, 8),
     stage: Callable[[str, int], None] = lambda name, steps: None,
 ) -> Iterator[Measured]:  # fmt: skip
-    """Measure the derivative by each parameter of a renderer's space beside differences of many samples.
+    """Measure the derivative by each parameter of a renderer's space beside differences
+    of many samples.
 
     Args:
-        reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and as `repeats` and `factors` of
-            `measure_reference`.
-        tried: from a group the estimators to try, by default as planned, with multiples of the step; a wider one on
-            what is not `ok` yet.
-        repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
+        reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and
+            as `repeats` and `factors` of `measure_reference`.
+        tried: from a group the estimators to try, by default as planned, with multiples
+            of the step; a wider one on what is not `ok` yet.
+        repeats: gradients by an estimator at first, and by one with another step, which
+            has to be surer.
         stage: is told what begins and of how many steps.
     """
 
     def refer(probe: Probe) -> Reference:
-        # what acts on the picture clips: its mean depends on the noise, so both get the same
-        spp = bench.spp if probe.group.estimator == "image" else max(bench.spp, reference_spp)
+        # what acts on the picture clips: its mean depends on the noise, so both get the
+        # same
+        spp = (
+            bench.spp
+            if probe.group.estimator == "image"
+            else max(bench.spp, reference_spp)
+        )
         finer = replace(bench, spp=spp)
 
         def measure() -> dict[str, Any]:
-            return measure_reference(finer, probe, repeats=seeds_of_reference, factors=reference_factors)._asdict()
+            return measure_reference(
+                finer, probe, repeats=seeds_of_reference, factors=reference_factors
+            )._asdict()
 
         reference = Reference(**bench.keep(f"reference {probe.name}", measure))
         bench.tick(bench.spp)
         return reference
 
-    for control, control_probes in groupby(find_probes(bench), lambda probe: probe.group.control):
+    for control, control_probes in groupby(
+        find_probes(bench), lambda probe: probe.group.control
+    ):
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
         references = {probe.name: refer(probe) for probe in probes}
-        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
+        # each comes from one gradient
+        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
-            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
-        stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))
+            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(
+                probe
+            )
+        stage(
+            f"gradients for {control}",
+            sum(len(tried(members[0].group)) for members in sets.values()),
+        )
         for members in sets.values():
-            yield from _try_estimators(bench, members, references, tried(members[0].group), repeats)
+            yield from _try_estimators(
+                bench, members, references, tried(members[0].group), repeats
+            )
 
 
 def _try_estimators(
     bench: Bench, probes: Sequence[Probe], references: Mapping[str, Reference], tries: Sequence[tuple[str, float]],
     repeats: tuple[int, int],
 ) -> Iterator[Measured]:  # fmt: skip
-    """Yield how estimators agree with references along probes; other steps are tried where none was `ok` before."""
+    """Yield how estimators agree with references along probes; other steps are tried
+    where none was `ok` before.
+    """
     good: set[str] = set()
     for estimator, factor in tries:
-        wanted = list(probes) if factor == 1.0 else [probe for probe in probes if probe.name not in good]
+        wanted = (
+            list(probes)
+            if factor == 1.0
+            else [probe for probe in probes if probe.name not in good]
+        )
         if not wanted:
             break
         count = repeats[0] if factor == 1.0 else repeats[1]
         name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
-        stored = bench.keep(name, partial(_estimates_as_json, bench, estimator, wanted, count, factor))
+        stored = bench.keep(
+            name, partial(_estimates_as_json, bench, estimator, wanted, count, factor)
+        )
         for probe, estimate in zip(wanted, stored, strict=True):
             others = list(references.values())
-            row = compare_with_reference(Estimate(**estimate), references[probe.name], others, probe, bench.spp)
+            row = compare_with_reference(
+                Estimate(**estimate), references[probe.name], others, probe, bench.spp
+            )
             if row.status == "ok":
                 good.add(probe.name)
             yield row
@@ -312,4 +419,7 @@ def _try_estimators(
 def _estimates_as_json(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[dict[str, Any]]:
-    return [estimate._asdict() for estimate in measure_estimates(bench, estimator, probes, repeats, factor)]
+    return [
+        estimate._asdict()
+        for estimate in measure_estimates(bench, estimator, probes, repeats, factor)
+    ]

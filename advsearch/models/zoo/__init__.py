@@ -1,7 +1,9 @@
-"""Networks by the name that a library gives them: ``torchvision:resnet50``, ``timm:resnet50``, ``hf:OWNER/REPOSITORY``.
+"""Networks by the name that a library gives them: ``torchvision:resnet50``,
+``timm:resnet50``, ``hf:OWNER/REPOSITORY``.
 
-Each library is imported when one of its networks is asked for, and not before. It brings the weights, as it does for
-anybody: from its cache on this machine, else from where it publishes them. They are read without unpickling.
+Each library is imported when one of its networks is asked for, and not before. It
+brings the weights, as it does for anybody: from its cache on this machine, else from
+where it publishes them. They are read without unpickling.
 """
 
 from __future__ import annotations
@@ -12,4 +14,10 @@ from advsearch.models.zoo.outputs import of_timm as recognize_timm
 from advsearch.models.zoo.transformers import load as load_transformers
 from advsearch.models.zoo.transformers import of_network as recognize_transformers
 
-__all__ = ["load_timm", "load_torchvision", "load_transformers", "recognize_timm", "recognize_transformers"]
+__all__ = [
+    "load_timm",
+    "load_torchvision",
+    "load_transformers",
+    "recognize_timm",
+    "recognize_transformers",
+]

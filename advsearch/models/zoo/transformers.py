@@ -1,4 +1,6 @@
-"""``hf:REPOSITORY``: networks of transformers, from the Hugging Face hub or a folder, in safetensors only."""
+"""``hf:REPOSITORY``: networks of transformers, from the Hugging Face hub or a folder,
+in safetensors only.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,24 @@ from torch.nn.functional import interpolate
 
 from advsearch.extend import errors, models
 from advsearch.models.zoo import language, outputs, zero_shot
-from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, processor_of, reading
+from advsearch.models.zoo.library import (
+    Adapted,
+    Ask,
+    Loaded,
+    cached_file,
+    in_pixels,
+    processor_of,
+    reading,
+)
 
 
 class Family(NamedTuple):
-    """Networks of transformers that are loaded and asked alike: `ours` tells them, a pattern in the name of an
-    architecture (``DeiTForImageClassificationWithTeacher``), or a function of that and the network or its class. The
-    class of transformers that builds them is AutoModel and `loader`, or for None the architecture itself; `source`
-    makes the model's source."""
+    """Networks of transformers that are loaded and asked alike: `ours` tells them, a
+    pattern in the name of an architecture (``DeiTForImageClassificationWithTeacher``),
+    or a function of that and the network or its class. The class of transformers that
+    builds them is AutoModel and `loader`, or for None the architecture itself; `source`
+    makes the model's source.
+    """
 
     ours: str | Callable[[str, Any], bool]
     loader: str | None
@@ -33,30 +45,43 @@ class Family(NamedTuple):
 
 
 PATIENCE = 5.0
-"""Seconds that the hub has for its first answer. Its client would ask for each file again for half a minute."""
+"""Seconds that the hub has for its first answer. Its client would ask for each file
+again for half a minute.
+"""
 
-ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
+ADVICE = (
+    "Give a folder that save_pretrained(..., safe_serialization=True) has made "
+    "as "
+    "'hf:FOLDER'"
+)
 
 
 def load(spec: str, purpose: models.Purpose) -> models.Source:
-    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
+    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of
+    `NETWORKS`.
 
-    One that reads texts gets its classes from its user (`zero_shot`, `language`). Labels of others are those that they
-    were published with; size, order of channels and normalisation are measured on the image processor
-    (`library.measured`), and where there is none a ModelWarning says so. Code in a repository is never run, and weights
-    are read from safetensors alone. A repository that timm has saved goes to timm. Raises ModelError: transformers is
-    missing, the repository cannot be had or lacks weights, its network is of another kind or larger than the memory, or
-    its processor does what `Preprocessing` can't.
+    One that reads texts gets its classes from its user (`zero_shot`, `language`).
+    Labels of others are those that they were published with; size, order of channels
+    and normalisation are measured on the image processor (`library.measured`), and
+    where there is none a ModelWarning says so. Code in a repository is never run, and
+    weights are read from safetensors alone. A repository that timm has saved goes to
+    timm. Raises ModelError: transformers is missing, the repository cannot be had or
+    lacks weights, its network is of another kind or larger than the memory, or its
+    processor does what `Preprocessing` can't.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = models.library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
     elif Path(name).is_file():
-        raise errors.ModelError(f"model {spec}: is a file; give the folder in which it is with its config.json")
+        raise errors.ModelError(
+            f"model {spec}: is a file; give the folder in which it "
+            "is with its config.json"
+        )
     elif name.startswith((".", "/", "~")) or name.count("/") > 1:
         raise errors.ModelError(
-            f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME"
+            f"model {spec}: no such folder{_near_folders(name)}; a repository is "
+            "written hf:OWNER/NAME"
         )
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
@@ -65,84 +90,128 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         if not Path(name).is_dir() and _out_of_reach(name):
             where["local_files_only"] = True
         saved = _config(transformers, name, spec, where)
-        if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:  # which timm itself has saved
+        # which timm itself has saved
+        if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:
             return outputs.timm_repository(spec, name, revision, purpose)
-        config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
+        config = transformers.AutoConfig.from_pretrained(
+            name, trust_remote_code=False, **where
+        )
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
         check_fits(transformers, name, where, spec)
         builder = architecture if kind.loader is None else f"AutoModel{kind.loader}"
         network, report = getattr(transformers, builder).from_pretrained(
-            name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
+            name,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+            **where,
         )
         _check_whole(network, report, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
-    return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose))
+    return kind.source(
+        Loaded(
+            network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose
+        )
+    )
 
 
 def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
-    """Return the source of a network of transformers that is there already; None of any other. Names come from its
-    ``config``, and what is done to pictures from the repository or folder that it was loaded from; a ModelWarning says
-    where that has no image processor, or can't be read any more."""
+    """Return the source of a network of transformers that is there already; None of any
+    other. Names come from its ``config``, and what is done to pictures from the
+    repository or folder that it was loaded from; a ModelWarning says where that has no
+    image processor, or can't be read any more.
+    """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
     spec = type(network).__name__
-    kind, origin = _kind(spec, network, spec), str(getattr(network, "name_or_path", "") or "")
-    where, processor = {"local_files_only": True}, None
+    kind = _kind(spec, network, spec)
+    origin = str(getattr(network, "name_or_path", "") or "")
+    where = {"local_files_only": True}
+    processor = None
     if origin:
-        with suppress(errors.ModelError), reading(spec, ""):  # it may not be there any more
+        # it may not be there any more
+        with suppress(errors.ModelError), reading(spec, ""):
             processor = processor_of(transformers, origin, where)
     part = partial(_part, transformers, spec, origin, where)
     return kind.source(Loaded(network, spec, spec, processor, part, purpose))
 
 
-def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str) -> Any:
-    with reading(spec, "Give a repository, or a folder, in which it is beside the network"):
-        return getattr(transformers, loader).from_pretrained(name, trust_remote_code=False, **where)
+def _part(
+    transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str
+) -> Any:
+    with reading(
+        spec, "Give a repository, or a folder, in which it is beside the network"
+    ):
+        return getattr(transformers, loader).from_pretrained(
+            name, trust_remote_code=False, **where
+        )
 
 
 def _kind(architecture: str, network: Any, spec: str) -> Family:
-    """Return which of `NETWORKS` an architecture is of, by its name and a network or its class; a ModelError says what
-    it is otherwise."""
+    """Return which of `NETWORKS` an architecture is of, by its name and a network or
+    its class; a ModelError says what it is otherwise.
+    """
     for kind in NETWORKS:
         ours = kind.ours
-        if re.search(ours, architecture) if isinstance(ours, str) else ours(architecture, network):
+        if (
+            re.search(ours, architecture)
+            if isinstance(ours, str)
+            else ours(architecture, network)
+        ):
             return kind
     raise errors.ModelError(
-        f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or "
-        "ForDepthEstimation in it, one that compares pictures with texts, as CLIPModel, one that goes on in words, as "
-        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap another in an nn.Module whose "
+        f"model {spec}: is a {architecture}; expected one whose name has "
+        "ForImageClassification, "
+        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, "
+        "ForObjectDetection or "
+        "ForDepthEstimation in it, one that compares pictures with texts, as "
+        "CLIPModel, one that goes on in words, as "
+        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap "
+        "another in an nn.Module whose "
         "output a task can judge, your own too, and give that from Python"
     )
 
 
-def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
+def _config(
+    transformers: Any, name: str, spec: str, where: Mapping[str, Any]
+) -> Mapping[str, Any]:
     has = partial(cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
             raise errors.ModelError(
-                f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
-                "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+                f"model {spec}: is a repository of open_clip, which transformers can't "
+                "read; give the network as "
+                "transformers has it, such as hf:openai/clip-vit-base-patch32 or "
+                "hf:google/siglip-base-patch16-224"
             )
-        config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(name, **where)[0]
+        config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(
+            name, **where
+        )[0]
         return config
     except OSError as error:
         if Path(name).is_dir():
             raise
         cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
-        cached = [folder.name.partition("--")[2].replace("--", "/") for folder in cache.glob("models--*")]
+        cached = [
+            folder.name.partition("--")[2].replace("--", "/")
+            for folder in cache.glob("models--*")
+        ]
         raise errors.ModelError(
-            f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
-            f"cache{_meant(models.resembling(name, cached))} or can be had ({models.first_line(error)}). Check the "
+            f"model {spec}: {name} is no folder here{_near_folders(name)}, and no "
+            "repository of that name is in the "
+            f"cache{_meant(models.resembling(name, cached))} or can be had "
+            f"({models.first_line(error)}). Check the "
             "name and the network, or give a folder"
         ) from error
 
 
 def _out_of_reach(name: str) -> bool:
-    """Return whether the hub gives no answer about a repository, not even that there is none."""
+    """Return whether the hub gives no answer about a repository, not even that there is
+    none.
+    """
     hub = import_module("huggingface_hub")
     try:
         hub.get_hf_file_metadata(hub.hf_hub_url(name, "config.json"), timeout=PATIENCE)
@@ -153,26 +222,46 @@ def _out_of_reach(name: str) -> bool:
 
 def _near_folders(name: str) -> str:
     place = Path(name).expanduser()
-    there = [folder.name for folder in place.parent.iterdir() if folder.is_dir()] if place.parent.is_dir() else []
-    return _meant([str(place.parent / near) for near in models.resembling(place.name, there)])
+    there = (
+        [folder.name for folder in place.parent.iterdir() if folder.is_dir()]
+        if place.parent.is_dir()
+        else []
+    )
+    return _meant(
+        [str(place.parent / near) for near in models.resembling(place.name, there)]
+    )
 
 
 def _meant(names: Sequence[str]) -> str:
-    """Return the question whether one of these folders or repositories is meant; "" if there is none."""
+    """Return the question whether one of these folders or repositories is meant; "" if
+    there is none.
+    """
     specs = [f"'hf:{name}'" for name in names[:3]]
     return f" (did you mean {' or '.join(specs)}?)" if specs else ""
 
 
 def _check_whole(network: Any, report: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and others at each load. A pooler
-    that was never trained is left out: what it would read is the first token, and that is taken then."""
-    lacking = sorted({*report.get("missing_keys", ()), *(key for key, *_ in report.get("mismatched_keys", ()))})
-    if lacking and getattr(network, "pooler", None) and all(str(key).startswith("pooler.") for key in lacking):
+    """Raise a ModelError where weights are not in the file: they would be random, and
+    others at each load. A pooler that was never trained is left out: what it would read
+    is the first token, and that is taken then.
+    """
+    lacking = sorted(
+        {
+            *report.get("missing_keys", ()),
+            *(key for key, *_ in report.get("mismatched_keys", ())),
+        }
+    )
+    if (
+        lacking
+        and getattr(network, "pooler", None)
+        and all(str(key).startswith("pooler.") for key in lacking)
+    ):
         network.pooler = None
     elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
         raise errors.ModelError(
-            f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
+            f"model {spec}: its files lack {len(lacking)} of the network's weights "
+            f"({shown}), which would be random. "
             "Give a repository that was trained for this, not one of its beginnings"
         )
 
@@ -187,9 +276,10 @@ def _logits_by_pixel(network: Any, images: Tensor) -> Tensor:
 
 
 def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, classes) in [0, 1], overlapping ones too.
-    Networks whose last class stands for "nothing" choose one class for each box (Carion et al. 2020); the others judge
-    each class by itself."""
+    """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, classes) in
+    [0, 1], overlapping ones too. Networks whose last class stands for "nothing" choose
+    one class for each box (Carion et al. 2020); the others judge each class by itself.
+    """
     returned = network(pixel_values=images)
     boxes = in_pixels(returned.pred_boxes, images)
     if returned.logits.shape[-1] > len(network.config.id2label):
@@ -198,12 +288,16 @@ def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], models.Source]:
-    """Return what makes the source of a network whose ``config`` has the names of its classes."""
+    """Return what makes the source of a network whose ``config`` has the names of its
+    classes.
+    """
     return lambda loaded: loaded.source(ask, boxes=boxes, labels=loaded.names or None)
 
 
 class _OfFrames:
-    """A processor of videos as one of pictures, each of which is a video of one frame."""
+    """A processor of videos as one of pictures, each of which is a video of one
+    frame.
+    """
 
     def __init__(self, processor: Any) -> None:
         self.processor = processor
@@ -216,24 +310,48 @@ class _OfFrames:
 
 
 def _of_clips(loaded: Loaded) -> models.Source:
-    """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of a rig."""
+    """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of
+    a rig.
+    """
     config = loaded.network.config
     loaded = replace(loaded, processor=loaded.processor and _OfFrames(loaded.processor))
     module = models.AllAtOnce(Adapted(loaded.network, _logits), int(config.num_frames))
-    return models.source_of(module, loaded.name, labels=loaded.names or None, **loaded.sized(config))
+    return models.source_of(
+        module, loaded.name, labels=loaded.names or None, **loaded.sized(config)
+    )
 
 
 NETWORKS = (
     Family("ForVideoClassification", "ForVideoClassification", _of_clips),
-    Family("TimmWrapperForImageClassification", "ForImageClassification", outputs.wrapped_timm),
-    Family("ForImageClassification", "ForImageClassification", partial(outputs.source, plain=_with_names(_logits))),
-    Family("ForSemanticSegmentation", "ForSemanticSegmentation", _with_names(_logits_by_pixel)),
+    Family(
+        "TimmWrapperForImageClassification",
+        "ForImageClassification",
+        outputs.wrapped_timm,
+    ),
+    Family(
+        "ForImageClassification",
+        "ForImageClassification",
+        partial(outputs.source, plain=_with_names(_logits)),
+    ),
+    Family(
+        "ForSemanticSegmentation",
+        "ForSemanticSegmentation",
+        _with_names(_logits_by_pixel),
+    ),
     Family(outputs.MASKS, "ForUniversalSegmentation", outputs.mask_source),
-    Family(f"^({'|'.join(zero_shot.DETECTORS)})$", "ForZeroShotObjectDetection", zero_shot.detector),
+    Family(
+        f"^({'|'.join(zero_shot.DETECTORS)})$",
+        "ForZeroShotObjectDetection",
+        zero_shot.detector,
+    ),
     Family("ForObjectDetection", "ForObjectDetection", _with_names(_boxes, boxes=True)),
     Family(language.speaks, "ForImageTextToText", language.source),
     Family("ForDepthEstimation", "ForDepthEstimation", outputs.depth_source),
-    Family(lambda _, network: zero_shot.compares(network), "", partial(outputs.source, plain=zero_shot.source)),
+    Family(
+        lambda _, network: zero_shot.compares(network),
+        "",
+        partial(outputs.source, plain=zero_shot.source),
+    ),
     Family(outputs.gives_features, None, outputs.source),
 )
 """Every kind that is read, the particular ones first."""
@@ -242,23 +360,38 @@ NETWORKS = (
 MEMORY = Path("/proc/meminfo")  # where Linux says what is free
 
 
-def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str) -> None:
-    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that can be had
-    without anything else being ended, swap included. They are kept in the type in which they are stored. Nothing is
-    checked where the system does not say what is free."""
+def check_fits(
+    transformers: Any, name: str, where: Mapping[str, Any], spec: str
+) -> None:
+    """Raise a ModelError where the weights of a repository or a folder are larger than
+    the memory that can be had without anything else being ended, swap included. They
+    are kept in the type in which they are stored. Nothing is checked where the system
+    does not say what is free.
+    """
     try:
         lines = MEMORY.read_text(encoding="ascii").splitlines()
-        kilobytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines if len(line.split()) > 1}
+        kilobytes = {
+            line.partition(":")[0]: int(line.split()[1])
+            for line in lines
+            if len(line.split()) > 1
+        }
         free = 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
     except (OSError, ValueError, KeyError):
         return
     size = 0
-    if index := cached_file(transformers, name, "model.safetensors.index.json", where):  # of several files
-        size = int(json.loads(Path(index).read_text(encoding="utf-8")).get("metadata", {}).get("total_size", 0))
+    # of several files
+    if index := cached_file(transformers, name, "model.safetensors.index.json", where):
+        size = int(
+            json.loads(Path(index).read_text(encoding="utf-8"))
+            .get("metadata", {})
+            .get("total_size", 0)
+        )
     elif weights := cached_file(transformers, name, "model.safetensors", where):
         size = Path(weights).stat().st_size
     if size > free:
         raise errors.ModelError(
-            f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free. Give a "
-            "smaller network, one whose weights are stored in bfloat16, or a machine with more memory"
+            f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} "
+            "GB of memory are free. Give a "
+            "smaller network, one whose weights are stored in bfloat16, or a machine "
+            "with more memory"
         )

@@ -6,12 +6,18 @@ from advsearch.experiment import RunContext, experiment
 from advsearch.questions.attack.display import claims, shown
 from advsearch.questions.attack.page import page
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import BY_FIELD, AttackSummary, CurveResult, MatrixResult
+from advsearch.questions.attack.summary import (
+    BY_FIELD,
+    AttackSummary,
+    CurveResult,
+    MatrixResult,
+)
 
 
 @experiment(
     "attack --object mug --control texture",
-    "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
+    "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 "
+    "--seed 1",
     "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
     python_function="advsearch.questions.attack.python:attack",
     view=shown,
@@ -19,12 +25,18 @@ from advsearch.questions.attack.summary import BY_FIELD, AttackSummary, CurveRes
     page=page,
     other_results=BY_FIELD,
 )
-def attack(asked: RunContext[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
-    """Find the worst configuration of a scene, and verify it with fresh renders; or do so for several."""
+def attack(
+    asked: RunContext[AttackConfig],
+) -> AttackSummary | CurveResult | MatrixResult:
+    """Find the worst configuration of a scene, and verify it with fresh renders; or do
+    so for several.
+    """
     # imports torch
     from advsearch.questions.attack.run import attack_once
     from advsearch.questions.attack.studies import curve, matrix
 
     if asked.config.is_study:
         return matrix(asked) if asked.config.is_matrix else curve(asked)
-    return attack_once(asked.config, progress=asked.progress, resumed=asked.resumed).summary
+    return attack_once(
+        asked.config, progress=asked.progress, resumed=asked.resumed
+    ).summary

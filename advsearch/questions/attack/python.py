@@ -1,4 +1,6 @@
-"""`advsearch.attack`: an attack on what a session has: scenes, models, controls, tasks, objectives and policies."""
+"""`advsearch.attack`: an attack on what a session has: scenes, models, controls, tasks,
+objectives and policies.
+"""
 
 from __future__ import annotations
 
@@ -77,44 +79,63 @@ def attack(
     progress: Watched = None,
     **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
-    """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
+    """Search for the worst configuration of a scene, verify it, and return everything
+    that is known about it.
 
-    All other arguments are the settings of `advsearch attack`; `environment`, `up`, `set` and `exposure` belong to a
-    scene that is named here, not to one that is loaded.
+    All other arguments are the settings of `advsearch attack`; `environment`, `up`,
+    `set` and `exposure` belong to a scene that is named here, not to one that is
+    loaded.
 
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes; with `ensemble`, several.
-        object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
-        task: what judges the model's output: a name, a mapping with a `name` and options, an instance, or a function
-            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
+        object: the node or shape that is the object, where `scene` is a file or
+            dictionary that holds several.
+        task: what judges the model's output: a name, a mapping with a `name` and
+            options, an instance, or a function (output, truth) that says how wrong it
+            is, over 0 where it is wrong (docs/tasks.md).
         controls: what may vary: names, instances, or a mapping from names to settings.
-        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
-            images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
-            values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
-            right label, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
-            `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
+        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance",
+            "score", or a function of (output, images (N, H, W, 3), truth, or the target
+            where there is one) or of (output, labels) that returns (N,) values, which
+            are maximised; in classification the output is logits (N, C) and the truth
+            the index of the right label, (N,), or a tuple of several. It may ask for
+            more by the names of further parameters: `u`, `texture`, `inputs`,
+            `configuration` (docs/own-loss.md). None takes the task's own.
         policy: a name, a mapping with a `name` and options, or an instance.
-        over: controls that vary by chance: the configuration has to hold for all of their values.
-        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
-            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
+        over: controls that vary by chance: the configuration has to hold for all of
+            their values.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0,
+            1], output of that picture, truth: the index of the right class) that return
+            a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory only.
-        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
-            was.
+        resume: go on with the run of that name, if there is one, where it was stopped;
+            everything else has to be as it was.
     """
-    options: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+    options: dict[str, Any] = {
+        name: value for name, value in settings.items() if value is not None
+    }
     task = make_task(task) if callable(task) else task
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
-            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
+            "policy: expected a name, a mapping with a `name` and options, or an "
+            f"instance, got {told(policy)}"
         )
     own_controls = [*loading.only_here(controls), *loading.only_here(over)]
-    are_named = all(isinstance(named, (str, Path)) for named in (scene, *several(model)))
-    if not are_named or callable(objective) or own_controls or isinstance(task, OwnTask):
+    are_named = all(
+        isinstance(named, (str, Path)) for named in (scene, *several(model))
+    )
+    if (
+        not are_named
+        or callable(objective)
+        or own_controls
+        or isinstance(task, OwnTask)
+    ):
         naming.check_not_spread(options)
     scene = _load_scene(scene, object, options)
 
-    # What `run.yaml` states. Objects of the caller have the names that they are shown by.
+    # What `run.yaml` states. Objects of the caller have the names that they are shown
+    # by.
     objective_name = _name_objective(objective) if callable(objective) else objective
     described = {
         **loading.scene_as_settings(scene),
@@ -128,18 +149,28 @@ def attack(
     }
     if options.get("exposure"):  # the option says it
         described["set"].pop("camera.exposure", None)
-    config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    config = AttackConfig(
+        **{**described, **options, "run": None if run is None else str(run)}
+    )
     losses.check_aim(objective, targeted=config.target is not None)
 
-    only_here = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
+    only_here = [
+        PythonOnly("model", model_name(network))
+        for network in several(model)
+        if naming.exists_here(network)
+    ]
     only_here += [PythonOnly("scene")] if scene.only_here else []
     if isinstance(task, Task) and not is_named(task, make_task):
         only_here.append(PythonOnly("task", task.name))
-    only_here += [PythonOnly("objective", str(objective_name))] if callable(objective) else []
+    only_here += (
+        [PythonOnly("objective", str(objective_name))] if callable(objective) else []
+    )
     if isinstance(policy, Policy) and not is_named(policy, _make_policy):
         only_here.append(PythonOnly("policy", policy.name))
     only_here += [PythonOnly("control", name) for name in own_controls]
-    only_here += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    only_here += [
+        PythonOnly("metric", name) for name in judging.only_here(config.metrics)
+    ]
     config = config.with_only_here(only_here)
     _check_single(config)
 
@@ -147,10 +178,18 @@ def attack(
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
     loaded_task, objective = task_and_objective(
-        config, task if isinstance(task, Task) else config.task, objective if callable(objective) else config.objective
+        config,
+        task if isinstance(task, Task) else config.task,
+        objective if callable(objective) else config.objective,
     )
-    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
-    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
+    stopped = (
+        run_path(run) if resume and run is not None and is_run(run_path(run)) else None
+    )
+    with (
+        begun(config)
+        if run is not None and stopped is None
+        else nullcontext(stopped) as folder
+    ):
         parts = AttackParts(
             config,
             scene,
@@ -167,15 +206,20 @@ def attack(
 
 
 def _load_scene(
-    scene: Scene | str | Path | Mapping[str, object], shape: str | None, options: Mapping[str, Any]
+    scene: Scene | str | Path | Mapping[str, object],
+    shape: str | None,
+    options: Mapping[str, Any],
 ) -> Scene:
-    """Return a scene, loaded with the options that belong to it; `shape` is its object where it holds several."""
+    """Return a scene, loaded with the options that belong to it; `shape` is its object
+    where it holds several.
+    """
     if isinstance(scene, Scene):
         naming.check_not_of_scene({**options, "object": shape})
         return scene
     of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
     config = SceneConfig(**{"object": "mug", **of_scene})
-    environment, keywords = config.environment, naming.told_of_scene(config)
+    environment = config.environment
+    keywords = naming.told_of_scene(config)
     if shape is not None:
         return loading.load_scene(shape, environment, scene=scene, **keywords)
     if isinstance(scene, Mapping):
@@ -196,17 +240,23 @@ def _make_policy(setting: Any) -> Policy[Any]:
 
 
 def _check_single(config: AttackConfig) -> None:
-    """Refuse settings of several attacks, and those that need a run directory or workers and cannot have them."""
+    """Refuse settings of several attacks, and those that need a run directory or
+    workers and cannot have them.
+    """
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
-            "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
+            "model: expected one, got several; add `ensemble`, which attacks them "
+            "together, or attack each by itself"
         )
     if config.epsilons:
         listed = ", ".join(f"{epsilon:g}" for epsilon in config.epsilons)
         raise InputError(
-            f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
+            f"epsilon: expected one, got {listed}; attack with each, or have "
+            "`advsearch attack` draw the curve"
         )
     if config.aov is not None and config.run is None:
-        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
+        raise InputError(
+            "aov: expected `run` beside it, the folder that keeps the layers; name one"
+        )

@@ -1,7 +1,9 @@
-"""An attack, from its parts to its result: problem, search, random search, verification.
+"""An attack, from its parts to its result: problem, search, random search,
+verification.
 
-`run_attack` is the whole line, to be read from top to bottom; `search_and_verify` is what it does with a problem, and
-`advsearch.questions.attack.stages` has each of its stages.
+`run_attack` is the whole line, to be read from top to bottom; `search_and_verify` is
+what it does with a problem, and `advsearch.questions.attack.stages` has each of its
+stages.
 """
 
 from __future__ import annotations
@@ -29,7 +31,13 @@ from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.models import Model, RemoteNetwork
 from advsearch.progress import NullProgress, Progress, Stages
-from advsearch.questions.attack.carry_out import LOADING, AttackParts, executor_for, parts_of, problem_on
+from advsearch.questions.attack.carry_out import (
+    LOADING,
+    AttackParts,
+    executor_for,
+    parts_of,
+    problem_on,
+)
 from advsearch.questions.attack.outcome import make_result
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
@@ -65,7 +73,8 @@ def attack_once(
         config: the settings.
         progress: is told how far it is.
         resumed: the folder of the run that is continued; None for a new one.
-        clean: the matrix of the clean scene, shared with attacks whose settings differ in epsilon alone.
+        clean: the matrix of the clean scene, shared with attacks whose settings differ
+            in epsilon alone.
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
@@ -81,8 +90,11 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     return run_attack(parts_of(config, scene, model), NullProgress())
 
 
-def run_attack(parts: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
-    """Search for the worst configuration of loaded parts, verify it, and return all that is known of it.
+def run_attack(
+    parts: AttackParts, progress: Progress, resumed: str | Path | None = None
+) -> AttackResult:
+    """Search for the worst configuration of loaded parts, verify it, and return all
+    that is known of it.
 
     Args:
         parts: scene, model, task, controls and policy, with the settings of the attack.
@@ -95,25 +107,40 @@ def run_attack(parts: AttackParts, progress: Progress, resumed: str | Path | Non
     config = parts.config
     model, loading_notes = parts.loaded
     with ExitStack() as stack:
-        run = None if resumed is None else stack.enter_context(RunDirectory.of(config, resumed))
+        run = (
+            None
+            if resumed is None
+            else stack.enter_context(RunDirectory.of(config, resumed))
+        )
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = problem_on(parts)
-        warnings = [*problem.space.notes(parts.scene.description), *loading_notes, *sentences(problem.space.moved)]
+        warnings = [
+            *problem.space.notes(parts.scene.description),
+            *loading_notes,
+            *sentences(problem.space.moved),
+        ]
         for text in warnings:
             progress.message(text)
         gradient_setting = "measure" if config.measure == "full" else None
-        policy = choose_policy(parts.policy, problem, "estimators" if config.estimators else gradient_setting)
+        policy = choose_policy(
+            parts.policy,
+            problem,
+            "estimators" if config.estimators else gradient_setting,
+        )
         if run is None and parts.keep:
             run = stack.enter_context(RunDirectory.of(config))
         if run is not None:
             check_made_of(run, [model], functions_of(parts))
         with executor_for(config, WORKER, progress) as executor:
-            journal = Journal(run, Shared(problem, executor))  # replays stored rows, renders and stores the others
+            # replays stored rows, renders and stores the others
+            journal = Journal(run, Shared(problem, executor))
             if problem.conditions is not None and None in (config.steps, config.draws):
                 progress.message(
-                    f"One configuration for many conditions: {count(problem.steps, 'step')}, each over "
-                    f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
+                    "One configuration for many conditions: "
+                    f"{count(problem.steps, 'step')}, each over "
+                    f"{count(problem.draws, 'condition')}; `steps` and `draws` change "
+                    "that."
                 )
             findings = search_and_verify(
                 policy,
@@ -126,7 +153,9 @@ def run_attack(parts: AttackParts, progress: Progress, resumed: str | Path | Non
                 printable=config.printable,
                 close_looks=config.close_looks,
                 average=config.average,
-                trials=config.trial_count if config.trials is not None or config.smallest else None,
+                trials=config.trial_count
+                if config.trials is not None or config.smallest
+                else None,
                 ladder=ladder_of(config.verify_spp, config.pixel_sampler),
                 specialise=config.specialise,
                 measure=config.measure,
@@ -143,12 +172,15 @@ def run_attack(parts: AttackParts, progress: Progress, resumed: str | Path | Non
             object_name=config.object,
             judge=config.judge,
             policy=config.policy_name,
-            objective=parts.objective if isinstance(parts.objective, str) else config.objective,
+            objective=parts.objective
+            if isinstance(parts.objective, str)
+            else config.objective,
             printable=config.printable,
             command_line=config.command_line(None if run is None else run.path),
             python_only=config.python_only,
         )
-        stored_parts = replace(parts, clean=CleanMatrix())  # without the matrix of light transport, which may be large
+        # without the matrix of light transport, which may be large
+        stored_parts = replace(parts, clean=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
 
 
@@ -171,34 +203,45 @@ def search_and_verify(
     deterministic: bool = False,
     chooses_spp: bool = False,
 ) -> Findings:
-    """Search a problem with a policy and at random, and verify what was found; Ctrl-C ends it with what there is.
+    """Search a problem with a policy and at random, and verify what was found; Ctrl-C
+    ends it with what there is.
 
     Args:
         policy: proposes configurations.
         journal: of the problem; it replays what is stored of the run.
         stages: is told what is done.
         clean: the matrix of the clean scene, of attacks that share it.
-        smallest: look for the smallest budget in which the model is wrong, in place of the worst configuration.
+        smallest: look for the smallest budget in which the model is wrong, in place of
+            the worst configuration.
         seconds: that the search may take; None for no limit.
         baseline: whether a random search with as many renders is made.
-        printable: whether the objective includes print terms; then a search without them is made, too.
+        printable: whether the objective includes print terms; then a search without
+            them is made, too.
         close_looks: further renders of candidates that are close to the best.
         average: random configurations to evaluate.
-        trials: renders that verify a configuration; None for as many as its verdict needs.
+        trials: renders that verify a configuration; None for as many as its verdict
+            needs.
         ladder: samples per pixel that a verification may take.
-        specialise: whether what the search does not need may be left out, and images be predicted.
+        specialise: whether what the search does not need may be left out, and images be
+            predicted.
         measure: which gradient estimators are measured.
         deterministic: whether counts decide in place of times.
-        chooses_spp: whether a full measurement may choose the samples per pixel of the search.
+        chooses_spp: whether a full measurement may choose the samples per pixel of the
+            search.
     """
     problem = journal.problem
     first_spp = problem.spp  # a preparation may choose another one for the search
     looks = TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
     findings = Findings()
-    verifier = Verifier(journal, ladder, stages, findings, looks if trials is None else (trials,))
-    searches = Searches(journal, stages, findings, printable=printable, close_looks=close_looks)
+    verifier = Verifier(
+        journal, ladder, stages, findings, looks if trials is None else (trials,)
+    )
+    searches = Searches(
+        journal, stages, findings, printable=printable, close_looks=close_looks
+    )
     if smallest:
-        scaled(problem.domain, 1.0)  # refuses what has no budget before anything is rendered
+        # refuses what has no budget before anything is rendered
+        scaled(problem.domain, 1.0)
     try:
         with interruptible():
             plan_renders(
@@ -213,12 +256,19 @@ def search_and_verify(
             findings.first_look = look_at_clean_scene(journal, stages, first_spp)
             if not is_already_wrong(verifier, in_any_case=smallest):
                 findings.transport = choose_predictor(
-                    policy, journal, stages, findings, specialise=specialise, clean=clean or CleanMatrix()
+                    policy,
+                    journal,
+                    stages,
+                    findings,
+                    specialise=specialise,
+                    clean=clean or CleanMatrix(),
                 )
                 if smallest:
                     find_smallest(searches, policy, verifier)
                 else:
-                    search_with_baselines(searches, policy, seconds=seconds, baseline=baseline)
+                    search_with_baselines(
+                        searches, policy, seconds=seconds, baseline=baseline
+                    )
                 verify_searches(verifier, is_smallest=smallest)
             if average:
                 verifier.average(average)
@@ -228,37 +278,65 @@ def search_and_verify(
     return findings
 
 
-def search_with_baselines(searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool) -> None:
-    """Search with a policy; then without print terms, if there are some, and at random, to compare."""
-    problem, findings = searches.problem, searches.findings
+def search_with_baselines(
+    searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool
+) -> None:
+    """Search with a policy; then without print terms, if there are some, and at random,
+    to compare.
+    """
+    problem = searches.problem
+    findings = searches.findings
     steps = problem.steps
-    searches.begin("search", f"searching with {policy.name}", steps, "`steps` or `seconds` shorten it")
-    findings.search = searches.search("search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds)
-    if seconds is not None:  # renders of the search itself, without those of the ranking
+    searches.begin(
+        "search",
+        f"searching with {policy.name}",
+        steps,
+        "`steps` or `seconds` shorten it",
+    )
+    findings.search = searches.search(
+        "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
+    )
+    # renders of the search itself, without those of the ranking
+    if seconds is not None:
         history = findings.search.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
         title = "searching without print terms, to see what they cost"
-        searches.begin("without print terms", title, steps, "`printable=false` leaves both out")
+        searches.begin(
+            "without print terms", title, steps, "`printable=false` leaves both out"
+        )
         findings.unprinted = searches.search(UNPRINTED, policy, steps, problem.seed)
     if baseline and policy.name != "random":
-        searches.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
+        searches.begin(
+            "baseline",
+            "searching at random, to compare",
+            steps,
+            "`baseline=false` leaves it out",
+        )
         seed = seeds.stream(problem.seed, "baseline")
-        findings.baseline = searches.search("baseline", make_policy("random"), steps, seed)
+        findings.baseline = searches.search(
+            "baseline", make_policy("random"), steps, seed
+        )
 
 
-def choose_policy(policy: Policy[Any], problem: Problem, gradient_setting: str | None = None) -> Policy[Any]:
-    """Return the policy that searches a problem: the requested one, or what `auto` is here.
+def choose_policy(
+    policy: Policy[Any], problem: Problem, gradient_setting: str | None = None
+) -> Policy[Any]:
+    """Return the policy that searches a problem: the requested one, or what `auto` is
+    here.
 
-    Where a model lets no gradient through, `auto` climbs by differences; behind an address it climbs nowhere.
+    Where a model lets no gradient through, `auto` climbs by differences; behind an
+    address it climbs nowhere.
 
     Args:
         policy: the requested one.
         problem: is searched.
-        gradient_setting: the setting that says something about derivatives; None if none does.
+        gradient_setting: the setting that says something about derivatives; None if
+            none does.
 
     Raises:
-        InputError: the policy needs the gradient of a model that has none, or derivatives that nobody takes are set.
+        InputError: the policy needs the gradient of a model that has none, or
+            derivatives that nobody takes are set.
     """
     norms = {block.norm for block in problem.domain.blocks}
     if isinstance(problem.model.module, RemoteNetwork):
@@ -266,18 +344,28 @@ def choose_policy(policy: Policy[Any], problem: Problem, gradient_setting: str |
             policy = WithoutAscent() if norms == {"box"} else make_policy("nes")
         elif policy.uses_gradient:
             raise InputError(
-                f"policy: {policy.name} follows the model's gradient, and {problem.model.name}, behind an address, has "
+                f"policy: {policy.name} follows the model's gradient, and "
+                f"{problem.model.name}, behind an address, has "
                 "none; use auto, cmaes, nes, random, sobol or grid"
             )
-    elif policy.name == "auto" and "box" not in norms and not problem.model.differentiable:
+    elif (
+        policy.name == "auto"
+        and "box" not in norms
+        and not problem.model.differentiable
+    ):
         return make_policy("nes")
     if gradient_setting and not policy.uses_gradient:
-        raise InputError(f"{gradient_setting}: policy {policy.name} takes no derivatives; leave one of the two out")
+        raise InputError(
+            f"{gradient_setting}: policy {policy.name} takes no "
+            "derivatives; leave one of the two out"
+        )
     return policy
 
 
 def functions_of(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
-    """Return the caller's own functions, by what a run has them for; one that goes on has to have the same."""
+    """Return the caller's own functions, by what a run has them for; one that goes on
+    has to have the same.
+    """
     functions: dict[str, Callable[..., Any] | None] = {
         f"metric {name}": metric for name, metric in parts.metrics.items()
     }

@@ -7,19 +7,35 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
 
-from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
+from advsearch.config import (
+    ControlsByName,
+    DerivativeConfig,
+    RenderConfig,
+    SceneConfig,
+    name_in,
+    read_named,
+)
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
 from advsearch.trust import powers
 
-TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, and what holds for many conditions
+# Fresh renders that check what a search found, and what holds for many conditions
+TRIALS = 20
+TRIALS_OVER = 200
 STEPS = 40  # Of a search about one picture
-OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
-"""Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures, where that is so and conditions are one number (docs/drives.md), where each is
-rendered, and where only a few numbers are searched (a pose)."""
+OVER_PREDICTED = (300, 8)
+OVER_ONE = (100, 4)
+OVER_RENDERED = (150, 4)
+OVER_NUMBERS = (STEPS, 4)
+"""Steps, and conditions that each looks at, of a search for many conditions: where a
+bank of light transport predicts pictures, where that is so and conditions are one
+number (docs/drives.md), where each is rendered, and where only a few numbers are
+searched (a pose).
+"""
 FEWEST_TRIALS = 6
-"""With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
+"""With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a
+test holds this to.
+"""
 
 
 class AttackConfig(DerivativeConfig):
@@ -28,128 +44,166 @@ class AttackConfig(DerivativeConfig):
     command: ClassVar[str] = "attack"
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
-    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
+    free: ClassVar[tuple[str, ...]] = (
+        *DerivativeConfig.free,
+        "log",
+        "workers",
+        "cluster",
+    )
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash("smallest", lambda asked: asked.epsilons,
               "finds one epsilon by itself; give one `epsilon` as the largest, or none"),
         Clash("smallest", lambda asked: asked.is_study,
-              "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest"),
+              "is about one object and one model; name one `object`, one `model`, and "
+              "one `epsilon` as the largest"),
         Clash("model", lambda asked: asked.is_matrix and asked.is_curve,
-              "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one "
+              "several make a matrix, of one object and one epsilon; name one `object` "
+              "and one `epsilon`, or one "
               "`model`"),
         Clash("ensemble", lambda asked: len(split_names(asked.model)) < 2,
-              "is of several models; name them in `model`, separated by commas, or leave `ensemble` out"),
+              "is of several models; name them in `model`, separated by commas, or "
+              "leave `ensemble` out"),
         Clash("smallest", lambda asked: asked.seconds is not None,
               "takes several searches; give `steps` for each, and leave `seconds` out"),
-        Clash("smallest", lambda asked: asked.over, "cannot be combined with `over` yet; leave one of them out"),
-        Clash("smallest", lambda asked: asked.printable, "cannot be combined with `printable`; leave one of them out"),
-        Clash("minimise", lambda asked: asked.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
-        Clash("minimise", lambda asked: asked.target, "makes the right answer easier to give; leave `target` out"),
-        Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave `smallest` out"),
+        Clash("smallest", lambda asked: asked.over, "cannot be combined with `over` "
+                                                    "yet; leave one of them out"),
+        Clash("smallest", lambda asked: asked.printable, "cannot be combined with "
+                                                         "`printable`; leave one of "
+                                                         "them out"),
+        Clash("minimise", lambda asked: asked.is_curve, "has no robust accuracy; name "
+                                                        "one `object` and one `epsilon`"),
+        Clash("minimise", lambda asked: asked.target, "makes the right answer easier "
+                                                      "to give; leave `target` out"),
+        Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave "
+                                                        "`smallest` out"),
         Clash("over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
               "names a control that is searched already; leave it out of one of the two"),
         Clash("draws", lambda asked: not asked.over,
-              "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out"),
+              "is how many conditions of `over` a step looks at, and there are none; "
+              "add `over`, or leave `draws` out"),
         Clash("estimators",
               lambda asked: (
                   {name.partition(".")[0] for name in asked.estimators}
                   & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
               ),
-              "names a control that varies by chance, whose derivative nobody asks for; leave it out"),
+              "names a control that varies by chance, whose derivative nobody asks "
+              "for; leave it out"),
         Clash("average", lambda asked: asked.epsilons,
-              "is the average within one epsilon; name one `epsilon`, or leave `average` out"),
+              "is the average within one epsilon; name one `epsilon`, or leave "
+              "`average` out"),
     )
 
     object: str = setting_as_in(
         SceneConfig, "object",
-        description="the object that the model should recognise; several, separated by commas, are attacked in turn",
+        description="the object that the model should recognise; several, separated by "
+                    "commas, are attacked in turn",
     )
     model: str = setting_as_in(
         SceneConfig, "model",
-        description="the network under test; of several, separated by commas, each is attacked and its adversarial "
+        description="the network under test; of several, separated by commas, each is "
+                    "attacked and its adversarial "
         "scene tried on all",
     )
     ensemble: Literal["mean", "worst"] | None = setting(
         None, "model",
-        "find one scene against several models together: maximise the mean of their objectives, or the lowest one",
+        "find one scene against several models together: maximise the mean of their "
+        "objectives, or the lowest one",
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
         "quick", "search",
-        "measure which gradient estimator is best on this scene; full also measures step and samples",
+        "measure which gradient estimator is best on this scene; full also measures "
+        "step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(
         "auto", "search", "the search policy, which proposes configurations",
         "the name of a policy, or NAME={OPTION: VALUE}",
     )
     steps: int | None = setting(
-        None, "search", "number of search steps, each of which evaluates one configuration",
-        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
-        f"{OVER_ONE[0]} where one number varies, as along a path, and {OVER_RENDERED[0]} where they are rendered",
+        None, "search", "number of search steps, each of which evaluates one "
+                        "configuration",
+        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} "
+                  "where pictures are predicted, "
+        f"{OVER_ONE[0]} where one number varies, as along a path, and "
+        f"{OVER_RENDERED[0]} where they are rendered",
         ge=1, le=1_000_000,
     )
     seconds: float | None = setting(
-        None, "search", "stop the search after this time; the random search beside it gets as many renders",
+        None, "search", "stop the search after this time; the random search beside it "
+                        "gets as many renders",
         otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )
     target: str | None = setting(
         None, "search", "the wrong prediction to aim for, or several",
         "names of classes or their numbers, separated by commas", otherwise="any wrong prediction",
     )
-    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
+    minimise: bool = setting(False, "search", "make the object easier to recognise, "
+                                              "not harder")
     smallest: bool = setting(
-        False, "search", "find the smallest epsilon at which the model is wrong; --epsilon is the largest to try"
+        False, "search", "find the smallest epsilon at which the model is wrong; "
+                         "--epsilon is the largest to try"
     )
     printable: bool = setting(
         False, "search",
-        "prefer a smooth texture or patch in printable colours; a second search without this tells what it costs in "
+        "prefer a smooth texture or patch in printable colours; a second search "
+        "without this tells what it costs in "
         "margin",
     )
     aov: str | None = setting_as_in(
         RenderConfig, "aov",
-        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for the clean "
+        description="write ground truth of each pixel, names separated by commas, as "
+                    "layers of an EXR, for the clean "
         "scene and the adversarial one",
     )
     metrics: dict[str, str] = setting(
-        dict, "run", "your own numbers for every picture, each a column of the rows; may be repeated",
+        dict, "run", "your own numbers for every picture, each a column of the rows; "
+                     "may be repeated",
         "NAME=package.module:function of image, output and truth", flag="--metric", metavar="NAME=FUNCTION",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
-        None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
+        None, "run", "experiment tracker to which every evaluation is sent; its "
+                     "package has to be installed",
         otherwise="none", power=powers.tracker,
     )
     over: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict,
-        description="controls that are drawn at random; one configuration has to hold across the draws", flag="",
+        description="controls that are drawn at random; one configuration has to hold "
+                    "across the draws", flag="",
         min_length=None,
     )
     path: str | None = setting(
         None, "search",
-        "the path along which camera or object travel, with --over path; pictures of the adversarial scene along it "
+        "the path along which camera or object travel, with --over path; pictures of "
+        "the adversarial scene along it "
         "are kept",
-        "approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or two of them, the camera's and the "
+        "approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or "
+        "two of them, the camera's and the "
         "object's, as in approach+orbit; of "
         "several with commas between them, one is drawn each time",
         otherwise="approach", min_length=1,
     )
     shutter: float | None = setting(
-        None, "search", "how long each row of a picture is exposed along a path (motion blur)", otherwise="a still",
+        None, "search", "how long each row of a picture is exposed along a path "
+                        "(motion blur)", otherwise="a still",
         unit="seconds", gt=0.0, le=60.0,
     )
     rolling: float | None = setting(
         None, "search",
-        "how long the rows of a picture are read one after the other along a path (rolling shutter), from the top; "
+        "how long the rows of a picture are read one after the other along a path "
+        "(rolling shutter), from the top; "
         "below 0 from the bottom", otherwise="all at once", unit="seconds", ge=-60.0, le=60.0,
     )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",
-        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one number varies, otherwise "
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one "
+                  "number varies, otherwise "
         f"{OVER_RENDERED[1]}", ge=1, le=1000,
     )
     average: int = setting(
-        0, "search", "also evaluate this many random configurations, to tell how often the model is wrong on average",
+        0, "search", "also evaluate this many random configurations, to tell how often "
+                     "the model is wrong on average",
         unit="renders", ge=0, le=1_000_000,
     )
     baseline: bool = setting(
@@ -162,19 +216,24 @@ class AttackConfig(DerivativeConfig):
         otherwise="raised until more would leave the margin on its side", unit="samples", ge=1, le=65536,
     )
     trials: int | None = setting(
-        None, "verification", "fresh renders that verify the adversarial scene, and as many of the clean scene",
-        f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
-        otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} where some fail; {TRIALS} with "
+        None, "verification", "fresh renders that verify the adversarial scene, and as "
+                              "many of the clean scene",
+        f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be "
+        "called found)",
+        otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} "
+                  f"where some fail; {TRIALS} with "
         "--smallest", unit="renders", ge=FEWEST_TRIALS, le=100_000,
     )
 
     workers: int | None = setting(
         None, "run",
-        "worker processes; they share the attacks of several objects or models, or the independent renders of one",
+        "worker processes; they share the attacks of several objects or models, or the "
+        "independent renders of one",
         otherwise="this one alone", unit="processes", ge=1, le=100_000, power=powers.many_processes,
     )
     cluster: str | None = setting(
-        None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
+        None, "run", "where the workers are", "the address of a Dask scheduler, local, "
+                                              "or a .yaml file",
         metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=powers.connection,
     )
     # fmt: on
@@ -182,7 +241,9 @@ class AttackConfig(DerivativeConfig):
     @model_validator(mode="before")
     @classmethod
     def _policy_with_steps(cls, data: Any) -> Any:
-        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
+        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum:
+        0.9}`` and a name.
+        """
         policy = read_named(data.get("policy"), "policy", "auto")
         if not isinstance(policy, Mapping):
             return data if policy is None else {**data, "policy": policy}
@@ -198,7 +259,11 @@ class AttackConfig(DerivativeConfig):
     @property
     def policy_options(self) -> JsonObject:
         """Options of the policy."""
-        return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
+        return (
+            {}
+            if isinstance(self.policy, str)
+            else {k: v for k, v in self.policy.items() if k != "name"}
+        )
 
     @property
     def is_curve(self) -> bool:
@@ -218,10 +283,18 @@ class AttackConfig(DerivativeConfig):
     @property
     def trial_count(self) -> int:
         """Trials of each group in the verification."""
-        return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
+        return (
+            self.trials
+            if self.trials is not None
+            else TRIALS_OVER
+            if self.over
+            else TRIALS
+        )
 
 
 def instance(asked: str) -> str:
-    """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
+    """A control as it is asked for, without its parameter: `light:key`, or `camera` of
+    `camera.azimuth`.
+    """
     kind, colon, name = asked.partition(":")
     return kind.partition(".")[0] + colon + name.partition(".")[0]

@@ -1,4 +1,6 @@
-"""The stages of an attack, in the order in which `advsearch.questions.attack.run` goes through them."""
+"""The stages of an attack, in the order in which `advsearch.questions.attack.run` goes
+through them.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,13 @@ from advsearch.attacks import (
     run_trials,
     search,
 )
-from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, smallest
+from advsearch.attacks.candidates import (
+    ATTEMPTS,
+    MOST_CHECKS,
+    ROUNDS,
+    confirmed,
+    smallest,
+)
 from advsearch.attacks.evaluation import Query
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
@@ -35,7 +43,13 @@ from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, refusal_of_matrices, remark
+from advsearch.engine.transport import (
+    CleanMatrix,
+    PredictedSearch,
+    Transport,
+    refusal_of_matrices,
+    remark,
+)
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
@@ -46,15 +60,22 @@ from advsearch.tasks import Judgement
 
 MAX_FRAMES = 60
 UNPRINTED = "search without print terms"
-"""The kind of the search without print terms, alongside one with them: it tells what these cost."""
+"""The kind of the search without print terms, alongside one with them: it tells what
+these cost.
+"""
 FIRST_LOOK = 4
-"""Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
+"""Renders of the clean configuration before the search; wrong in all of them, it goes
+through the full trials first.
+"""
 
 Measure = Literal["no", "quick", "full"]
-"""Which gradient estimators are measured before a search: none, the contested ones, or all, with step and samples."""
+"""Which gradient estimators are measured before a search: none, the contested ones, or
+all, with step and samples.
+"""
 
 
-# ---- before the search ----------------------------------------------------------------------------------------------
+# ---- before the search
+# ----------------------------------------------------------------------------------------------
 
 
 def plan_renders(
@@ -67,9 +88,11 @@ def plan_renders(
     deterministic: bool,
     chooses_spp: bool,
 ) -> None:
-    """Choose the bounces of light, gradient estimators and samples of a search by measurement on the scene.
+    """Choose the bounces of light, gradient estimators and samples of a search by
+    measurement on the scene.
 
-    The choice is set in the journal's problem, and stored: a run that goes on has the same.
+    The choice is set in the journal's problem, and stored: a run that goes on has the
+    same.
 
     Args:
         policy: what searches; only one that uses gradients has them measured.
@@ -89,49 +112,98 @@ def plan_renders(
         return
     is_worth_measuring = measure == "full" or problem.steps >= planning.WORTH_BOUNCES
     if specialise and is_worth_measuring:
-        refusal = surface_light.refusal_of_surface_light(problem, problem.steps, policy, specialise)
+        refusal = surface_light.refusal_of_surface_light(
+            problem, problem.steps, policy, specialise
+        )
         if refusal is not None:  # else no step will be rendered
-            title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
+            title = "finding how many bounces of light the search needs"
+            most = planning.most_pictures(problem)
             hint = "few samples each; `specialise=false` leaves it out"
             stages.begin("setup", title, most, hint=hint, at_most=True)
             tick = stages.progress.advance
-            problem.search_depth = planning.bounces_of(problem, problem.seed, tick=tick).depth
+            problem.search_depth = planning.bounces_of(
+                problem, problem.seed, tick=tick
+            ).depth
     is_full = measure == "full"
     if policy.uses_gradient and measure != "no":
         # else derivatives come from what predicts the images
-        if is_full or refusal_of_matrices(problem, problem.steps, specialise) is not None:
-            _measure_gradients(problem, stages, full=is_full, deterministic=deterministic, chooses_spp=chooses_spp)
-    chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
+        if (
+            is_full
+            or refusal_of_matrices(problem, problem.steps, specialise) is not None
+        ):
+            _measure_gradients(
+                problem,
+                stages,
+                full=is_full,
+                deterministic=deterministic,
+                chooses_spp=chooses_spp,
+            )
+    chosen = {
+        "plan": problem.plan.to_dict(),
+        "spp": problem.spp,
+        "search_depth": problem.search_depth,
+    }
     journal.set_note(PLAN, chosen)
 
 
-def _measure_gradients(problem: Problem, stages: Stages, *, full: bool, deterministic: bool, chooses_spp: bool) -> None:
-    """Choose gradient estimators, and with `full` their step and samples, by measurement."""
-    renderer, progress = problem.renderer, stages.progress
+def _measure_gradients(
+    problem: Problem,
+    stages: Stages,
+    *,
+    full: bool,
+    deterministic: bool,
+    chooses_spp: bool,
+) -> None:
+    """Choose gradient estimators, and with `full` their step and samples, by
+    measurement.
+    """
+    renderer = problem.renderer
+    progress = stages.progress
     counted = not full or deterministic
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
-        renderer, problem.loss, interior_point(renderer), seed, problem.spp, tick=lambda samples: progress.advance(1)
+        renderer,
+        problem.loss,
+        interior_point(renderer),
+        seed,
+        problem.spp,
+        tick=lambda samples: progress.advance(1),
     )
     gradients = planning.plan_gradients(renderer.plan, every=full)
     if gradients:
-        hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"
-        stages.begin("setup", "measuring which gradients are best here", gradients, hint=hint)
+        hint = (
+            f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; "
+            "`measure=no` leaves it out"
+        )
+        stages.begin(
+            "setup", "measuring which gradients are best here", gradients, hint=hint
+        )
     problem.plan = planning.measured_plan(bench, every=full, counted=counted)
     if full:
         samples = planning.cosine_samples(problem.plan)
         hint = "counted in samples a pixel; `measure=quick` leaves it out"
-        stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
+        stages.begin(
+            "setup",
+            "choosing step and samples of gradients",
+            samples,
+            hint=hint,
+            at_most=True,
+        )
         table = list(planning.cosines(replace(bench, tick=progress.advance)))
         problem.plan, spp = planning.tuned(problem.plan, table)
         if chooses_spp and spp is not None:
             problem.spp = spp
 
 
-def look_at_clean_scene(journal: Journal, stages: Stages, spp: int) -> tuple[Judgement, ...]:
-    """Render the clean configuration a few times, and return what model and objective say."""
+def look_at_clean_scene(
+    journal: Journal, stages: Stages, spp: int
+) -> tuple[Judgement, ...]:
+    """Render the clean configuration a few times, and return what model and objective
+    say.
+    """
     problem = journal.problem
-    seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
+    seed = seeds.stream(problem.seed, "first look")
+    start = problem.domain.start
     hint = "the first picture compiles the renderer's code"
     stages.begin("setup", "looking at the clean scene", FIRST_LOOK, hint=hint)
 
@@ -140,15 +212,19 @@ def look_at_clean_scene(journal: Journal, stages: Stages, spp: int) -> tuple[Jud
         stages.progress.advance(1)
         return evaluation
 
-    return run_trials(partial(map, evaluate), start, spp=spp, seed=seed, trials=FIRST_LOOK)
+    return run_trials(
+        partial(map, evaluate), start, spp=spp, seed=seed, trials=FIRST_LOOK
+    )
 
 
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
-    """Return whether the clean scene is wrong in the full trials, so that there is nothing to search for.
+    """Return whether the clean scene is wrong in the full trials, so that there is
+    nothing to search for.
 
     They are made where it was wrong in every first look, or `in_any_case`.
     """
-    problem, findings = verifier.problem, verifier.findings
+    problem = verifier.problem
+    findings = verifier.findings
     looks_right = any(trial.right for trial in findings.first_look)
     if not problem.rule.control or (looks_right and not in_any_case):
         return False
@@ -167,9 +243,11 @@ def choose_predictor(
     specialise: bool,
     clean: CleanMatrix,
 ) -> PredictedSearch | None:
-    """Return the cheapest predictor that is accurate here, prepared, or None: then every step is rendered.
+    """Return the cheapest predictor that is accurate here, prepared, or None: then
+    every step is rendered.
 
-    Light on surfaces is compared with traced images first. Why another predictor, or none, was taken is in `findings`.
+    Light on surfaces is compared with traced images first. Why another predictor, or
+    none, was taken is in `findings`.
     """
     problem = journal.problem
     steps = problem.steps
@@ -198,17 +276,27 @@ def choose_predictor(
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
     assert matrix is not None and surface is not None
-    is_too_short = not findings.surface_refused and refusal_of_matrices(problem, None, specialise) is None
+    is_too_short = (
+        not findings.surface_refused
+        and refusal_of_matrices(problem, None, specialise) is None
+    )
     is_about_matrices = is_too_short or surface.cause is RefusalCause.NO_CAMERA
     _report_rendering(matrix if is_about_matrices else surface, stages, findings)
     return None
 
 
 def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
-    """Prepare what predicts images, and return why it cannot be used; None if it can."""
+    """Prepare what predicts images, and return why it cannot be used; None if it
+    can.
+    """
     is_light = isinstance(predictor, SurfaceLight)
-    title = "finding the light on surfaces" if is_light else "collecting light transport"
-    hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+    title = (
+        "finding the light on surfaces" if is_light else "collecting light transport"
+    )
+    hint = (
+        "from here on the search renders nothing (counted in samples a pixel); "
+        "`specialise=false` leaves it out"
+    )
     stages.begin("transport", title, predictor.samples, hint=hint)
     try:
         predictor.prepare(stages.progress.advance)
@@ -223,12 +311,14 @@ def _report_rendering(refusal: Refusal, stages: Stages, findings: Findings) -> N
         stages.progress.message(text)
 
 
-# ---- searches -------------------------------------------------------------------------------------------------------
+# ---- searches
+# -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Searches:
-    """Makes the searches of one attack: by what predicts images, where there is something, or else by rendering.
+    """Makes the searches of one attack: by what predicts images, where there is
+    something, or else by rendering.
 
     Attributes:
         journal: replays stored evaluations, and stores the others.
@@ -249,9 +339,14 @@ class Searches:
         return self.journal.problem
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
-        """Begin the stage of a search of so many steps; `shorter` says which settings shorten it."""
+        """Begin the stage of a search of so many steps; `shorter` says which settings
+        shorten it.
+        """
         renders = planned_renders(steps, close=self.close_looks)
-        hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
+        hint = (
+            f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; "
+            f"{shorter}"
+        )
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
@@ -281,7 +376,8 @@ class Searches:
             ranked: whether the best configurations are rendered again.
 
         Raises:
-            KeyboardInterrupt: it was interrupted; the result of an interrupted main search is in `findings` before.
+            KeyboardInterrupt: it was interrupted; the result of an interrupted main
+                search is in `findings` before.
         """
         renders_before = 0
         frame_interval = max(1, -(-steps // MAX_FRAMES))
@@ -292,13 +388,19 @@ class Searches:
             if evaluation.picture is not None and frames is not None:
                 frames.append(evaluation.picture.numpy())
             new_renders = record.renders - renders_before
-            self.stages.progress.advance(new_renders, best=record.best, **self.journal.traced.told)
+            self.stages.progress.advance(
+                new_renders, best=record.best, **self.journal.traced.told
+            )
             renders_before = record.renders
 
         def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
             if frames is not None:
                 queries = [
-                    replace(query, keep=query.phase == "search" and query.number % frame_interval == 0)
+                    replace(
+                        query,
+                        keep=query.phase == "search"
+                        and query.number % frame_interval == 0,
+                    )
                     for query in queries
                 ]
             on_replay = (lambda query: None) if transport is None else transport.passed
@@ -308,7 +410,11 @@ class Searches:
         if transport is None:
             domain = replace(domain, exact=False, drawn=False)
         else:
-            domain = replace(domain, exact=transport.exact, drawn=transport.drawn and policy.uses_gradient)
+            domain = replace(
+                domain,
+                exact=transport.exact,
+                drawn=transport.drawn and policy.uses_gradient,
+            )
         result = search(
             evaluate,
             domain,
@@ -328,48 +434,73 @@ class Searches:
         return result
 
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer queries by what predicts images, or by rendering, and take print terms off the objective."""
-        traced, predictor = self.journal.traced, self.findings.transport
+        """Answer queries by what predicts images, or by rendering, and take print terms
+        off the objective.
+        """
+        traced = self.journal.traced
+        predictor = self.findings.transport
         if predictor is None or not queries or queries[0].phase != "search":
             evaluations = traced(queries)
         else:
             evaluations = predictor.evaluate_all(queries, traced)
         for query, evaluation in zip(queries, evaluations, strict=True):
             has_print_terms = self.printable and query.kind != UNPRINTED
-            yield penalised(evaluation, self.problem.searched_space, query.u) if has_print_terms else evaluation
+            yield (
+                penalised(evaluation, self.problem.searched_space, query.u)
+                if has_print_terms
+                else evaluation
+            )
 
 
-# ---- verification ---------------------------------------------------------------------------------------------------
+# ---- verification
+# ---------------------------------------------------------------------------------------------------
 
 
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
-    The sample count is chosen first. Then the clean configuration, the adversarial one, that without print terms and
-    the random search's are tried with equal seeds. The smallest change lies at the decision, where no sample count
-    settles the margin: it is tried with that of the clean configuration, as on the way to it.
+    The sample count is chosen first. Then the clean configuration, the adversarial one,
+    that without print terms and the random search's are tried with equal seeds. The
+    smallest change lies at the decision, where no sample count settles the margin: it
+    is tried with that of the clean configuration, as on the way to it.
     """
-    findings, problem = verifier.findings, verifier.problem
-    candidate, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
+    findings = verifier.findings
+    problem = verifier.problem
+    candidate = findings.search
+    baseline = findings.baseline
+    unprinted = findings.unprinted
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
     adversarial = problem.domain.project(candidate.best_u)
-    results = [result for result in (candidate, baseline, unprinted) if result is not None]
+    results = [
+        result for result in (candidate, baseline, unprinted) if result is not None
+    ]
     if not is_smallest or findings.sample_count is None:
-        n_images = sum((result.renders + result.gradients) * problem.draws for result in results)
+        n_images = sum(
+            (result.renders + result.gradients) * problem.draws for result in results
+        )
         configurations = {"adversarial": adversarial, "clean": problem.domain.start}
         verifier.choose_spp(configurations, searched=n_images * problem.spp)
     n_groups = len(results) + (not verifier.clean_tried)
-    verifier.begin("checking what was found with fresh renders", n_groups * verifier.count, at_most=True)
+    verifier.begin(
+        "checking what was found with fresh renders",
+        n_groups * verifier.count,
+        at_most=True,
+    )
     verifier.try_clean()
     findings.verification = verifier.verified("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
-        findings.smallest = None  # seen with other samples than before: no change at all flips the prediction
+        # seen with other samples than before: no change at all flips the prediction
+        findings.smallest = None
     if unprinted is not None:
-        findings.unprinted_verification = verifier.verified("unprinted verification", unprinted)
+        findings.unprinted_verification = verifier.verified(
+            "unprinted verification", unprinted
+        )
     if baseline is not None:
         is_found = findings.verification.ending is Ending.FOUND
-        findings.baseline_verification = verifier.verified("baseline verification", baseline, curtailed=is_found)
+        findings.baseline_verification = verifier.verified(
+            "baseline verification", baseline, curtailed=is_found
+        )
         _take_the_worse(verifier, candidate, baseline)
     if not is_smallest:
         check_failures(verifier, candidate)
@@ -377,13 +508,18 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         find_ambient(verifier, findings.verification.u)
 
 
-def _take_the_worse(verifier: Verifier, result: SearchResult, baseline: SearchResult) -> None:
-    """Let what the random search found be the run's if it is found and the worse one for the model.
+def _take_the_worse(
+    verifier: Verifier, result: SearchResult, baseline: SearchResult
+) -> None:
+    """Let what the random search found be the run's if it is found and the worse one
+    for the model.
 
-    It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too.
+    It is chosen by its trials, so these are no evidence: it has to be the worse one in
+    fresh ones, too.
     """
     findings = verifier.findings
-    by_policy, by_chance = findings.verification, findings.baseline_verification
+    by_policy = findings.verification
+    by_chance = findings.baseline_verification
     if by_policy is None or by_chance is None or by_chance.ending is not Ending.FOUND:
         return
     if _rank(by_chance) <= _rank(by_policy):
@@ -393,38 +529,59 @@ def _take_the_worse(verifier: Verifier, result: SearchResult, baseline: SearchRe
     by_chance = verifier.verified("baseline verification", baseline, again=True)
     findings.baseline_verification = by_chance
     if _rank(by_chance) > _rank(by_policy):
-        findings.beaten, findings.verification = by_policy, by_chance
+        findings.beaten = by_policy
+        findings.verification = by_chance
         names = ("best_u", "best_objective", "claimed_objective", "success_rate")
         taken = {name: getattr(baseline, name) for name in names}
         findings.search = replace(result, **taken, distribution=None)
 
 
-CONFIRMED = 40  # Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them
+# Trials in a row that the upper end of a smallest epsilon has to pass, or as many
+# checks as have them
+CONFIRMED = 40
 
 
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
-    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
+    """Bracket the smallest epsilon; every claim on the way goes through trials with
+    seeds of its own.
 
-    On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
-    full, and what is verified at the end is the configuration there.
+    On the way the fewest trials that can verify anything are enough where none fails.
+    The upper end is tried again in full, and what is verified at the end is the
+    configuration there.
     """
-    problem, findings, trials = searches.problem, searches.findings, verifier.count
+    problem = searches.problem
+    findings = searches.findings
+    trials = verifier.count
     results: list[SearchResult] = []
-    transport = findings.transport if isinstance(findings.transport, Transport) else None
+    transport = (
+        findings.transport if isinstance(findings.transport, Transport) else None
+    )
 
     def searched(inside: Domain, number: int) -> Tensor:
         title = f"search {number + 1} of at most {ROUNDS}"
         searches.begin("search", title, problem.steps, "`steps` shortens each search")
-        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
+        kind = f"search {number}" if number else "search"
+        seed = seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
-        results.append(searches.search(kind, policy, problem.steps, seed, domain=inside, ranked=ranked))
-        findings.search = findings.search or results[0]  # what was found if this is interrupted
+        results.append(
+            searches.search(
+                kind, policy, problem.steps, seed, domain=inside, ranked=ranked
+            )
+        )
+        # what was found if this is interrupted
+        findings.search = findings.search or results[0]
         verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
         return results[-1].best_u
 
     def passes(u: Tensor, check: int, few: int = trials) -> bool:
-        allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
-        while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
+        allowed = problem.rule.allowed(trials)
+        scores = list[float]()
+        failures = 0
+        while (
+            len(scores) < trials
+            and failures <= allowed
+            and (failures or len(scores) < few)
+        ):
             (trial,) = verifier.trials(f"check {check}", {len(scores): u})
             scores.append(trial.score)
             failures += not trial.success
@@ -438,39 +595,72 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         return passes(u, check, problem.rule.fewest)
 
     times = -(-CONFIRMED // trials)
-    bracket = smallest(searched, seems, problem.domain, likely=None if transport is None else transport.likely)
+    bracket = smallest(
+        searched,
+        seems,
+        problem.domain,
+        likely=None if transport is None else transport.likely,
+    )
     if bracket.u is not None:
-        verifier.begin("checking the smallest change", ATTEMPTS * times * trials, at_most=True)
-    findings.smallest = bracket = confirmed(bracket, passes, problem.domain, times=times)
+        verifier.begin(
+            "checking the smallest change", ATTEMPTS * times * trials, at_most=True
+        )
+    findings.smallest = bracket = confirmed(
+        bracket, passes, problem.domain, times=times
+    )
     winner = results[0]
     if bracket.u is not None:
-        winner = replace(results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND)
-    renders, gradients = (sum(getattr(result, name) for result in results) for name in ("renders", "gradients"))
+        winner = replace(
+            results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND
+        )
+    renders, gradients = (
+        sum(getattr(result, name) for result in results)
+        for name in ("renders", "gradients")
+    )
     findings.search = replace(winner, renders=renders, gradients=gradients)
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
-    return verification.ending is Ending.FOUND, verification.adversarial.rate, mean if mean == mean else -math.inf
+    return (
+        verification.ending is Ending.FOUND,
+        verification.adversarial.rate,
+        mean if mean == mean else -math.inf,
+    )
 
 
 TRIED = 8  # Different failures that are tried, at most: the first of the list
 
 
 def check_failures(verifier: Verifier, result: SearchResult) -> None:
-    """Verify the first of the different failures that a search found, each for itself: by the trials of the adversarial
-    configuration, with the seeds that the control group had, up to the first that decides against it.
+    """Verify the first of the different failures that a search found, each for itself:
+    by the trials of the adversarial configuration, with the seeds that the control
+    group had, up to the first that decides against it.
 
-    Over conditions that vary one of them takes hundreds of trials, and nothing is tried here.
+    Over conditions that vary one of them takes hundreds of trials, and nothing is tried
+    here.
     """
-    problem, findings = verifier.problem, verifier.findings
-    known, rule = result.failures, problem.rule
-    if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
+    problem = verifier.problem
+    findings = verifier.findings
+    known = result.failures
+    rule = problem.rule
+    if (
+        known is None
+        or not known.listed
+        or rule.conditional
+        or rule.already_wrong(count_right(findings.clean, 1))
+    ):
         return
     tried = known.listed[:TRIED]
-    verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
+    verifier.begin(
+        "checking different failures with fresh renders",
+        len(tried) * verifier.count,
+        at_most=True,
+    )
     findings.failures = tuple(
-        verifier.verified(f"failure {number}", replace(result, best_u=failure.u), curtailed=True)
+        verifier.verified(
+            f"failure {number}", replace(result, best_u=failure.u), curtailed=True
+        )
         for number, failure in enumerate(tried)
     )

@@ -1,4 +1,6 @@
-"""The results of `attack`, as `summary.json` holds them: of one, of several objects or epsilons, of several models."""
+"""The results of `attack`, as `summary.json` holds them: of one, of several objects or
+epsilons, of several models.
+"""
 
 from __future__ import annotations
 
@@ -35,26 +37,39 @@ from advsearch.runs.summary import NAME, other_summary, read_result
 class FoundValue(DescribedValue):
     """One value of the adversarial configuration, and where it lies."""
 
-    clean: int | float | str | None = optional("the clean scene's; absent of several numbers")
-    low: float | None = optional("the least that the control allows; absent without a range")
+    clean: int | float | str | None = optional(
+        "the clean scene's; absent of several numbers"
+    )
+    low: float | None = optional(
+        "the least that the control allows; absent without a range"
+    )
     high: float | None = optional("the most")
 
 
 class PicturedPrediction(Fields):
-    """What the model says of the picture that is kept, which is that of a trial with the usual prediction."""
+    """What the model says of the picture that is kept, which is that of a trial with
+    the usual prediction.
+    """
 
     label: str
     index: int | None = Field(description="of the class")
-    probability: JsonFloat | None = Field(description="of this prediction; of a detector the score of the box")
+    probability: JsonFloat | None = Field(
+        description="of this prediction; of a detector the score of the box"
+    )
     payload: Payload = optional("what else the task keeps of it; absent without")
-    trial: int | None = optional("number of the trial, the same for both pictures; absent where nothing was tried")
+    trial: int | None = optional(
+        "number of the trial, the same for both pictures; "
+        "absent where nothing was tried"
+    )
 
 
 class CleanPrediction(CleanScene, PicturedPrediction):
     """What the model says of the picture of the clean scene that is kept."""
 
     correct: bool = Field(description="whether that is right")
-    control: ControlGroup | None = Field(description="trials of the clean scene, and in how many it is right")
+    control: ControlGroup | None = Field(
+        description="trials of the clean scene, and in how many it is right"
+    )
 
 
 class ObjectiveValues(Fields):
@@ -67,20 +82,35 @@ class ObjectiveValues(Fields):
 
 
 class TriedObjective(Fields):
-    """What the search maximised, over the trials of the verification, which have other seeds and 8 bits."""
+    """What the search maximised, over the trials of the verification, which have other
+    seeds and 8 bits.
+    """
 
-    clean: ObjectiveValues | None = Field(description="of the clean scene; null where it was not tried")
-    answer: ObjectiveValues | None = Field(description="of the adversarial scene; null where nothing was verified")
+    clean: ObjectiveValues | None = Field(
+        description="of the clean scene; null where it was not tried"
+    )
+    answer: ObjectiveValues | None = Field(
+        description="of the adversarial scene; null where nothing was verified"
+    )
 
 
 class AlongDrive(Fields):
-    """The clean scene and the adversarial one at evenly spaced times of the path that varied by chance."""
+    """The clean scene and the adversarial one at evenly spaced times of the path that
+    varied by chance.
+    """
 
     frames: int
     seconds: float = Field(description="from the first frame to the last")
-    paths: list[str] = Field(default=[], description="the paths, where one of several was drawn; the frames are theirs")
-    clean: int = Field(description="frames of the clean scene in which the model is right")
-    answer: int | None = Field(description="likewise, with the adversarial one; null if nothing was searched")
+    paths: list[str] = Field(
+        default=[],
+        description="the paths, where one of several was drawn; the frames are theirs",
+    )
+    clean: int = Field(
+        description="frames of the clean scene in which the model is right"
+    )
+    answer: int | None = Field(
+        description="likewise, with the adversarial one; null if nothing was searched"
+    )
     spp: int = Field(description="samples a pixel")
 
 
@@ -95,8 +125,12 @@ class BaselineSearch(Fields):
 class SmallestEpsilon(Fields):
     """The bracket of the least epsilon at which the prediction flips, by control."""
 
-    epsilon: dict[str, float] | None = Field(description="the least that passed its trials; null: none did")
-    not_found_at: dict[str, float] | None = Field(description="the largest at which a search found none; null: none")
+    epsilon: dict[str, float] | None = Field(
+        description="the least that passed its trials; null: none did"
+    )
+    not_found_at: dict[str, float] | None = Field(
+        description="the largest at which a search found none; null: none"
+    )
     closed: bool = Field(description="the two are within 5 %")
     confirmed: bool = Field(description="the upper end passed again with new seeds")
     searches: int
@@ -113,35 +147,61 @@ class SearchDistribution(Fields):
 class DifferentFailure(Fields):
     """One of them: a configuration, and where those lie that it stands for."""
 
-    ranges: dict[str, tuple[float, float] | str] = Field(description="from, to; of a discrete choice its option")
+    ranges: dict[str, tuple[float, float] | str] = Field(
+        description="from, to; of a discrete choice its option"
+    )
     configuration: dict[str, DescribedValue]
-    objective: JsonFloat = Field(description="of the one render that won; biased upwards")
-    holds: bool | None = Field(description="whether it is verified; null if it was not tried")
-    verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
-    picture: str | None = Field(description="the first of these trials; null if there is none")
-    pictured: PicturedPrediction | None = optional("of that picture; absent if there is none")
+    objective: JsonFloat = Field(
+        description="of the one render that won; biased upwards"
+    )
+    holds: bool | None = Field(
+        description="whether it is verified; null if it was not tried"
+    )
+    verified: VerifiedRate | None = Field(
+        description="trials that ended as soon as that was clear; null: not tried"
+    )
+    picture: str | None = Field(
+        description="the first of these trials; null if there is none"
+    )
+    pictured: PicturedPrediction | None = optional(
+        "of that picture; absent if there is none"
+    )
 
 
 class FailingShare(Fields):
-    """How large a part of all configurations, drawn evenly, fails in one render of the search."""
+    """How large a part of all configurations, drawn evenly, fails in one render of the
+    search.
+    """
 
     estimate: float | None = Field(description="null where too few draws failed to say")
     interval: Interval = Field(description="95 %, however the draws were chosen")
-    effective: float = Field(description="failures of equal weight that would say as much")
+    effective: float = Field(
+        description="failures of equal weight that would say as much"
+    )
     draws: int
 
 
 class DifferentFailures(Fields):
     """Many different failures, of a policy that looks for them."""
 
-    over: list[str] = Field(description="the parameters that tell cells apart; empty where there are no cells")
-    found: int = Field(description="cells in which the search saw a success, or such draws: its own claim")
+    over: list[str] = Field(
+        description="the parameters that tell cells apart; empty "
+        "where there are no cells"
+    )
+    found: int = Field(
+        description="cells in which the search saw a success, or such "
+        "draws: its own claim"
+    )
     seen: int = Field(description="cells, or draws, that it looked at")
-    places: int | None = Field(description="cells that there are; null where there are none")
+    places: int | None = Field(
+        description="cells that there are; null where there are none"
+    )
     share: FailingShare | None = optional("null where it can't be told")
     tried: int = Field(description="failures that were tried with fresh seeds")
     held: int = Field(description="of these, verified")
-    listed: list[DifferentFailure] = Field(description="the worst, then whichever is farthest from all before it")
+    listed: list[DifferentFailure] = Field(
+        description="the worst, then whichever is farthest from all before it"
+    )
 
 
 class VerificationSamples(Fields):
@@ -149,7 +209,8 @@ class VerificationSamples(Fields):
 
     spp: int
     converged: bool = Field(
-        description="whether it is shown that more would leave the margins on their sides; over conditions that vary, "
+        description="whether it is shown that more would leave the margins on their "
+        "sides; over conditions that vary, "
         "the rate within 5 points"
     )
 
@@ -166,7 +227,9 @@ class SearchGradients(Fields):
     """What the search saw of its gradients."""
 
     count: int
-    cosine_with_the_one_before: JsonFloat | None = Field(description="the median: noise, and the way between")
+    cosine_with_the_one_before: JsonFloat | None = Field(
+        description="the median: noise, and the way between"
+    )
     zero: int
     cut: int = Field(description="of which single numbers were outliers and cut")
     shortened: int = Field(description="outliers as a whole")
@@ -188,17 +251,25 @@ class NotFinite(Fields):
 
 
 class PrintCost(Fields):
-    """What the terms of `printable` cost in margin: beside a search without them, of as many steps.
+    """What the terms of `printable` cost in margin: beside a search without them, of as
+    many steps.
 
-    Margins are means over trials with the same seeds, of what is sought: the smaller, the worse for the model. Each is
-    of one search, so that a cost below 0 says that the search without terms ended in a worse place.
+    Margins are means over trials with the same seeds, of what is sought: the smaller,
+    the worse for the model. Each is of one search, so that a cost below 0 says that the
+    search without terms ended in a worse place.
     """
 
     steps: int = Field(description="evaluations of the search without the terms")
-    margin_with: JsonFloat = Field(description="of the run's adversarial scene, in logits")
-    margin_without: JsonFloat = Field(description="of what was found by the search without the terms, in logits")
+    margin_with: JsonFloat = Field(
+        description="of the run's adversarial scene, in logits"
+    )
+    margin_without: JsonFloat = Field(
+        description="of what was found by the search without the terms, in logits"
+    )
     cost: JsonFloat = Field(description="the first less the second, in logits")
-    verified: VerifiedRate = Field(description="trials of what was found by the search without the terms")
+    verified: VerifiedRate = Field(
+        description="trials of what was found by the search without the terms"
+    )
     terms: PrintTerms = Field(description="of that scene")
 
 
@@ -206,8 +277,12 @@ class Printability(Fields):
     """What `printable` was about, and what it cost."""
 
     clean: PrintTerms = Field(description="of the clean scene")
-    answer: PrintTerms | None = Field(description="of the adversarial scene; null if nothing was searched")
-    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified")
+    answer: PrintTerms | None = Field(
+        description="of the adversarial scene; null if nothing was searched"
+    )
+    cost: PrintCost | None = optional(
+        "what the terms cost in margin; null if nothing was verified"
+    )
 
 
 class AmbientPoint(Fields):
@@ -219,62 +294,103 @@ class AmbientPoint(Fields):
 
 
 class AmbientLight(Fields):
-    """In how much ambient light the picture of a projector still makes the model wrong."""
+    """In how much ambient light the picture of a projector still makes the model
+    wrong.
+    """
 
     lux: float = Field(description="on the object in the scene, without the projector")
-    holds_to: float = Field(description="lux, the most in which it was verified, as in all less that was tried")
-    ends_at: float | None = Field(description="lux, the least in which it was not; null: it holds in direct sun")
-    points: list[AmbientPoint] = Field(description="what was tried, by lux; the first is the verification itself")
+    holds_to: float = Field(
+        description="lux, the most in which it was verified, as in "
+        "all less that was tried"
+    )
+    ends_at: float | None = Field(
+        description="lux, the least in which it was not; null: it holds in direct sun"
+    )
+    points: list[AmbientPoint] = Field(
+        description="what was tried, by lux; the first is the verification itself"
+    )
 
 
 class AttackSummary(SceneResult):
-    """The worst configuration of a scene that was found, how sure that is, and what it cost."""
+    """The worst configuration of a scene that was found, how sure that is, and what it
+    cost.
+    """
 
     command: ClassVar[str] = "attack"
 
     policy: str
     objective: str
-    epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")
-    norm: str | dict[str, str] = Field(description="in which the budget is measured; by control as above")
+    epsilon: float | dict[str, float | None] | None = Field(
+        description="the budget; by control where there are more"
+    )
+    norm: str | dict[str, str] = Field(
+        description="in which the budget is measured; by control as above"
+    )
     label_set: list[str] = Field(description="the names that count as right")
     judge: str = Field(
-        default="object", description="the thing whose answers count: object, the name of one beside it, or all"
+        default="object",
+        description="the thing whose answers count: object, the name "
+        "of one beside it, or all",
     )
-    goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
+    goal: str = Field(
+        description="`a wrong answer`, `a target answer` or `a right "
+        "answer`: what counts as success"
+    )
     target: list[str] | None = Field(description="the targets' names")
     over: list[str] = Field(description="the controls that varied by chance")
     conditions: dict[str, VariedValue] = Field(
-        default={}, description="what they were drawn from; absent without, and of parameters of many numbers"
+        default={},
+        description="what they were drawn from; absent without, and of "
+        "parameters of many numbers",
     )
     image_formation: Formation
     gradient_plan: PlannedGradient
     light_path_segments: PathSegments
     clean: CleanPrediction
-    adversarial: PicturedPrediction | None = Field(description="of what the search found; null if nothing was searched")
-    verified: VerifiedRate | None = Field(description="trials of the adversarial scene; null if nothing was verified")
+    adversarial: PicturedPrediction | None = Field(
+        description="of what the search found; null if nothing was searched"
+    )
+    verified: VerifiedRate | None = Field(
+        description="trials of the adversarial scene; null if nothing was verified"
+    )
     tried_objective: TriedObjective | None = optional("the objective over these trials")
-    baseline: BaselineSearch | None = optional("the random search; absent without `baseline`")
-    answer_from: str | None = optional("`random` where the run's adversarial scene is the random search's")
-    policy_verified: VerifiedRate | None = optional("of what the policy itself found then")
-    drive: AlongDrive | None = optional("[along a drive](drives.md), with `over` a path; absent without")
+    baseline: BaselineSearch | None = optional(
+        "the random search; absent without `baseline`"
+    )
+    answer_from: str | None = optional(
+        "`random` where the run's adversarial scene is the random search's"
+    )
+    policy_verified: VerifiedRate | None = optional(
+        "of what the policy itself found then"
+    )
+    drive: AlongDrive | None = optional(
+        "[along a drive](drives.md), with `over` a path; absent without"
+    )
     ambient: AmbientLight | None = optional(
-        "with [a projector](controls/projector.md) that is found: how much other light it bears"
+        "with [a projector](controls/projector.md) that is found: how much other light "
+        "it bears"
     )
     average: AverageCase | None = optional("only with `average`")
     smallest: SmallestEpsilon | None = optional("only with `smallest`")
     printability: Printability | None = optional("only with `printable`")
     distribution: SearchDistribution | None = optional("of a policy that finds one")
-    failures: DifferentFailures | None = optional("of a policy that looks for different ones")
+    failures: DifferentFailures | None = optional(
+        "of a policy that looks for different ones"
+    )
     sample_count: VerificationSamples | None = optional("of the verification")
     transport: LinearTransport | None = optional(
-        "whether [a matrix of light transport](transport.md) predicted the searches' pictures"
+        "whether [a matrix of light transport](transport.md) predicted the searches' "
+        "pictures"
     )
     claimed: SearchClaim | None = optional("what the search itself believes")
     gradients: SearchGradients | None = optional("of the search")
-    configuration: dict[str, FoundValue] | None = optional("the adversarial configuration in a few values")
+    configuration: dict[str, FoundValue] | None = optional(
+        "the adversarial configuration in a few values"
+    )
     shared: SharedWork | None = optional("only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
-        description="of the search, its gradients, the baseline and the verification; `unprinted`: of the search "
+        description="of the search, its gradients, the baseline and the verification; "
+        "`unprinted`: of the search "
         "without print terms, with its gradients; `products`: predicted instead"
     )
     steps: int = Field(description="evaluations of the search before the reranking")
@@ -288,9 +404,15 @@ class AttackSummary(SceneResult):
 
     @property
     def brief(self) -> str:
-        """The verified rate; of a run that was interrupted before, what was found so far."""
+        """The verified rate; of a run that was interrupted before, what was found so
+        far.
+        """
         if self.verified is None:
-            return f"{self.adversarial.label}, unverified" if self.goes_on and self.adversarial else ""
+            return (
+                f"{self.adversarial.label}, unverified"
+                if self.goes_on and self.adversarial
+                else ""
+            )
         return f"{self.verified.successes}/{self.verified.trials}"
 
 
@@ -305,14 +427,17 @@ class ObjectRow(Fields):
     ending: str | None = None
     epsilon: EpsilonBudget = optional("of the last attack")
     flips_at: EpsilonBudget = Field(
-        description="the least epsilon at which an adversarial scene was found; null: at none"
+        description="the least epsilon at which an adversarial scene was found; null: "
+        "at none"
     )
     verified: VerifiedRate | None = None
     margin: JsonFloat | None = optional("mean of the trials, in logits")
     run: str | None = None
     tried: float | None = optional("the largest epsilon that was tried")
     average: AverageCase | None = optional("only with `average`")
-    renders: dict[str, int] | None = optional("pictures by kind, of the attacks at all epsilons together")
+    renders: dict[str, int] | None = optional(
+        "pictures by kind, of the attacks at all epsilons together"
+    )
 
 
 class CurvePoint(Fields):
@@ -333,17 +458,23 @@ class CurveResult(InNotebook, StudyResult):
     command: ClassVar[str] = "attack"
     tabular: ClassVar[str] = "curve"
 
-    epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
+    epsilons: list[float | None] = Field(
+        description="those that were tried; null: the own of each control"
+    )
     table: list[ObjectRow]
     curve: list[CurvePoint]
 
 
 class MatrixModel(Fields):
-    """One of the models, and what it says of the clean scene in the pictures of all trials."""
+    """One of the models, and what it says of the clean scene in the pictures of all
+    trials.
+    """
 
     model: str
     labels: list[str] = Field(description="the names that count as right")
-    input_size: tuple[int, int] = Field(description="of the pictures that it is shown, [height, width] in pixels")
+    input_size: tuple[int, int] = Field(
+        description="of the pictures that it is shown, [height, width] in pixels"
+    )
     spp: int = Field(description="samples a pixel")
     clean: ControlGroup
 
@@ -352,37 +483,62 @@ class MatrixCell(Fields):
     """One adversarial scene, tried on one model."""
 
     model: str = Field(description="that it is tried on")
-    ending: str = Field(description="`found` where it is verified on this model, as for an attack")
+    ending: str = Field(
+        description="`found` where it is verified on this model, as for an attack"
+    )
     verified: VerifiedRate
 
 
 class MatrixRow(Fields):
     """One adversarial scene, and what it does to each model."""
 
-    attacked: str = Field(description="the model that it was searched on; `all` for an ensemble")
+    attacked: str = Field(
+        description="the model that it was searched on; `all` for an ensemble"
+    )
     ending: str = Field(description="of the search and its own verification")
     run: str | None
-    renders: dict[str, int] = Field(description="of the search and its own verification")
-    tested: list[MatrixCell] = Field(description="on each model; empty where nothing was searched")
+    renders: dict[str, int] = Field(
+        description="of the search and its own verification"
+    )
+    tested: list[MatrixCell] = Field(
+        description="on each model; empty where nothing was searched"
+    )
 
 
 class MatrixResult(InNotebook, StudyResult):
-    """Adversarial scenes that were searched on each of several models, or on all of them together, tried on each."""
+    """Adversarial scenes that were searched on each of several models, or on all of
+    them together, tried on each.
+    """
 
     command: ClassVar[str] = "attack"
 
     models: list[str] = Field(description="as they were asked for")
-    ensemble: str | None = Field(description="how objectives were put together; null: each model by itself")
+    ensemble: str | None = Field(
+        description="how objectives were put together; null: each model by itself"
+    )
     tested: list[MatrixModel] = Field(
-        description="the models that adversarial scenes were tried on; empty where none was"
+        description="the models that adversarial scenes were tried on; empty where "
+        "none was"
     )
     table: list[MatrixRow]
 
     @property
     def brief(self) -> str:
         """How many adversarial scenes hold on models that they were not searched on."""
-        others = [cell for row in self.table for cell in row.tested if cell.model != row.attacked]
-        return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
+        others = [
+            cell
+            for row in self.table
+            for cell in row.tested
+            if cell.model != row.attacked
+        ]
+        return (
+            (
+                f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} "
+                "transfer"
+            )
+            if others
+            else ""
+        )
 
 
 BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}

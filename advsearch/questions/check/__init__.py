@@ -1,4 +1,6 @@
-"""Check every gradient against differences; show how a search gets them and what it leaves out."""
+"""Check every gradient against differences; show how a search gets them and what it
+leaves out.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from advsearch.questions.check.result import CheckConfig, CheckResult, shown
 @experiment(
     "check --object mug --control pose",
     "check --object mug --control environment.rotation --loss linear --json",
-    "check --object mug --control texture,camera --loss model --seconds 120 --run derivatives",
+    "check --object mug --control texture,camera --loss model --seconds 120 --run "
+    "derivatives",
     "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
     "resume gradients",
     positional_args=("object", "model"),
@@ -18,7 +21,9 @@ from advsearch.questions.check.result import CheckConfig, CheckResult, shown
     view=shown,
 )
 def check(context: RunContext[CheckConfig]) -> CheckResult:
-    """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
+    """Compare every gradient of a scene with differences, and plan a search over it
+    (docs/gradients.md).
+    """
     from advsearch.questions.check.carry_out import GradientCheck  # imports torch
 
     return GradientCheck(context).run()

@@ -20,12 +20,19 @@ from advsearch.extend import (
     views,
 )
 
-OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
+OF_ALL: Mapping[str, object] = {
+    "object": "mug",
+    "environment": None,
+    "controls": {"texture": {}},
+    "set_": {},
+}
 """What is as it is unless it is given, and has to be left so with `all`."""
 
 
 class CheckConfig(DerivativeConfig):
-    """Everything that decides what `check` does: gradients of a scene against differences."""
+    """Everything that decides what `check` does: gradients of a scene against
+    differences.
+    """
 
     command: ClassVar[str] = "check"
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
@@ -34,27 +41,34 @@ class CheckConfig(DerivativeConfig):
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,
         settings.Clash("all", lambda config: any(getattr(config, name) != value for name, value in OF_ALL.items()),
-              "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out"),
+              "takes scenes and controls of its own; leave `object`, `environment`, "
+              "`controls` and `set` out"),
         settings.Clash("objective", lambda config: config.loss == "linear",
-              "is of the model's loss, which `loss=linear` leaves out; leave one of the two out"),
+              "is of the model's loss, which `loss=linear` leaves out; leave one of "
+              "the two out"),
     )
 
-    all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours")
+    all: bool = setting(False, "check", "every control, on three bundled scenes; takes "
+                                        "hours")
     loss: Literal["linear", "model", "both"] = setting(
         "both", "check",
-        "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
+        "what is differentiated: a smooth linear loss of the raw picture, the model's "
+        "own, or both in turn",
     )
     # fmt: on
     seconds: float | None = setting(
         None,
         "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        "time after which no measurement is begun any more; `advsearch resume` goes on "
+        "for as long again",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
         le=1e9,
     )  # fmt: skip
-    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-check-NNN")
+    run: str | None = setting_as_in(
+        SceneConfig, "run", otherwise="runs/OBJECT-check-NNN"
+    )
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -66,7 +80,9 @@ class CheckConfig(DerivativeConfig):
 
 
 class CheckedRow(results.Measured):
-    """A derivative along a parameter, or the gradient of a whole control, beside its reference."""
+    """A derivative along a parameter, or the gradient of a whole control, beside its
+    reference.
+    """
 
     object: str
     environment: str
@@ -78,10 +94,19 @@ class GainRow(results.Fields):
 
     item: str
     what: str
-    time_gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
-    picture_difference: results.JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
-    gradient_difference: results.JsonFloat = Field(description="the same of gradients; 0 where there are none")
-    safe: bool = Field(description="whether pictures and gradients agree to within their noise")
+    time_gain: float = Field(
+        description="a gradient's time x the picture's variance "
+        "with it, over those without it"
+    )
+    picture_difference: results.JsonFloat = Field(
+        description="root mean square at one seed, over that of two seeds"
+    )
+    gradient_difference: results.JsonFloat = Field(
+        description="the same of gradients; 0 where there are none"
+    )
+    safe: bool = Field(
+        description="whether pictures and gradients agree to within their noise"
+    )
     seconds: float = Field(description="of a gradient with it")
 
 
@@ -92,7 +117,9 @@ class TexelRow(results.Fields):
     side: int = Field(description="of the texture, in texels")
     seen: int = Field(description="texels that light reaches the camera from directly")
     pixels: int = Field(description="pixels that show the surface")
-    enough: int = Field(description="side, `side` halved as often as the pixels still resolve as much")
+    enough: int = Field(
+        description="side, `side` halved as often as the pixels still resolve as much"
+    )
 
 
 class SearchPlan(results.PlannedGradient):
@@ -102,17 +129,25 @@ class SearchPlan(results.PlannedGradient):
 
 
 class CheckResult(views.InNotebook, RunResult):
-    """Every derivative of a scene beside differences, and the plan of a search over it, as far as they are measured."""
+    """Every derivative of a scene beside differences, and the plan of a search over it,
+    as far as they are measured.
+    """
 
     command: ClassVar[str] = "check"
 
     object: str
-    measured: int = Field(description="parts (a scene with a control and a loss) that are done")
+    measured: int = Field(
+        description="parts (a scene with a control and a loss) that are done"
+    )
     planned: int = Field(description="all parts")
     rows: list[CheckedRow]
     plan: SearchPlan | None = results.optional("absent of `loss=linear` and of `all`")
-    bounces: results.PathLength | None = results.optional("how long the light paths of a long search are")
-    gains: list[GainRow] = Field(default=[], description="what is left out, and what that saves")
+    bounces: results.PathLength | None = results.optional(
+        "how long the light paths of a long search are"
+    )
+    gains: list[GainRow] = Field(
+        default=[], description="what is left out, and what that saves"
+    )
     texels: list[TexelRow] = Field(default=[], description="of the searched textures")
 
     @property
@@ -125,10 +160,14 @@ class CheckResult(views.InNotebook, RunResult):
 
 
 READING = (
-    "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference). ok: "
-    "they agree within 5 %, and one gradient scatters by less than 20 % (noise); biased: they disagree; noisy: it "
-    "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a second render that carries all "
-    "derivatives back at once; differences, secant: two renders with the parameter moved by a step. A cosine of 1 with "
+    "Each row sets a derivative as a search gets it (gradient) beside one that takes "
+    "far more renders (reference). ok: "
+    "they agree within 5 %, and one gradient scatters by less than 20 % (noise); "
+    "biased: they disagree; noisy: it "
+    "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a "
+    "second render that carries all "
+    "derivatives back at once; differences, secant: two renders with the parameter "
+    "moved by a step. A cosine of 1 with "
     "the converged gradient means that a gradient points the right way."
 )
 
@@ -161,7 +200,9 @@ def _step(group: results.GroupDerivative) -> str:
     if not group.step_reason:
         return ""
     unit = "" if group.unit == "1" else f" {group.unit}"
-    return f"{group.step:.3g}" + ("" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})")
+    return f"{group.step:.3g}" + (
+        "" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})"
+    )
 
 
 GROUPS: Mapping[str, views.Column] = {
@@ -184,16 +225,24 @@ LOSSES = {
 
 
 def shown(result: CheckResult) -> ShownResult:
-    rows, left, plan, sentences = result.rows, result.planned - result.measured, result.plan, []
+    rows = result.rows
+    left = result.planned - result.measured
+    plan = result.plan
+    sentences = []
     if left:
-        stopped = "The time was up" if result.ending == results.OUT_OF_TIME else "Stopped"
+        stopped = (
+            "The time was up" if result.ending == results.OUT_OF_TIME else "Stopped"
+        )
         sentences.append(
-            f"{stopped} after {result.measured} of {result.planned} parts (a scene, its controls and a loss)."
+            f"{stopped} after {result.measured} of {result.planned} parts (a scene, "
+            "its controls and a loss)."
         )
     if short := short_names(rows):
         sentences.append(f"No estimator is good enough for {', '.join(short)}.")
     elif rows:
-        sentences.append(f"Every parameter {'so far ' if left else ''}has a good gradient.")
+        sentences.append(
+            f"Every parameter {'so far ' if left else ''}has a good gradient."
+        )
     groups, left_out = (plan.groups, [*plan.left_out]) if plan else ([], [])
     reasons: dict[tuple[str, str], list[str]] = {}  # each once, with its parameters
     for group in groups:
@@ -202,26 +251,53 @@ def shown(result: CheckResult) -> ShownResult:
         if group.step_reason:
             reasons.setdefault(("step", group.step_reason), []).append(group.name)
     if bounces := result.bounces:
-        longest = f"at most {bounces.depth} segments of {bounces.full}: {bounces.reason}"
+        longest = (
+            f"at most {bounces.depth} segments of {bounces.full}: {bounces.reason}"
+        )
         left_out.append(f"light paths of a long search: {longest}")
     for texels in result.texels:
         seen = f"{texels.seen} are seen in {texels.pixels} pixels"
-        left_out.append(f"texels of {texels.control}: {seen}, which resolve {texels.enough} of {texels.side} a side")
-    why = [f"{what} of {', '.join(names)}: {reason}" for (what, reason), names in reasons.items()]
+        left_out.append(
+            f"texels of {texels.control}: {seen}, which resolve "
+            f"{texels.enough} of {texels.side} a side"
+        )
+    why = [
+        f"{what} of {', '.join(names)}: {reason}"
+        for (what, reason), names in reasons.items()
+    ]
     whole = [row for row in rows if row.quantity == "gradient"]
-    facts = {} if plan is None else {"renders a gradient": str(plan.renders_per_gradient), "samples": str(plan.spp)}
+    facts = (
+        {}
+        if plan is None
+        else {
+            "renders a gradient": str(plan.renders_per_gradient),
+            "samples": str(plan.spp),
+        }
+    )
     return ShownResult(
         " ".join(sentences),
         [
             ResultPart(text=[READING] if rows else []),
             *(
                 ResultPart.table(
-                    [row for row in rows if row.loss == name and row.quantity == "derivative"], SINGLE, title=title
+                    [
+                        row
+                        for row in rows
+                        if row.loss == name and row.quantity == "derivative"
+                    ],
+                    SINGLE,
+                    title=title,
                 )
                 for name, title in LOSSES.items()
             ),
-            ResultPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
-            ResultPart.table(groups, GROUPS, title="How a search gets its derivatives", text=why),
+            ResultPart.table(
+                whole,
+                WHOLE,
+                title="The model's loss, cosine with the converged gradient",
+            ),
+            ResultPart.table(
+                groups, GROUPS, title="How a search gets its derivatives", text=why
+            ),
             ResultPart("Left out", left_out),
             ResultPart.table(result.gains, GAINS, title="What that saves"),
         ],
@@ -232,15 +308,18 @@ def shown(result: CheckResult) -> ShownResult:
 def short_names(rows: Sequence[CheckedRow]) -> list[str]:
     """Return the names of what no estimator is good enough for, each once.
 
-    For each parameter and loss the row with the best status counts: an estimator that no plan would take may fall
-    short. Of the model's loss those of whole controls count: what matters is where their gradient points.
+    For each parameter and loss the row with the best status counts: an estimator that
+    no plan would take may fall short. Of the model's loss those of whole controls
+    count: what matters is where their gradient points.
     """
     order = ("ok", "reference unusable", "noisy", "biased")
     best: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
         key = row.object, row.environment, row.loss, row.name
         counts = row.loss == "linear" or row.quantity == "gradient"
-        if counts and (key not in best or order.index(row.status) < order.index(best[key].status)):
+        if counts and (
+            key not in best or order.index(row.status) < order.index(best[key].status)
+        ):
             best[key] = row
     short = [row for row in best.values() if row.status in ("biased", "noisy")]
     return list(dict.fromkeys(f"{row.name} ({row.status})" for row in short))

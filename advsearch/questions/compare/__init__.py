@@ -22,41 +22,75 @@ from advsearch.extend import (
     setting_as_in,
     settings,
 )
-from advsearch.questions.compare.result import ComparedPair, ComparedSide, CompareResult, claims, shown
+from advsearch.questions.compare.result import (
+    ComparedPair,
+    ComparedSide,
+    CompareResult,
+    claims,
+    shown,
+)
 
 if TYPE_CHECKING:
     from advsearch.questions.compare.sides import Side
 
-ALWAYS = ("compared", "pictures", "seed", "threads", "deterministic", "run", "overwrite")
+ALWAYS = (
+    "compared",
+    "pictures",
+    "seed",
+    "threads",
+    "deterministic",
+    "run",
+    "overwrite",
+)
 """The settings that mean something for stored sweeps, too."""
 
 
 class CompareConfig(SweepConfig):
-    """Everything that decides what `compare` does: which stored sweeps it reads, or the sweep that it makes first."""
+    """Everything that decides what `compare` does: which stored sweeps it reads, or the
+    sweep that it makes first.
+    """
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
-        *("model", "adversarial_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "shutter"),
+        *(
+            "model",
+            "adversarial_of",
+            "surface",
+            "aov",
+            "metrics",
+            "log",
+            "trials",
+            "verify_spp",
+            "path",
+            "shutter",
+        ),
         *("rolling", "fps", "must_change", "must_not_change"),
     )
 
     # fmt: off
     compared: str = setting(
         ..., "compare",
-        "what is compared, separated by commas: sweeps that are stored (one of several models, or several of the same "
+        "what is compared, separated by commas: sweeps that are stored (one of several "
+        "models, or several of the same "
         "draws), or models, where `object` says what they are shown", "names or folders of runs of sweep, or models",
     )
     pictures: int = setting(
-        6, "compare", "pictures of what one side alone gets right that are shown, for each side; 0 for none",
+        6, "compare", "pictures of what one side alone gets right that are shown, for "
+                      "each side; 0 for none",
         unit="pictures", ge=0, le=1000,
     )
     object: str = setting_as_in(
         SweepConfig, "object", default="",
-        description="the object that models are shown, where models are compared; several, separated by commas",
+        description="the object that models are shown, where models are compared; "
+                    "several, separated by commas",
     )
     # fmt: on
-    keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
-    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
+    keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(
+        SweepConfig, "keep_pictures", default="wrong"
+    )
+    run: str | None = setting_as_in(
+        SceneConfig, "run", otherwise="runs/WHAT-compare-NNN"
+    )
 
     _named = settings.texts(several=["compared"])
     _different = settings.each_once("compared")
@@ -69,21 +103,33 @@ class CompareConfig(SweepConfig):
 
     @model_validator(mode="after")
     def _of_stored_or_made(self) -> CompareConfig:
-        """Refuse what says how pictures are made where stored ones are compared, and a single model."""
+        """Refuse what says how pictures are made where stored ones are compared, and a
+        single model.
+        """
         if not self.object:
             for declared in settings.settings(type(self)):
-                if declared.field not in ALWAYS and getattr(self, declared.field) != declared.default:
+                if (
+                    declared.field not in ALWAYS
+                    and getattr(self, declared.field) != declared.default
+                ):
                     raise InputError(
-                        f"{declared.name}: says how models are shown pictures, and no `object` is named; add `object`, "
+                        f"{declared.name}: says how models are shown pictures, and no "
+                        "`object` is named; add `object`, "
                         "or leave it out to compare stored sweeps"
                     )
         elif len(settings.split_names(self.compared)) < 2:
-            raise InputError(f"compared: expected at least two models, got {self.compared[:60]}; name another one")
+            raise InputError(
+                "compared: expected at least two models, got "
+                f"{self.compared[:60]}; name another one"
+            )
         return self
 
     @property
     def title(self) -> tuple[str, ...]:
-        return "-".join(Path(name).stem for name in settings.split_names(self.object or self.compared)), self.command
+        return "-".join(
+            Path(name).stem
+            for name in settings.split_names(self.object or self.compared)
+        ), self.command
 
     def sweep(self) -> SweepConfig:
         """Return the sweep of the models that has to be made first."""
@@ -96,19 +142,23 @@ class CompareConfig(SweepConfig):
     "compare reference hardened.pt2 --object mug --control pose,camera --samples 200",
     positional_args=("compared",),
     about="compared",
-    positional=PositionalArgument("WHAT", "the run of a sweep, or models and what they are shown", "", True),
+    positional=PositionalArgument(
+        "WHAT", "the run of a sweep, or models and what they are shown", "", True
+    ),
     view=shown,
     claims=claims,
 )
 def compare(context: RunContext[CompareConfig]) -> CompareResult:
-    """Compare models, objects or adversarial scenes on the same pictures, pair by pair (docs/compare.md).
+    """Compare models, objects or adversarial scenes on the same pictures, pair by pair
+    (docs/compare.md).
 
-    All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that
-    exist in Python alone are swept first (`sweep(scene, [one, other], run=...)`), and then the run is compared.
+    All other arguments are the settings of `advsearch compare`. The run is kept, in
+    `run` or under runs/. Models that exist in Python alone are swept first
+    (`sweep(scene, [one, other], run=...)`), and then the run is compared.
 
     Args:
-        compared: names or folders of runs of `sweep`: one of several models, or several of the same draws. With
-            `object`, names of models, which are shown it first.
+        compared: names or folders of runs of `sweep`: one of several models, or several
+            of the same draws. With `object`, names of models, which are shown it first.
     """
     # these import torch and pandas
     from advsearch.questions.compare.images import PairImages
@@ -126,7 +176,9 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
             sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
     else:
         progress.stage("reading rows")
-        sides = read_sides([directory.find_run(name) for name in settings.split_names(config.compared)])
+        sides = read_sides(
+            [directory.find_run(name) for name in settings.split_names(config.compared)]
+        )
     if not sides:
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []
@@ -164,12 +216,16 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
             "model": config.compared,
             "task": config.task_name,
         }
-    environments = settings.names_together(side.sweep.summary.environment for side in sides)
+    environments = settings.names_together(
+        side.sweep.summary.environment for side in sides
+    )
     return {
         "environment": environments or config.lit_by,
         "controls": sides[0].sweep.summary.controls,
-        "object": settings.names_together(side.labels["object"] for side in sides) or config.object,
-        "model": settings.names_together(side.labels["model"] for side in sides) or config.compared,
+        "object": settings.names_together(side.labels["object"] for side in sides)
+        or config.object,
+        "model": settings.names_together(side.labels["model"] for side in sides)
+        or config.compared,
         "task": sides[0].sweep.summary.task,
     }
 
@@ -192,20 +248,34 @@ def count_side(side: Side) -> ComparedSide:
 
 
 def find_cautions(sides: Sequence[Side], differ: Sequence[str]) -> list[str]:
-    """Return what a reader has to know of sides whose sweeps differ in some settings."""
+    """Return what a reader has to know of sides whose sweeps differ in some
+    settings.
+    """
     if not sides:
         return []
     cautions = [text for side in sides for text in side.sweep.summary.warnings]
     if len(differ) > 1:
         names = f"{', '.join(differ[:-1])} and {differ[-1]}"
-        cautions.append(f"The sweeps differ in {names}: what is told here is of all of that together.")
+        cautions.append(
+            f"The sweeps differ in {names}: what is told here is of all of "
+            "that together."
+        )
     if not differ:
-        cautions.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
+        cautions.append(
+            "The sweeps have the same settings: what differs is in files, "
+            "in versions, or in the machine."
+        )
     rows = sides[0].rows
     if len(rows) > 1 and rows["unit"].nunique() == 1:
         unit = rows.attrs["unit name"]
-        cautions.append(f"All pairs are of one {unit}: the shares are of this one, and nothing is shown of others.")
+        cautions.append(
+            f"All pairs are of one {unit}: the shares are of this one, and "
+            "nothing is shown of others."
+        )
     tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
-        cautions.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
+        cautions.append(
+            "What counts as right is judged by different tasks: "
+            f"{', '.join(sorted(tasks))}."
+        )
     return cautions

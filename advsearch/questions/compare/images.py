@@ -14,7 +14,9 @@ from advsearch.questions.compare.sides import Side
 
 
 class MissingImage(NamedTuple):
-    """An image to render: of a side, with a number; and the name of its file in the run directory."""
+    """An image to render: of a side, with a number; and the name of its file in the run
+    directory.
+    """
 
     side: Side
     number: int
@@ -23,7 +25,8 @@ class MissingImage(NamedTuple):
 
 @dataclass
 class PairImages:
-    """Images of pairs in the directory of the run: those that sweeps have stored, or rendered again.
+    """Images of pairs in the directory of the run: those that sweeps have stored, or
+    rendered again.
 
     Attributes:
         context: of the experiment.
@@ -37,20 +40,32 @@ class PairImages:
     _unavailable: set[str] = field(default_factory=set)
 
     def list_pairs(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
-        """Yield pairs that one side alone gets right, where the margins are farthest apart first.
+        """Yield pairs that one side alone gets right, where the margins are farthest
+        apart first.
 
-        There are at most as many of each side as the settings say, with images as far as these are available; `pair` is
-        the number of the two sides.
+        There are at most as many of each side as the settings say, with images as far
+        as these are available; `pair` is the number of the two sides.
         """
         run = self.context.run
         margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
         rows = [
-            *find_smallest(-margin_gap[first.is_right & ~second.is_right], self.context.config.pictures),
-            *find_smallest(margin_gap[~first.is_right & second.is_right], self.context.config.pictures),
+            *find_smallest(
+                -margin_gap[first.is_right & ~second.is_right],
+                self.context.config.pictures,
+            ),
+            *find_smallest(
+                margin_gap[~first.is_right & second.is_right],
+                self.context.config.pictures,
+            ),
         ]
-        shares_images = first.sweep.folder == second.sweep.folder and first.rows["number"].equals(second.rows["number"])
+        shares_images = first.sweep.folder == second.sweep.folder and first.rows[
+            "number"
+        ].equals(second.rows["number"])
         sides = {"a": first} if shares_images else {"a": first, "b": second}
-        files = {row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides] for row in rows}
+        files = {
+            row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides]
+            for row in rows
+        }
         missing = []
         with self.context.until_interrupted():
             for row in rows:
@@ -67,17 +82,28 @@ class PairImages:
             is_complete = all((run.path / file).is_file() for file in files[row])
             yield PairPicture(
                 number=row,
-                values={name: value if isinstance(value, str) else float(f"{value:.6g}") for name, value in values},
+                values={
+                    name: value if isinstance(value, str) else float(f"{value:.6g}")
+                    for name, value in values
+                },
                 right=(first if first.is_right[row] else second).name,
                 answers=(first.rows["label"][row], second.rows["label"][row]),
                 pictures=files[row] if is_complete else [],
             )
 
     def _render(self, missing: Sequence[MissingImage]) -> None:
-        """Render images again, those of one sweep after the other, so that its scenes are loaded once."""
+        """Render images again, those of one sweep after the other, so that its scenes
+        are loaded once.
+        """
         if missing:
-            self.context.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
-        for image in sorted(missing, key=lambda image: (str(image.side.sweep.folder), image.number)):
+            self.context.progress.stage(
+                "rendering pictures again",
+                len(missing),
+                hint="`pictures` says how many",
+            )
+        for image in sorted(
+            missing, key=lambda image: (str(image.side.sweep.folder), image.number)
+        ):
             self._render_image(image)
             self.context.progress.advance(1)
 
@@ -87,9 +113,14 @@ class PairImages:
             return
         try:
             scenes = sweep.scenes
-        except (InputError, errors.ModelError) as error:  # a scene or a model is no longer available
+        except (
+            InputError,
+            errors.ModelError,
+        ) as error:  # a scene or a model is no longer available
             self._unavailable.add(str(sweep.folder))
-            self.warnings.append(f"Pictures of {sweep.folder.name} are not shown: {error}")
+            self.warnings.append(
+                f"Pictures of {sweep.folder.name} are not shown: {error}"
+            )
             return
         self.context.run.write_file(image.file, scenes.thumbnail(image.number))
         self.n_rendered += 1

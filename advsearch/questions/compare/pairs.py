@@ -1,4 +1,6 @@
-"""Two sides, counted pair by pair: in all, by each parameter, and where one side is worse."""
+"""Two sides, counted pair by pair: in all, by each parameter, and where one side is
+worse.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,17 @@ from advsearch.extend import rules, seeds, statistics
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.questions.compare.sides import Side, has_same_values
 
-MAX_VALUES = 64  # Different numbers of a parameter, beyond which it has no table unless the sweep says how it is cut
+# Different numbers of a parameter, beyond which it has no table unless the sweep says
+# how it is cut
+MAX_VALUES = 64
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 
-def compare_sides(first: Side, second: Side, seed: int, *, with_rules: bool = True) -> ComparedPair:
+def compare_sides(
+    first: Side, second: Side, seed: int, *, with_rules: bool = True
+) -> ComparedPair:
     """Count the pairs of two sides; images are added later.
 
     Args:
@@ -34,7 +40,8 @@ def compare_sides(first: Side, second: Side, seed: int, *, with_rules: bool = Tr
     shared = [
         name
         for name in first.varying_parameters
-        if name in second.rows.attrs["units"] and has_same_values(first.rows[name], second.rows[name])
+        if name in second.rows.attrs["units"]
+        and has_same_values(first.rows[name], second.rows[name])
     ]
     units = first.rows["unit"].to_numpy()
     n_units = len(np.unique(units))
@@ -51,31 +58,47 @@ def compare_sides(first: Side, second: Side, seed: int, *, with_rules: bool = Tr
         units=None if n_units == len(units) else n_units,
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, units),
-        p=statistics.clustered.paired_by_unit(first.is_right, second.is_right, units)[2],
+        p=statistics.clustered.paired_by_unit(first.is_right, second.is_right, units)[
+            2
+        ],
         worse=worse,
         better=better,
-        parts=[part for name in shared for part in count_by_parameter(first, second, name)],
+        parts=[
+            part for name in shared for part in count_by_parameter(first, second, name)
+        ],
         shown=[],
     )
 
 
 def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPart]:
-    """Yield the counts of the pairs for each value, or each part of the range, of a parameter."""
+    """Yield the counts of the pairs for each value, or each part of the range, of a
+    parameter.
+    """
     column = first.rows[name]
     unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
     units = first.rows["unit"].to_numpy()
     for value, mask in split_by_value(column, first.rows.attrs["edges"].get(name)):
         if mask.any():
-            counts = count_pairs(first.is_right[mask], second.is_right[mask], units[mask])
+            counts = count_pairs(
+                first.is_right[mask], second.is_right[mask], units[mask]
+            )
             yield PairPart(parameter=name, unit=unit, value=value, **counts)
 
 
-def count_pairs(first_right: BoolArray, second_right: BoolArray, units: IntArray) -> dict[str, Any]:
-    """Return the fields of `PairCounts` from what both sides say of pairs (n,), which are of units (n,)."""
-    difference, interval, _ = statistics.clustered.paired_by_unit(first_right, second_right, units)
+def count_pairs(
+    first_right: BoolArray, second_right: BoolArray, units: IntArray
+) -> dict[str, Any]:
+    """Return the fields of `PairCounts` from what both sides say of pairs (n,), which
+    are of units (n,).
+    """
+    difference, interval, _ = statistics.clustered.paired_by_unit(
+        first_right, second_right, units
+    )
     pairs_per_unit = statistics.clustered.per_unit(np.ones(len(units)), units)
     shares = [
-        statistics.clustered.mean_share(statistics.clustered.per_unit(is_right, units), pairs_per_unit)
+        statistics.clustered.mean_share(
+            statistics.clustered.per_unit(is_right, units), pairs_per_unit
+        )
         for is_right in (first_right, second_right)
     ]
     return {
@@ -89,13 +112,19 @@ def count_pairs(first_right: BoolArray, second_right: BoolArray, units: IntArray
     }
 
 
-def split_by_value(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[Any, BoolArray]]:
-    """Yield the values of a parameter, or the parts of its range between edges, and which rows (n,) have them."""
+def split_by_value(
+    column: pd.Series, edges: Sequence[float] | None
+) -> Iterator[tuple[Any, BoolArray]]:
+    """Yield the values of a parameter, or the parts of its range between edges, and
+    which rows (n,) have them.
+    """
     if column.dtype == "category":
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
     elif edges is not None:
-        bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, len(edges) - 2)
+        bins = np.clip(
+            np.searchsorted(edges, column, side="right") - 1, 0, len(edges) - 2
+        )
         for index, bounds in enumerate(pairwise(edges)):
             yield bounds, bins == index
     elif column.nunique() <= MAX_VALUES:
@@ -104,7 +133,8 @@ def split_by_value(column: pd.Series, edges: Sequence[float] | None) -> Iterator
 
 
 def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
-    """Find where one side alone is right more often than elsewhere; None of too few pairs.
+    """Find where one side alone is right more often than elsewhere; None of too few
+    pairs.
 
     Args:
         table: of pairs (`rules`); `correct` is False where that side alone is right.
@@ -129,4 +159,9 @@ def count_exceptions(pairs: pd.DataFrame) -> CountOf:
     lower, upper = rules.estimate_interval(pairs)
     share = None if pairs.empty else 1.0 - rules.estimate_share(pairs)
     n_exceptions = int((~pairs["correct"]).sum())
-    return CountOf(count=n_exceptions, total=len(pairs), interval=(1.0 - upper, 1.0 - lower), share=share)
+    return CountOf(
+        count=n_exceptions,
+        total=len(pairs),
+        interval=(1.0 - upper, 1.0 - lower),
+        share=share,
+    )

@@ -19,9 +19,13 @@ class ComparedSide(results.CountedPredictions):
     run: str = Field(description="folder of the sweep that has its rows")
     object: str
     model: str
-    answer: str = Field(default="", description="the run whose adversarial scene was swept; absent without")
+    answer: str = Field(
+        default="",
+        description="the run whose adversarial scene was swept; absent without",
+    )
     seconds: results.JsonFloat = Field(
-        description="of a picture and its predictions, shared evenly among the models that saw it"
+        description="of a picture and its predictions, shared evenly among the models "
+        "that saw it"
     )
 
 
@@ -33,7 +37,8 @@ class CountOf(results.Fields):
     interval: results.Interval = Field(description="of the share, 95 %")
     share: float | None = Field(
         default=None,
-        description="of all; where pairs share draws, the mean over draws of the share of each; absent of older runs",
+        description="of all; where pairs share draws, the mean over draws of the share "
+        "of each; absent of older runs",
     )
 
     @property
@@ -51,10 +56,13 @@ class PairCounts(results.Fields):
     neither: int = Field(description="that none gets right")
     shares: tuple[float, float] | None = Field(
         default=None,
-        description="accuracy of the first and of the second; where pairs share draws, means over draws of the share "
+        description="accuracy of the first and of the second; where pairs share draws, "
+        "means over draws of the share "
         "of each; absent of older runs",
     )
-    difference: float = Field(description="accuracy of the second less that of the first")
+    difference: float = Field(
+        description="accuracy of the second less that of the first"
+    )
     interval: results.Interval = Field(description="of that difference, 95 %, of pairs")
 
     @property
@@ -73,7 +81,9 @@ class PairCounts(results.Fields):
 
 
 class PairRule(CountOf):
-    """Values under which one side alone is right more often than elsewhere, counted on pairs that did not choose it."""
+    """Values under which one side alone is right more often than elsewhere, counted on
+    pairs that did not choose it.
+    """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: CountOf = Field(description="pairs under no rule so far")
@@ -93,8 +103,13 @@ class PairPicture(results.Fields):
     number: int = Field(description="of the pair, from 0")
     values: dict[str, str | float] = Field(description="of the parameters")
     right: str = Field(description="the side that is right")
-    answers: tuple[str, str] = Field(description="what is said of the first side, and of the second")
-    pictures: list[str] = Field(description="files in the run's folder: of each side, or one that both were shown")
+    answers: tuple[str, str] = Field(
+        description="what is said of the first side, and of the second"
+    )
+    pictures: list[str] = Field(
+        description="files in the run's folder: of each side, "
+        "or one that both were shown"
+    )
 
 
 class ComparedPair(PairCounts):
@@ -104,18 +119,32 @@ class ComparedPair(PairCounts):
     second: str = Field(description="name of the other")
     units: int | None = Field(
         default=None,
-        description="draws that the pairs are of, such as [drives](drives.md), where some share one; absent where none "
+        description="draws that the pairs are of, such as [drives](drives.md), where "
+        "some share one; absent where none "
         "do",
     )
-    unit: str = Field(default="drive", description="what such a draw is: a drive, a picture or a configuration")
-    p: float = Field(
-        description="how likely a split so uneven of the pairs that one alone gets right is where both are right "
-        "equally often (two-sided; McNemar's exact test, or where pairs share draws a bound by bets)"
+    unit: str = Field(
+        default="drive",
+        description="what such a draw is: a drive, a picture or a configuration",
     )
-    worse: list[PairRule] | None = Field(description="where the first alone is right; null where it was not looked for")
-    better: list[PairRule] | None = Field(description="where the second alone is right; null likewise")
-    parts: list[PairPart] = Field(description="by the values of each parameter, cut as the sweep's tables are")
-    shown: list[PairPicture] = Field(description="pairs that one side alone gets right, the farthest apart first")
+    p: float = Field(
+        description="how likely a split so uneven of the pairs that one alone gets "
+        "right is where both are right "
+        "equally often (two-sided; McNemar's exact test, or where pairs share draws a "
+        "bound by bets)"
+    )
+    worse: list[PairRule] | None = Field(
+        description="where the first alone is right; null where it was not looked for"
+    )
+    better: list[PairRule] | None = Field(
+        description="where the second alone is right; null likewise"
+    )
+    parts: list[PairPart] = Field(
+        description="by the values of each parameter, cut as the sweep's tables are"
+    )
+    shown: list[PairPicture] = Field(
+        description="pairs that one side alone gets right, the farthest apart first"
+    )
 
 
 class CompareResult(views.InNotebook, RunResult):
@@ -127,26 +156,38 @@ class CompareResult(views.InNotebook, RunResult):
     model: str
     task: str = Field(description="what judges the predictions")
     differ: list[str] = Field(description="the settings in which the sweeps differ")
-    sides: list[ComparedSide] = Field(description="in the order in which they were named; empty if interrupted before")
-    pairs: list[ComparedPair] = Field(description="the first side with each of the others")
+    sides: list[ComparedSide] = Field(
+        description="in the order in which they were named; empty if interrupted before"
+    )
+    pairs: list[ComparedPair] = Field(
+        description="the first side with each of the others"
+    )
     renders: int = Field(description="pictures that were rendered now")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
     def brief(self) -> str:
-        return ", ".join(f"{side.name} {side.accuracy:.1%}" for side in self.sides if side.accuracy is not None)
+        return ", ".join(
+            f"{side.name} {side.accuracy:.1%}"
+            for side in self.sides
+            if side.accuracy is not None
+        )
 
 
 LIKELY = (
-    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+    "p: how likely a split so uneven of the pairs that one side alone gets right is "
+    "where both are right equally often "
 )
 NOTE = (
-    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's "
+    "for pairs, of shares "
     "Clopper-Pearson's, each for its row by itself."
 )
 NOTE_OF_UNITS = (
-    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent, nor are pictures of one configuration: p "
-    "and intervals are over {units}, by bets, each for its row by itself. All {units} weigh the same."
+    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent, nor are "
+    "pictures of one configuration: p "
+    "and intervals are over {units}, by bets, each for its row by itself. All {units} "
+    "weigh the same."
 )
 
 SIGNIFICANCE = 0.05  # A p-value up to this is called a difference
@@ -164,11 +205,19 @@ def shown(result: CompareResult) -> ShownResult:
         "time a prediction": lambda side: cost_text(side.seconds),
     }
     if any(side.outcomes for side in result.sides):
-        columns["the others"] = lambda side: wording.outcomes_text(side.outcomes, result.task)
-    sections = [ResultPart.table(result.sides, columns, title="How often each is right")]
+        columns["the others"] = lambda side: wording.outcomes_text(
+            side.outcomes, result.task
+        )
+    sections = [
+        ResultPart.table(result.sides, columns, title="How often each is right")
+    ]
     for pair in result.pairs:
         sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
-    said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
+    said = (
+        headline(result.pairs[0])
+        if result.pairs
+        else ("Interrupted before anything was compared.")
+    )
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
     return ShownResult(said, sections, facts, says_interrupted=not result.pairs)
@@ -178,15 +227,20 @@ def cost_text(seconds: float) -> str:
     """Return the time of a prediction; empty where it is not known."""
     if math.isnan(seconds):
         return ""
-    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+    return (
+        f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+    )
 
 
 def headline(pair: ComparedPair) -> str:
     """Return the first thing that a reader should know of two sides, in a sentence."""
     first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
-    of_units = "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
+    of_units = (
+        "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
+    )
     return (
-        f"{pair.first} is right in {first_accuracy} and {pair.second} in {second_accuracy} of the same "
+        f"{pair.first} is right in {first_accuracy} and {pair.second} in "
+        f"{second_accuracy} of the same "
         f"{wording.count(pair.pairs, 'picture')}{of_units}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {points_text(pair.interval)})."
@@ -202,11 +256,14 @@ def alone_text(pair: ComparedPair) -> str:
     """Return what the pairs say that one side alone gets right, in a sentence."""
     if not pair.first_only and not pair.second_only:
         return "Both are right about the same pictures."
-    reservation = "" if pair.p <= SIGNIFICANCE else ". That there is a difference is not shown"
+    reservation = (
+        "" if pair.p <= SIGNIFICANCE else (". That there is a difference is not shown")
+    )
     p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
     return (
-        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in "
+        f"{pair.second_only} "
         f"({test}, p {p_text}){reservation}."
     )
 
@@ -219,7 +276,9 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
     note = NOTE if pair.units is None else NOTE_OF_UNITS.format(units=f"{pair.unit}s")
-    yield ResultPart(f"{pair.first} and {pair.second}, pair by pair", sentences, heads, rows, note)
+    yield ResultPart(
+        f"{pair.first} and {pair.second}, pair by pair", sentences, heads, rows, note
+    )
     yield ResultPart("Where one is worse", [*_rule_texts(pair)])
     yield from _parameter_tables(pair)
     for name in (pair.first, pair.second):
@@ -227,21 +286,32 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
 
 
 def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
-    """Yield a table for each parameter; a terminal shows those over which the difference varies most."""
+    """Yield a table for each parameter; a terminal shows those over which the
+    difference varies most.
+    """
     tables: dict[str, list[PairPart]] = {}
     for part in pair.parts:
         unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
         tables.setdefault(f"{part.parameter}{unit}", []).append(part)
-    range_of_difference = {name: np.ptp([part.difference for part in parts]) for name, parts in tables.items()}
+    range_of_difference = {
+        name: np.ptp([part.difference for part in parts])
+        for name, parts in tables.items()
+    }
     by_range = sorted(tables, key=range_of_difference.__getitem__, reverse=True)
     in_terminal = by_range[:MAX_TABLES]
     heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
     heads += [f"{pair.first} alone", f"{pair.second} alone"]
     for name, parts in tables.items():
         rows = [_part_cells(part) for part in parts]
-        yield ResultPart(name, heads=heads, rows=rows, only="" if name in in_terminal else "page")
+        yield ResultPart(
+            name, heads=heads, rows=rows, only="" if name in in_terminal else "page"
+        )
     if len(in_terminal) < len(tables):
-        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
+        more = (
+            "The difference varies most over these; the page has all "
+            f"{len(tables)} "
+            "parameters."
+        )
         yield ResultPart(text=[more], only="text")
 
 
@@ -249,7 +319,13 @@ def _part_cells(part: PairPart) -> list[str]:
     accuracies = [wording.percent(accuracy) for accuracy in part.accuracies]
     difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
     alone = [str(part.first_only), str(part.second_only)]
-    return [wording.value_text(part.value), str(part.pairs), *accuracies, difference, *alone]
+    return [
+        wording.value_text(part.value),
+        str(part.pairs),
+        *accuracies,
+        difference,
+        *alone,
+    ]
 
 
 def _rule_texts(pair: ComparedPair) -> Iterator[str]:
@@ -257,8 +333,12 @@ def _rule_texts(pair: ComparedPair) -> Iterator[str]:
     yield from _worse_texts(pair.better, pair.second_only, pair.second, pair.first)
 
 
-def _worse_texts(rules: Sequence[PairRule] | None, n_alone: int, name: str, other: str) -> Iterator[str]:
-    """Yield where the other side is worse than one that alone gets so many pairs right."""
+def _worse_texts(
+    rules: Sequence[PairRule] | None, n_alone: int, name: str, other: str
+) -> Iterator[str]:
+    """Yield where the other side is worse than one that alone gets so many pairs
+    right.
+    """
     if rules is None or not n_alone:
         return
     where = f"Where {other} is worse than {name}:"
@@ -267,11 +347,16 @@ def _worse_texts(rules: Sequence[PairRule] | None, n_alone: int, name: str, othe
     for index, rule in enumerate(rules):
         rest = "elsewhere" if index == 0 else "in what no rule before covers"
         conditions = wording.conditions_text(rule.conditions)
-        yield f"{where} {conditions}, in {rule.text} pairs; {rest} in {rule.elsewhere.text}."
+        yield (
+            f"{where} {conditions}, in {rule.text} pairs; {rest} in "
+            f"{rule.elsewhere.text}."
+        )
 
 
 def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
-    """Yield the pictures of the pairs that one side alone gets right, for a terminal and for a page."""
+    """Yield the pictures of the pairs that one side alone gets right, for a terminal
+    and for a page.
+    """
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []
     without_pictures: list[str] = []
@@ -284,7 +369,10 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
             for key, value in example.values.items()
         )
         answers = zip((pair.first, pair.second), example.answers, strict=True)
-        captions = [f"{side}: {answer}{' (right)' if side == name else ''}" for side, answer in answers]
+        captions = [
+            f"{side}: {answer}{' (right)' if side == name else ''}"
+            for side, answer in answers
+        ]
         line = "; ".join([*captions, values])
         lines.append([line, *example.pictures])
         if not example.pictures:
@@ -293,7 +381,12 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         if len(example.pictures) != 2:
             captions = ["; ".join(captions)]
         captions[0] += f"; {values}"
-        groups.append([views.Picture(file, caption) for file, caption in zip(example.pictures, captions, strict=True)])
+        groups.append(
+            [
+                views.Picture(file, caption)
+                for file, caption in zip(example.pictures, captions, strict=True)
+            ]
+        )
     if groups and all(len(group) == 1 for group in groups):
         groups = [[picture for group in groups for picture in group]]
     yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
@@ -304,11 +397,16 @@ def claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair."""
     for pair in result.pairs:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
-        statement = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {method}."
+        statement = (
+            f"{headline(pair)} {alone_text(pair)} The interval of the "
+            f"difference is {method}."
+        )
         side = next(side for side in result.sides if side.name == pair.second)
         outcomes = wording.outcomes_text(side.outcomes, result.task)
         if outcomes:
             statement += f" Of the others {pair.second} has {outcomes}."
         what = f"configurations in which {pair.second} is right"
-        extent = results.Extent.from_count(what, side.correct, side.configurations, side.interval, side.accuracy)
+        extent = results.Extent.from_count(
+            what, side.correct, side.configurations, side.interval, side.accuracy
+        )
         yield views.Claim(kind="measured", statement=statement, extent=extent)

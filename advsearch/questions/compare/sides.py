@@ -1,7 +1,8 @@
 """What is compared, read from stored sweeps.
 
-Images of a sweep are numbered, and the draw of an image follows from its number. So sweeps with the same seed, grid and
-controls have the same draws, and images with the same number are a pair, whatever else differs.
+Images of a sweep are numbered, and the draw of an image follows from its number. So
+sweeps with the same seed, grid and controls have the same draws, and images with the
+same number are a pair, whatever else differs.
 """
 
 from __future__ import annotations
@@ -16,16 +17,33 @@ import pandas as pd
 
 from advsearch.extend import InputError, errors, rules, wording, workbench
 
-DRAW_SETTINGS = ("grid", "controls", "samples", "sampler", "seed")  # decide what is drawn
-SIDE_COLUMNS = ("object", "model", "answer")  # what may tell sides apart, as rows have it
+# decide what is drawn
+DRAW_SETTINGS = ("grid", "controls", "samples", "sampler", "seed")
+# what may tell sides apart, as rows have it
+SIDE_COLUMNS = ("object", "model", "answer")
 SIDE_SETTINGS = ("object", "model")
 SECONDARY_SETTINGS = (
-    *(*DRAW_SETTINGS, "label", "labels", "prompt", "up", "facing", "size", "unit", "batch", "keep_pictures", "trials"),
+    *(
+        *DRAW_SETTINGS,
+        "label",
+        "labels",
+        "prompt",
+        "up",
+        "facing",
+        "size",
+        "unit",
+        "batch",
+        "keep_pictures",
+        "trials",
+    ),
     *("verify_spp", "specialise", "value_range", "adversarial_of"),
 )
-"""Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
+"""Settings that do not tell sweeps apart: of draws, along with object and model, or of
+no adversarial scene.
+"""
 
-TOLERANCE = 1e-4  # of a value, relative to the largest in its column: values come from single precision
+# of a value, relative to the largest in its column: values come from single precision
+TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +54,8 @@ class Side:
         name: what tells it from the others.
         sweep: that has its rows.
         labels: its object, model and adversarial scene, by `SIDE_COLUMNS`.
-        rows: one for each image in their order (`StoredSweep.read_rows`), with the `number` of the image.
+        rows: one for each image in their order (`StoredSweep.read_rows`), with the
+            `number` of the image.
     """
 
     name: str
@@ -52,32 +71,43 @@ class Side:
     @property
     def varying_parameters(self) -> list[str]:
         """The parameters that have more than one value; not what names the side."""
-        names = [name for name in self.rows.attrs["units"] if name not in ("model", "answer")]
+        names = [
+            name for name in self.rows.attrs["units"] if name not in ("model", "answer")
+        ]
         return [name for name in names if self.rows[name].nunique() > 1]
 
 
 def read_sides(folders: Sequence[Path]) -> list[Side]:
     """Read what the sweeps in some folders compare, each side with a name of its own.
 
-    A sweep has a side for each of its models. The sweep of an adversarial scene has these without it and with it; along
-    with other sweeps, only with it.
+    A sweep has a side for each of its models. The sweep of an adversarial scene has
+    these without it and with it; along with other sweeps, only with it.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
         InputError: there is nothing to compare, or sweeps are of other draws.
     """
-    sides = [side for folder in folders for side in read_sides_of(folder, is_only=len(folders) == 1)]
+    sides = [
+        side
+        for folder in folders
+        for side in read_sides_of(folder, is_only=len(folders) == 1)
+    ]
     if len(sides) < 2:
         raise InputError(
-            f"compared: expected a sweep of several models, or several sweeps, got {folders[0]}, a sweep of one model; "
-            "name another sweep of the same draws beside it, or give `model` two models when you sweep"
+            "compared: expected a sweep of several models, or several sweeps, got "
+            f"{folders[0]}, a sweep of one model; "
+            "name another sweep of the same draws beside it, or give `model` two "
+            "models when you sweep"
         )
     for side in sides[1:]:
         check_same_draws(sides[0], side)
     in_view = np.logical_and.reduce([rules.is_in_view(side.rows) for side in sides])
     names = name_sides(sides)
     if not in_view.any():
-        raise InputError(f"compared: expected pictures with the object in them, got none in {folders[0]}")
+        raise InputError(
+            "compared: expected pictures with the object in them, got "
+            f"none in {folders[0]}"
+        )
     return [
         replace(side, name=name, rows=side.rows[in_view].reset_index(drop=True))
         for side, name in zip(sides, names, strict=True)
@@ -85,30 +115,47 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
 
 
 def name_sides(sides: Sequence[Side]) -> list[str]:
-    """Return a different name for each side: what tells it apart; if that is not enough, with folders, or numbers."""
-    columns = [column for column in SIDE_COLUMNS if len({side.labels[column] for side in sides}) > 1]
-    names = [", ".join(wording.short_names(side.labels[column]) or "as it is" for column in columns) for side in sides]
+    """Return a different name for each side: what tells it apart; if that is not
+    enough, with folders, or numbers.
+    """
+    columns = [
+        column
+        for column in SIDE_COLUMNS
+        if len({side.labels[column] for side in sides}) > 1
+    ]
+    names = [
+        ", ".join(
+            wording.short_names(side.labels[column]) or "as it is" for column in columns
+        )
+        for side in sides
+    ]
     if len(set(names)) < len(names):
         folders = [side.sweep.folder.name for side in sides]
-        names = [", ".join(filter(None, words)) for words in zip(folders, names, strict=True)]
+        names = [
+            ", ".join(filter(None, words)) for words in zip(folders, names, strict=True)
+        ]
     if len(set(names)) < len(names):
         names = [f"{number}: {name}" for number, name in enumerate(names, start=1)]
     return names
 
 
 def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
-    """Read the sides of one sweep, without names yet; `is_only`: no other sweep is compared."""
+    """Read the sides of one sweep, without names yet; `is_only`: no other sweep is
+    compared.
+    """
     sweep = workbench.StoredSweep.read(folder)
     summary = sweep.summary
     if summary.goes_on or summary.looked_at != summary.planned:
         raise errors.FileFormatError(
-            f"{folder}: expected a sweep that has ended, got one with {summary.looked_at} of {summary.planned} "
+            f"{folder}: expected a sweep that has ended, got one with "
+            f"{summary.looked_at} of {summary.planned} "
             f"predictions; go on with it: advsearch resume {folder}"
         )
     rows = sweep.read_rows()
     if len(rows) != summary.planned or not rows["step"].is_unique:
         raise errors.FileFormatError(
-            f"{folder}: expected {summary.planned} rows, as its summary says, got {len(rows)}; sweep again"
+            f"{folder}: expected {summary.planned} rows, as its summary says, got "
+            f"{len(rows)}; sweep again"
         )
     models = sweep.config.models
     model_index = rows["step"] % len(models)
@@ -120,7 +167,9 @@ def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
         scene_masks = [~is_adversarial, is_adversarial] if is_only else [is_adversarial]
     for is_of_scene in scene_masks:
         for index, model in enumerate(models):
-            side_rows = rows[is_of_scene & (model_index == index)].reset_index(drop=True)
+            side_rows = rows[is_of_scene & (model_index == index)].reset_index(
+                drop=True
+            )
             labels = {"object": summary.object, "model": model, "answer": ""}
             for column in SIDE_COLUMNS:
                 if column in side_rows:
@@ -129,19 +178,23 @@ def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
 
 
 def check_same_draws(first: Side, second: Side) -> None:
-    """Check that the sweeps of two sides have the same draws. Raises InputError: they have not."""
+    """Check that the sweeps of two sides have the same draws. Raises InputError: they
+    have not.
+    """
     if first.sweep.folder == second.sweep.folder:
         return
     where = f"{first.sweep.folder} and {second.sweep.folder}"
     for name in DRAW_SETTINGS:
         if first.sweep.config.deciding()[name] != second.sweep.config.deciding()[name]:
             raise InputError(
-                f"compared: expected sweeps of the same draws, got {where}, whose `{name}` differ; sweep one of them "
+                f"compared: expected sweeps of the same draws, got {where}, whose "
+                f"`{name}` differ; sweep one of them "
                 "again with the settings of the other"
             )
     if len(first.rows) != len(second.rows):
         raise InputError(
-            f"compared: expected sweeps with as many pictures, got {len(first.rows)} and {len(second.rows)} in "
+            f"compared: expected sweeps with as many pictures, got {len(first.rows)} "
+            f"and {len(second.rows)} in "
             f"{where}; sweep as many objects and environments in both"
         )
     if first.labels["object"] != second.labels["object"]:
@@ -149,25 +202,44 @@ def check_same_draws(first: Side, second: Side) -> None:
     for name in first.rows.attrs["units"]:
         is_drawn = name not in (*SIDE_COLUMNS, "environment")
         is_shared = name in second.rows.attrs["units"]
-        if is_drawn and is_shared and not has_same_values(first.rows[name], second.rows[name]):
+        if (
+            is_drawn
+            and is_shared
+            and not has_same_values(first.rows[name], second.rows[name])
+        ):
             raise InputError(
-                f"compared: expected sweeps of the same draws, got {where} with other values of {name}; sweep both "
+                f"compared: expected sweeps of the same draws, got {where} with other "
+                f"values of {name}; sweep both "
                 "again"
             )
 
 
 def has_same_values(first: pd.Series, second: pd.Series) -> bool:
-    """Return whether two columns (n,) have the same values, but for what single precision rounds."""
+    """Return whether two columns (n,) have the same values, but for what single
+    precision rounds.
+    """
     if first.dtype == "category" or second.dtype == "category":
         return bool((first.astype(object) == second.astype(object)).all())
     scale = float(np.nanmax(np.abs(first), initial=0.0))
-    return bool(np.allclose(first, second, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True))
+    return bool(
+        np.allclose(first, second, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True)
+    )
 
 
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
-    """Return the settings in which the sweeps of some sides differ and that decide predictions."""
+    """Return the settings in which the sweeps of some sides differ and that decide
+    predictions.
+    """
     first, *others = (side.sweep.config.deciding() for side in sides)
     names = {name for other in others for name in other if other[name] != first[name]}
-    names |= {column for column in SIDE_COLUMNS if len({side.labels[column] for side in sides}) > 1}
-    names |= {name for name in SIDE_SETTINGS if len({getattr(side.sweep.config, name) for side in sides}) > 1}
+    names |= {
+        column
+        for column in SIDE_COLUMNS
+        if len({side.labels[column] for side in sides}) > 1
+    }
+    names |= {
+        name
+        for name in SIDE_SETTINGS
+        if len({getattr(side.sweep.config, name) for side in sides}) > 1
+    }
     return sorted(names - set(SECONDARY_SETTINGS))

@@ -1,4 +1,6 @@
-"""Say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders."""
+"""Say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh
+renders.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,19 @@ from advsearch.extend import (
     setting_as_in,
     settings,
 )
-from advsearch.questions.explain.result import ExplainResult, RuleRow, claims, shown, triggering
+from advsearch.questions.explain.result import (
+    ExplainResult,
+    RuleRow,
+    claims,
+    shown,
+    triggering,
+)
 
 
 class ExplainConfig(Config):
-    """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
+    """Everything that decides what `explain` does: whose rows it reads, and what it
+    renders to see whether it is so.
+    """
 
     command: ClassVar[str] = "explain"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -37,24 +47,33 @@ class ExplainConfig(Config):
         "names or folders of runs of sweep, or of recipes with sweeps",
     )
     confirm: int = setting(
-        100, "explain", "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
+        100, "explain", "fresh configurations inside each rule that are rendered to "
+                        "confirm it; 0 for none",
         unit="renders", ge=0, le=100_000,
     )
     pairs: int = setting(
-        12, "explain", "failures for which the nearest right configuration is looked for; 0 for none",
+        12, "explain", "failures for which the nearest right configuration is looked "
+                       "for; 0 for none",
         unit="failures", ge=0, le=100,
     )
     clusters: int = setting(
-        100, "explain", "failures that are rendered again and grouped by what the model decides by; 0 for none",
+        100, "explain", "failures that are rendered again and grouped by what the "
+                        "model decides by; 0 for none",
         unit="failures", ge=0, le=10_000,
     )
     # fmt: on
     accuracy: float = setting(
-        0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
+        0.95,
+        "explain",
+        "accuracy that the envelope promises, at 95 % confidence",
+        gt=0.0,
+        le=0.999,
     )
     seed: int = setting_as_in(SceneConfig, "seed")
     threads: int | None = setting_as_in(SceneConfig, "threads")
-    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
+    run: str | None = setting_as_in(
+        SceneConfig, "run", otherwise="runs/RUN-explain-NNN"
+    )
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
     _named = settings.texts("run", several=["sweeps"])
@@ -77,11 +96,12 @@ class ExplainConfig(Config):
     triggering=triggering,
 )
 def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
-    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
+    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by
+    renders (docs/explain.md).
 
     Args:
-        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
-            recipe, its sweeps.
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose
+            rows are read together; of a recipe, its sweeps.
     """
     # these import torch, scipy and pandas
     from advsearch.extend import rules, workbench
@@ -95,18 +115,24 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     progress = context.progress
     progress.stage("reading rows")
     folders = [
-        folder for name in settings.split_names(config.sweeps) for folder in find_sweeps(directory.find_run(name))
+        folder
+        for name in settings.split_names(config.sweeps)
+        for folder in find_sweeps(directory.find_run(name))
     ]
     sweeps = [workbench.StoredSweep.read(folder) for folder in folders]
     rows = read_predictions(sweeps)
     rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
     if len(rows) < rules.MIN_ROWS:
         raise InputError(
-            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep more configurations"
+            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep "
+            "more configurations"
         )
     table = rules.make_table(rows, rows.attrs["units"])
     if not table.attrs["units"]:
-        raise InputError("explain: expected rows in which something varies that all of them have, got none")
+        raise InputError(
+            "explain: expected rows in which something varies that all of "
+            "them have, got none"
+        )
 
     choosing, counting = rules.split_in_halves(table, config.seed)
     progress.stage("seeking rules on one half of the rows")
@@ -117,7 +143,10 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
 
     renders = Renders(context, sweeps, rows, table)
     rule_rows = [
-        RuleRow(**findings.describe_rule(rule), confirmed=renders.confirm_rule(found_rules.accepted, index))
+        RuleRow(
+            **findings.describe_rule(rule),
+            confirmed=renders.confirm_rule(found_rules.accepted, index),
+        )
         for index, rule in enumerate(found_rules.accepted)
     ]
     pairs = list(renders.find_pairs(found_rules.accepted))
@@ -129,7 +158,9 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         sweeps=[str(sweep.folder) for sweep in sweeps],
         object=settings.names_together(sweep.summary.object for sweep in sweeps),
         model=settings.names_together(sweep.summary.model for sweep in sweeps),
-        environment=settings.names_together(sweep.summary.environment for sweep in sweeps),
+        environment=settings.names_together(
+            sweep.summary.environment for sweep in sweeps
+        ),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
         **vars(findings.count_right(table)),
@@ -147,11 +178,15 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
 
 
 def find_sweeps(folder: Path) -> list[Path]:
-    """Return the run directories of the sweeps of a run: itself, or parts of a recipe."""
+    """Return the run directories of the sweeps of a run: itself, or parts of a
+    recipe.
+    """
     result = read_result(folder)
     if result.command != "recipe":
         return [folder]
     parts = [part for part in getattr(result, "parts", ()) if part.command == "sweep"]
     if not parts:
-        raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
+        raise InputError(
+            f"explain: expected sweeps, got {folder}, a recipe without one"
+        )
     return [RunDirectory.locate_part(folder, part.name) for part in parts]

@@ -12,7 +12,9 @@ from advsearch.extend import rules
 MAX_CLUSTERS = 6
 MIN_FAILURES = 8  # of which clusters are sought
 N_REFERENCES = 19
-"""Samples of as many points from one normal distribution like them: clusters in none of these may be as far apart."""
+"""Samples of as many points from one normal distribution like them: clusters in none of
+these may be as far apart.
+"""
 N_COMPONENTS = 8  # principal components that distances are measured in
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,7 +26,8 @@ class Clusters:
     """Clusters of failures.
 
     Attributes:
-        members: indices of the failures of each, the most typical first; the largest cluster first.
+        members: indices of the failures of each, the most typical first; the largest
+            cluster first.
         silhouette: the mean; None where all are one cluster.
         apart: whether clusters of a cloud without any are less far apart.
     """
@@ -37,8 +40,9 @@ class Clusters:
 def find_clusters(features: FloatArray, seed: int) -> Clusters:
     """Cluster failures by k-means over the directions of their features (n, F).
 
-    The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). They are apart if it is larger than that
-    of each reference, clustered likewise (after Tibshirani, Walther and Hastie 2001).
+    The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). They are
+    apart if it is larger than that of each reference, clustered likewise (after
+    Tibshirani, Walther and Hastie 2001).
 
     Raises:
         InputError: scikit-learn is missing.
@@ -54,10 +58,17 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     silhouette, cluster = cluster_points(points)
     generator = np.random.default_rng(seed)
     spread = points.std(axis=0)
-    references = (generator.standard_normal(points.shape) * spread for _ in range(N_REFERENCES))
-    is_apart = all(cluster_points(reference)[0] < silhouette for reference in references)
+    references = (
+        generator.standard_normal(points.shape) * spread for _ in range(N_REFERENCES)
+    )
+    is_apart = all(
+        cluster_points(reference)[0] < silhouette for reference in references
+    )
 
-    members = [sort_by_distance(points, np.flatnonzero(cluster == k)) for k in range(int(cluster.max()) + 1)]
+    members = [
+        sort_by_distance(points, np.flatnonzero(cluster == k))
+        for k in range(int(cluster.max()) + 1)
+    ]
     members.sort(key=len, reverse=True)
     if len(members) < 2:
         return Clusters(tuple(members), None, False)
@@ -71,7 +82,9 @@ def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
 
 
 def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
-    """Return the largest mean silhouette over numbers of clusters, and the cluster of each point."""
+    """Return the largest mean silhouette over numbers of clusters, and the cluster of
+    each point.
+    """
     k_means = rules.import_library("sklearn.cluster").KMeans
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score
     best_silhouette = -1.0

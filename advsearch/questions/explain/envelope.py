@@ -1,8 +1,9 @@
 """A box of values to rely on.
 
-The box is peeled (PRIM: Friedman and Fisher 1999, section 6): a thin slice of one factor, or one of its names, is taken
-off again and again where that raises the accuracy of the rest the most. One half of the rows chooses the box, and the
-other half, which has not chosen it, is asked once whether it holds what is promised.
+The box is peeled (PRIM: Friedman and Fisher 1999, section 6): a thin slice of one
+factor, or one of its names, is taken off again and again where that raises the accuracy
+of the rest the most. One half of the rows chooses the box, and the other half, which
+has not chosen it, is asked once whether it holds what is promised.
 """
 
 from __future__ import annotations
@@ -19,11 +20,15 @@ from advsearch.questions.explain.result import EnvelopeRow
 
 PEELED_SHARE = 0.05  # of the rows in the box, which are peeled off a side at a time
 MIN_INSIDE = 60  # Fewer rows, or drives, than this cannot show an accuracy of 95 %
-RESERVE = 0.01  # By how much more the choosing rows have to show, since they were chosen by
+# By how much more the choosing rows have to show, since they were chosen by
+RESERVE = 0.01
 
 
-def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> EnvelopeRow | None:
-    """Find the largest box that promises an accuracy; None where no box of enough rows does.
+def find_envelope(
+    choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float
+) -> EnvelopeRow | None:
+    """Find the largest box that promises an accuracy; None where no box of enough rows
+    does.
 
     Args:
         choosing: rows that choose the box.
@@ -44,13 +49,17 @@ def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: floa
     counts = count_right(counting[rules.find_covered(box, counting)])
     conditions = [condition.row for condition in box]
     is_held = counts.interval[0] >= accuracy
-    return EnvelopeRow(conditions=conditions, **vars(counts), accuracy=accuracy, held=is_held)
+    return EnvelopeRow(
+        conditions=conditions, **vars(counts), accuracy=accuracy, held=is_held
+    )
 
 
 def find_best_peel(
     box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
 ) -> rules.RuleConditions | None:
-    """Return the slightly smaller box whose rows are right most often; None where too few rows are left in each."""
+    """Return the slightly smaller box whose rows are right most often; None where too
+    few rows are left in each.
+    """
     is_independent = choosing["unit"].is_unique
     best_box = None
     best_accuracy = -1.0
@@ -63,28 +72,46 @@ def find_best_peel(
     return best_box
 
 
-def peel(box: rules.RuleConditions, inside: pd.DataFrame) -> Iterator[rules.RuleConditions]:
-    """Yield boxes that are slightly smaller than a box with rows `inside`, in one factor each."""
+def peel(
+    box: rules.RuleConditions, inside: pd.DataFrame
+) -> Iterator[rules.RuleConditions]:
+    """Yield boxes that are slightly smaller than a box with rows `inside`, in one
+    factor each.
+    """
     condition_of_factor = {condition.factor: condition for condition in box}
     for factor, unit in inside.attrs["units"].items():
         condition = condition_of_factor.get(factor, rules.RuleCondition(factor, unit))
         for smaller in peel_factor(condition, inside[factor]):
             if smaller != condition and smaller.low < smaller.high:
                 conditions = {**condition_of_factor, factor: smaller}
-                yield tuple(conditions[name] for name in inside.attrs["units"] if name in conditions)
+                yield tuple(
+                    conditions[name]
+                    for name in inside.attrs["units"]
+                    if name in conditions
+                )
 
 
-def peel_factor(condition: rules.RuleCondition, column: pd.Series) -> Iterator[rules.RuleCondition]:
-    """Yield conditions without one of the names, or without the lowest or the highest values of a column."""
+def peel_factor(
+    condition: rules.RuleCondition, column: pd.Series
+) -> Iterator[rules.RuleCondition]:
+    """Yield conditions without one of the names, or without the lowest or the highest
+    values of a column.
+    """
     if column.dtype == "category":
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
-            yield from (replace(condition, options=names - {name}) for name in sorted(names))
+            yield from (
+                replace(condition, options=names - {name}) for name in sorted(names)
+            )
         return
 
     values = column.to_numpy()
-    low, high = (float(f"{np.quantile(values, share):.3g}") for share in (PEELED_SHARE, 1.0 - PEELED_SHARE))
-    if low < values.min() or low >= values.max():  # few different values: the smallest one goes
+    low, high = (
+        float(f"{np.quantile(values, share):.3g}")
+        for share in (PEELED_SHARE, 1.0 - PEELED_SHARE)
+    )
+    # few different values: the smallest one goes
+    if low < values.min() or low >= values.max():
         low = float(values.min())
     yield replace(condition, low=low)
     if high < values.max():

@@ -24,18 +24,31 @@ def count_right(rows: pd.DataFrame) -> RightOf:
 
 
 def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
-    """Return the fields of a rule: its conditions, and the counts inside and elsewhere."""
+    """Return the fields of a rule: its conditions, and the counts inside and
+    elsewhere.
+    """
     conditions = [condition.row for condition in rule.conditions]
-    return {"conditions": conditions, **vars(count_right(rule.inside)), "elsewhere": count_right(rule.elsewhere)}
+    return {
+        "conditions": conditions,
+        **vars(count_right(rule.inside)),
+        "elsewhere": count_right(rule.elsewhere),
+    }
 
 
-def describe_rejected(rule: rules.CountedRule | None, n_rows: int) -> RuleNotTold | None:
+def describe_rejected(
+    rule: rules.CountedRule | None, n_rows: int
+) -> RuleNotTold | None:
     """Return the result of a rule that is not told, found in so many rows."""
     if rule is None:
         return None
     times = rule.find_needed_factor()
     n_needed = None if times is None else round_up(times * n_rows)
-    return RuleNotTold(**describe_rule(rule), chance=rule.p_value, asked=rules.SIGNIFICANCE, rows=n_needed)
+    return RuleNotTold(
+        **describe_rule(rule),
+        chance=rule.p_value,
+        asked=rules.SIGNIFICANCE,
+        rows=n_needed,
+    )
 
 
 def round_up(count: float) -> int:
@@ -44,22 +57,31 @@ def round_up(count: float) -> int:
     return math.ceil(count / step) * step
 
 
-def find_cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:
+def find_cautions(
+    table: pd.DataFrame, importance: Sequence[ParameterWeight]
+) -> list[str]:
     """Return what a reader has to know of the rows of a table and of what decides."""
     cautions = []
     n_draws = table["unit"].nunique()
     if n_draws == 1:
         cautions.append(
-            "The rows are of one draw: a single drive, or pictures that differ in noise alone. The shares are of this "
+            "The rows are of one draw: a single drive, or pictures that differ in "
+            "noise alone. The shares are of this "
             "one, and nothing is shown of others."
         )
     elif n_draws < rules.MIN_ROWS:
         cautions.append(
-            f"The rows are of {n_draws} draws, each with several, which are not independent: few show little."
+            f"The rows are of {n_draws} draws, each with several, which are not "
+            "independent: few show little."
         )
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"
-        cautions.append(f"The model is {always} in every row: there is nothing to tell apart.")
+        cautions.append(
+            f"The model is {always} in every row: there is nothing to tell apart."
+        )
     elif all(weight.interval[0] <= 0.0 for weight in importance):
-        cautions.append("No parameter is shown to decide anything: the intervals of all their shares begin at 0.")
+        cautions.append(
+            "No parameter is shown to decide anything: the intervals of "
+            "all their shares begin at 0."
+        )
     return cautions

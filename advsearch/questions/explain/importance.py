@@ -1,16 +1,21 @@
 """Which factors decide the predictions, and by how much.
 
-A factor's values are cut into groups that have equally many rows (a name is a group). The share is the variance of the
-model's accuracy between the groups over the variance of the yes/no predictions: the first-order Sobol index of the
-prediction, by groups (given-data estimators: Plischke, Borgonovo and Smith 2013). What differs inside a group is not in
-it, so that the index without groups is at least as large. Of two factors it is that of the groups of both at once.
+A factor's values are cut into groups that have equally many rows (a name is a group).
+The share is the variance of the model's accuracy between the groups over the variance
+of the yes/no predictions: the first-order Sobol index of the prediction, by groups
+(given-data estimators: Plischke, Borgonovo and Smith 2013). What differs inside a group
+is not in it, so that the index without groups is at least as large. Of two factors it
+is that of the groups of both at once.
 
-Of n predictions and k groups, n times the estimated share is Pearson's chi-squared statistic of a table of k x 2, and
-the true share is its noncentrality over n (Cohen's w squared). The interval is that of the noncentrality (Smithson
-2003, "Confidence Intervals"). Where predictions come in clusters (frames of drives), chance adds more to the statistic
-than with independent ones: it is divided by the design effect, which the deviations of clusters give, and is one of F,
-as that is known from few clusters (Rao and Scott 1981, their first-order correction; Thomas and Rao 1987).
-`benchmarks/explain.py` and `benchmarks/drives.py` print in how many of repeated samples it covers the truth.
+Of n predictions and k groups, n times the estimated share is Pearson's chi-squared
+statistic of a table of k x 2, and the true share is its noncentrality over n (Cohen's w
+squared). The interval is that of the noncentrality (Smithson 2003, "Confidence
+Intervals"). Where predictions come in clusters (frames of drives), chance adds more to
+the statistic than with independent ones: it is divided by the design effect, which the
+deviations of clusters give, and is one of F, as that is known from few clusters (Rao
+and Scott 1981, their first-order correction; Thomas and Rao 1987).
+`benchmarks/explain.py` and `benchmarks/drives.py` print in how many of repeated samples
+it covers the truth.
 """
 
 from __future__ import annotations
@@ -31,10 +36,13 @@ from advsearch.questions.explain.result import ParameterWeight
 MAX_GROUPS = 20  # of one factor
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' groups has on average, at least
 SIGNIFICANCE = 0.01
-"""Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
+"""Probability that any pair is told to decide together where none does; each is tested
+at its part (Bonferroni).
+"""
 MIN_INFLATION = 0.1
-"""What chance adds for clusters, at least, of what it adds to independent predictions, though clusters deviate in
-nothing."""
+"""What chance adds for clusters, at least, of what it adds to independent predictions,
+though clusters deviate in nothing.
+"""
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -42,11 +50,12 @@ IntArray = npt.NDArray[np.int64]
 
 
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
-    """Estimate what each factor of a table (`rules`) decides, and which pairs decide more than each by itself.
+    """Estimate what each factor of a table (`rules`) decides, and which pairs decide
+    more than each by itself.
 
     Returns:
-        The factors by falling share, without what chance adds to it; then the pairs, likewise. Nothing where all
-        predictions are the same.
+        The factors by falling share, without what chance adds to it; then the pairs,
+        likewise. Nothing where all predictions are the same.
     """
     if table["correct"].nunique() < 2:
         return []
@@ -55,15 +64,22 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     factors = list(table.attrs["units"])
 
     n_groups = round(sample.n_clusters ** (1.0 / 3.0))
-    single_weights = [sample.measure([factor], cut_into_groups(table[factor], n_groups)) for factor in factors]
+    single_weights = [
+        sample.measure([factor], cut_into_groups(table[factor], n_groups))
+        for factor in factors
+    ]
 
     n_coarse_groups = max(2, math.isqrt(sample.n_clusters // ROWS_IN_A_CELL))
-    coarse_groups = {factor: cut_into_groups(table[factor], n_coarse_groups) for factor in factors}
+    coarse_groups = {
+        factor: cut_into_groups(table[factor], n_coarse_groups) for factor in factors
+    }
     pairs = list(combinations(factors, 2))
     pair_weights = []
     for first, second in pairs:
         joint_group = cross_groups(coarse_groups[first], coarse_groups[second])
-        p_value = sample.interaction_p_value(joint_group, coarse_groups[first], coarse_groups[second])
+        p_value = sample.interaction_p_value(
+            joint_group, coarse_groups[first], coarse_groups[second]
+        )
         if p_value < SIGNIFICANCE / len(pairs):
             pair_weights.append(sample.measure([first, second], joint_group))
     return [*sort_by_share(single_weights), *sort_by_share(pair_weights)]
@@ -74,12 +90,16 @@ def sort_by_share(weights: list[ParameterWeight]) -> list[ParameterWeight]:
 
 
 def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
-    """Return the group of each row (n,): its name, or one of at most `n_groups` with equally many rows."""
+    """Return the group of each row (n,): its name, or one of at most `n_groups` with
+    equally many rows.
+    """
     if column.dtype == "category":
         return np.asarray(column.cat.codes, dtype=np.int64)
     values = column.to_numpy()
     n_bins = min(max(2, n_groups), MAX_GROUPS)
-    inner_edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)[1:-1]))
+    inner_edges = np.unique(
+        np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)[1:-1])
+    )
     return np.asarray(np.searchsorted(inner_edges, values, side="left"), dtype=np.int64)
 
 
@@ -89,7 +109,8 @@ def cross_groups(first: IntArray, second: IntArray) -> IntArray:
 
 
 class ClusteredPredictions:
-    """Yes/no predictions in clusters that have equal weight, so that few with many rows do not decide.
+    """Yes/no predictions in clusters that have equal weight, so that few with many rows
+    do not decide.
 
     Attributes:
         correct: whether each prediction is right (n,).
@@ -111,27 +132,37 @@ class ClusteredPredictions:
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_share(self, group: IntArray) -> tuple[float, int]:
-        """Return the estimated share of the variance between groups, and the number of groups that have rows."""
+        """Return the estimated share of the variance between groups, and the number of
+        groups that have rows.
+        """
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
         used_weight = group_weight[is_used]
-        group_rate = np.bincount(group, self.weight * self.correct)[is_used] / used_weight
+        group_rate = (
+            np.bincount(group, self.weight * self.correct)[is_used] / used_weight
+        )
         sum_of_squares = float((used_weight * (group_rate - self.mean) ** 2).sum())
         return sum_of_squares / len(self.correct) / self.variance, len(group_rate)
 
     def measure(self, factors: list[str], group: IntArray) -> ParameterWeight:
-        """Estimate the share of the variance between groups, less what chance adds, with its 95 % interval."""
+        """Estimate the share of the variance between groups, less what chance adds,
+        with its 95 % interval.
+        """
         share, n_groups = self.explained_share(group)
         expected_statistic = self.expected_statistic(group)
         if n_groups < 2 or math.isnan(expected_statistic):
-            return ParameterWeight(parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups)
+            return ParameterWeight(
+                parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
+            )
 
         n_rows = len(self.correct)
         degrees = n_groups - 1
         if self.is_independent:
             design_effect = 1.0
             error_degrees = math.inf
-            corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(n_rows - n_groups, 1)
+            corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(
+                n_rows - n_groups, 1
+            )
         else:
             design_effect = expected_statistic / degrees
             error_degrees = float(self.n_clusters - n_groups)
@@ -141,19 +172,27 @@ class ClusteredPredictions:
         # A statistic below its degrees of freedom is smaller than by chance alone.
         upper_statistic = max(statistic, float(degrees))
         tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
-        lower_noncentrality = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)
-        upper_noncentrality = find_noncentrality(upper_statistic, degrees, error_degrees, tail)
+        lower_noncentrality = find_noncentrality(
+            statistic, degrees, error_degrees, 1.0 - tail
+        )
+        upper_noncentrality = find_noncentrality(
+            upper_statistic, degrees, error_degrees, tail
+        )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
         return ParameterWeight(
-            parameters=factors, share=max(corrected_share, 0.0), interval=(lower, upper), parts=n_groups
+            parameters=factors,
+            share=max(corrected_share, 0.0),
+            interval=(lower, upper),
+            parts=n_groups,
         )
 
     def expected_statistic(self, group: IntArray) -> float:
         """Compute the expected chi-squared statistic of a factor without effect.
 
-        With independent rows it is (groups - 1). With clusters it is multiplied by the design effect
-        (Rao and Scott 1981, section 3). NaN if a group has fewer than two clusters.
+        With independent rows it is (groups - 1). With clusters it is multiplied by the
+        design effect (Rao and Scott 1981, section 3). NaN if a group has fewer than two
+        clusters.
         """
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
@@ -162,28 +201,54 @@ class ClusteredPredictions:
             return float(n_groups - 1)
 
         n_correct = np.bincount(group, self.weight * self.correct)
-        group_rate = np.divide(n_correct, group_weight, out=np.zeros(len(group_weight)), where=is_used)
+        group_rate = np.divide(
+            n_correct, group_weight, out=np.zeros(len(group_weight)), where=is_used
+        )
         residual = self.weight * (self.correct - group_rate[group])
 
         # A cell is one cluster inside one group.
-        cell_id, cell = np.unique(group * self.n_clusters + self.cluster, return_inverse=True)
+        cell_id, cell = np.unique(
+            group * self.n_clusters + self.cluster, return_inverse=True
+        )
         cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)
         cell_residual = np.bincount(cell.reshape(-1), residual)
-        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[is_used]
-        if self.n_clusters < 2 or self.n_clusters <= n_groups or clusters_per_group.min() < 2:
+        clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[
+            is_used
+        ]
+        if (
+            self.n_clusters < 2
+            or self.n_clusters <= n_groups
+            or clusters_per_group.min() < 2
+        ):
             return math.nan
 
-        squared_residual = np.bincount(cell_group, cell_residual**2, minlength=len(group_weight))[is_used]
-        variance_of_group = squared_residual * clusters_per_group / (clusters_per_group - 1) / group_weight[is_used]
+        squared_residual = np.bincount(
+            cell_group, cell_residual**2, minlength=len(group_weight)
+        )[is_used]
+        variance_of_group = (
+            squared_residual
+            * clusters_per_group
+            / (clusters_per_group - 1)
+            / group_weight[is_used]
+        )
         within_groups = float(variance_of_group.sum())
 
         cluster_residual = np.bincount(cell_cluster, cell_residual)
         sum_of_squares = float((cluster_residual**2).sum())
-        between_clusters = sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
-        return max((within_groups - between_clusters) / self.variance, MIN_INFLATION * float(n_groups - 1))
+        between_clusters = (
+            sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
+        )
+        return max(
+            (within_groups - between_clusters) / self.variance,
+            MIN_INFLATION * float(n_groups - 1),
+        )
 
-    def interaction_p_value(self, joint_group: IntArray, first_group: IntArray, second_group: IntArray) -> float:
-        """Return how likely chance makes the statistic of two factors exceed the sum of theirs by so much."""
+    def interaction_p_value(
+        self, joint_group: IntArray, first_group: IntArray, second_group: IntArray
+    ) -> float:
+        """Return how likely chance makes the statistic of two factors exceed the sum of
+        theirs by so much.
+        """
         joint_share, n_cells = self.explained_share(joint_group)
         first_share, n_first = self.explained_share(first_group)
         second_share, n_second = self.explained_share(second_group)
@@ -201,11 +266,15 @@ class ClusteredPredictions:
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
 
 
-def find_noncentrality(statistic: float, degrees: int, error_degrees: float, probability: float) -> float:
-    """Find the noncentrality at which a statistic is not exceeded with a probability; 0 where none is that small.
+def find_noncentrality(
+    statistic: float, degrees: int, error_degrees: float, probability: float
+) -> float:
+    """Find the noncentrality at which a statistic is not exceeded with a probability; 0
+    where none is that small.
 
     Args:
-        statistic: of a noncentral chi-squared distribution, or `degrees` times one of F.
+        statistic: of a noncentral chi-squared distribution, or `degrees` times one of
+            F.
         degrees: of freedom.
         error_degrees: of freedom of F's denominator; infinity for chi-squared.
         probability: of a value up to the statistic.
@@ -218,7 +287,9 @@ def find_noncentrality(statistic: float, degrees: int, error_degrees: float, pro
             reached = distribution.cdf(statistic)
         else:
             central = f_distribution(degrees, error_degrees)
-            distribution = central if is_central else ncf(degrees, error_degrees, noncentrality)
+            distribution = (
+                central if is_central else ncf(degrees, error_degrees, noncentrality)
+            )
             reached = distribution.cdf(statistic / degrees)
         # NaN: the distribution is too far away to be computed
         return float(np.nan_to_num(reached)) - probability

@@ -1,4 +1,6 @@
-"""Renders that test what rows have shown: inside rules, along one factor from failures, and of failures again."""
+"""Renders that test what rows have shown: inside rules, along one factor from failures,
+and of failures again.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,38 @@ import numpy as np
 import pandas as pd
 import torch
 
-from advsearch.extend import InputError, RunContext, RunDirectory, SweepConfig, errors, results, rules, seeds, workbench
+from advsearch.extend import (
+    InputError,
+    RunContext,
+    RunDirectory,
+    SweepConfig,
+    errors,
+    results,
+    rules,
+    seeds,
+    workbench,
+)
 from advsearch.questions.explain.clusters import find_clusters
 from advsearch.questions.explain.findings import count_right
-from advsearch.questions.explain.result import Confirmation, FailureCluster, FailureClusters, NearestRight
+from advsearch.questions.explain.result import (
+    Confirmation,
+    FailureCluster,
+    FailureClusters,
+    NearestRight,
+)
 from advsearch.questions.explain.rows import read_predictions, read_values
-from advsearch.questions.explain.sweeps import is_drawn, is_settable, sweep_along, sweep_inside
+from advsearch.questions.explain.sweeps import (
+    is_drawn,
+    is_settable,
+    sweep_along,
+    sweep_inside,
+)
 
 MAX_ARCS = 2  # of a circle that a condition has
 MIN_REST = 0.2
-"""Share of a rule that no rule before it covers, below which no more is rendered so that enough of it is left."""
+"""Share of a rule that no rule before it covers, below which no more is rendered so
+that enough of it is left.
+"""
 
 
 @dataclass
@@ -60,7 +84,9 @@ class Renders:
         return len(self._tried_failures)
 
     def render_rows(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
-        """Return the rows of a sweep; None if it was interrupted, or its scene is no longer available."""
+        """Return the rows of a sweep; None if it was interrupted, or its scene is no
+        longer available.
+        """
         if self.interrupted:
             return None
         if self.config.threads:
@@ -72,18 +98,25 @@ class Renders:
                 self._errors.add(str(error))
                 self.warnings.append(f"Nothing was rendered for {name}: {error}")
             return None
-        sweep = workbench.StoredSweep.read(RunDirectory.locate_part(self.context.run.path, name))
+        sweep = workbench.StoredSweep.read(
+            RunDirectory.locate_part(self.context.run.path, name)
+        )
         self._rendered[name] = sweep
         self.interrupted = sweep.summary.goes_on
         self.n_renders += sum(sweep.summary.renders.values())
         return None if self.interrupted else read_predictions([sweep])
 
-    # ---- rules ------------------------------------------------------------------------------------------------------
+    # ---- rules
+    # ------------------------------------------------------------------------------------------------------
 
-    def confirm_rule(self, counted_rules: Sequence[rules.CountedRule], index: int) -> Confirmation | None:
-        """Render fresh configurations inside a rule and outside those before it, in the scene of each sweep.
+    def confirm_rule(
+        self, counted_rules: Sequence[rules.CountedRule], index: int
+    ) -> Confirmation | None:
+        """Render fresh configurations inside a rule and outside those before it, in the
+        scene of each sweep.
 
-        They confirm it if they alone, with the rows elsewhere, tell it. None where nothing was rendered.
+        They confirm it if they alone, with the rows elsewhere, tell it. None where
+        nothing was rendered.
         """
         if not self.config.confirm:
             return None
@@ -94,21 +127,36 @@ class Renders:
 
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
-            drawn = [condition for condition in rule.conditions if is_drawn(sweep.config, condition.factor)]
+            drawn = [
+                condition
+                for condition in rule.conditions
+                if is_drawn(sweep.config, condition.factor)
+            ]
             n_arcs = max((len(condition.arcs) for condition in drawn), default=1) or 1
             samples = math.ceil(self.config.confirm / len(self.sweeps) / n_arcs / rest)
             for arc in range(n_arcs):
                 part = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 seed = seeds.stream(self.config.seed, "confirm", part)
-                self.progress.message(f"rule {index + 1}: rendering about {samples} configurations inside it")
-                config = sweep_inside(sweep.config, self.table, rule.conditions, samples, seed, arc)
+                self.progress.message(
+                    f"rule {index + 1}: rendering about {samples} "
+                    "configurations inside it"
+                )
+                config = sweep_inside(
+                    sweep.config, self.table, rule.conditions, samples, seed, arc
+                )
                 suffix = f"-{arc}" if arc else ""
-                rows = self.render_rows(f"rule-{index + 1}-{sweep_index}{suffix}", config)
+                rows = self.render_rows(
+                    f"rule-{index + 1}-{sweep_index}{suffix}", config
+                )
                 if rows is None:
                     continue
-                is_inside = rules.find_covered(rule.conditions, rows) & is_outside(earlier_conditions, rows)
+                is_inside = rules.find_covered(rule.conditions, rows) & is_outside(
+                    earlier_conditions, rows
+                )
                 inside = rows[is_inside & rules.is_in_view(rows)]
-                fresh_frames.append(inside.assign(unit=inside["unit"].astype(str) + f" of {part}"))
+                fresh_frames.append(
+                    inside.assign(unit=inside["unit"].astype(str) + f" of {part}")
+                )
 
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
@@ -117,37 +165,49 @@ class Renders:
         fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
         return Confirmation(**vars(count_right(fresh_rows)), held=fresh_rule.holds)
 
-    # ---- pairs ------------------------------------------------------------------------------------------------------
+    # ---- pairs
+    # ------------------------------------------------------------------------------------------------------
 
-    def find_pairs(self, counted_rules: Sequence[rules.CountedRule]) -> Iterator[NearestRight]:
+    def find_pairs(
+        self, counted_rules: Sequence[rules.CountedRule]
+    ) -> Iterator[NearestRight]:
         """Yield the nearest right configurations to typical failures.
 
-        They lie along the parameters of the failure's rule, or else the others. A failure that no parameter by itself
-        puts right has none.
+        They lie along the parameters of the failure's rule, or else the others. A
+        failure that no parameter by itself puts right has none.
         """
         failures = find_typical_failures(self.table, counted_rules, self.config.pairs)
         for number, (index, conditions) in enumerate(failures, start=1):
             of_rule = [condition.factor for condition in conditions]
-            other_factors = [factor for factor in self.table.attrs["units"] if factor not in of_rule]
+            other_factors = [
+                factor for factor in self.table.attrs["units"] if factor not in of_rule
+            ]
             for factors in (of_rule, *([factor] for factor in other_factors)):
-                attempts = [self._find_nearest(f"pair-{number}", index, factor) for factor in factors]
+                attempts = [
+                    self._find_nearest(f"pair-{number}", index, factor)
+                    for factor in factors
+                ]
                 pairs = [pair for pair in attempts if pair is not None]
                 if pairs:
                     yield min(pairs, key=self._relative_change)
                     break
 
     def _relative_change(self, pair: NearestRight) -> float:
-        """Return by which share of the range of the rows a value differs; 1 for names."""
+        """Return by which share of the range of the rows a value differs; 1 for
+        names.
+        """
         column = self.table[pair.parameter]
         if column.dtype == "category":
             return 1.0
-        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(column.max() - column.min())
+        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(
+            column.max() - column.min()
+        )
 
     def _find_nearest(self, name: str, index: int, factor: str) -> NearestRight | None:
         """Go along one factor until the prediction is right.
 
-        This is done twice with different noise, and the failure has to fail in both. None where it does not, or where
-        no value puts it right.
+        This is done twice with different noise, and the failure has to fail in both.
+        None where it does not, or where no value puts it right.
         """
         config = self.sweeps[self.rows["sweep"][index]].config
         row = read_values(self.rows, index)
@@ -158,7 +218,9 @@ class Renders:
         frames = []
         for repeat in range(2):
             seed = seeds.stream(self.config.seed, f"{label} {repeat}")
-            rows = self.render_rows(f"{label}-{repeat}", sweep_along(config, row, factor, self.table, seed))
+            rows = self.render_rows(
+                f"{label}-{repeat}", sweep_along(config, row, factor, self.table, seed)
+            )
             if rows is None:
                 return None
             frames.append(rows)
@@ -175,7 +237,9 @@ class Renders:
         if self.table[factor].dtype == "category":
             nearest = right_indices[0]
         else:
-            nearest = min(right_indices, key=lambda k: abs(float(values[k]) - float(wrong_value)))
+            nearest = min(
+                right_indices, key=lambda k: abs(float(values[k]) - float(wrong_value))
+            )
         return NearestRight(
             values=row,
             parameter=factor,
@@ -188,27 +252,43 @@ class Renders:
         )
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the files of images of a part, relative to the run directory, as far as they were stored."""
+        """Return the files of images of a part, relative to the run directory, as far
+        as they were stored.
+        """
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
         files = [sweep.find_thumbnail(number) for number in numbers]
-        return [str(file.relative_to(self.context.run.path)) for file in files if file is not None]
+        return [
+            str(file.relative_to(self.context.run.path))
+            for file in files
+            if file is not None
+        ]
 
-    # ---- clusters ---------------------------------------------------------------------------------------------------
+    # ---- clusters
+    # ---------------------------------------------------------------------------------------------------
 
     def find_clusters(self) -> FailureClusters | None:
-        """Render failures of one model's sweeps again, and cluster them by what the model decides by."""
+        """Render failures of one model's sweeps again, and cluster them by what the
+        model decides by.
+        """
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
         if self.interrupted or not self.config.clusters or failing.empty:
             return None
         if len(selected) < len(self.sweeps):
             name = self.sweeps[selected[0]].config.model
-            self.warnings.append(f"Kinds are of the failures of model {name} alone, where it was swept by itself.")
+            self.warnings.append(
+                f"Kinds are of the failures of model {name} alone, "
+                "where it was swept by itself."
+            )
         generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
-        picked = failing.iloc[np.sort(generator.permutation(len(failing))[: self.config.clusters])]
-        self.progress.stage("rendering failures again", len(picked), hint="`clusters` says how many")
+        picked = failing.iloc[
+            np.sort(generator.permutation(len(failing))[: self.config.clusters])
+        ]
+        self.progress.stage(
+            "rendering failures again", len(picked), hint="`clusters` says how many"
+        )
         try:
             with self.context.until_interrupted():
                 batches = [
@@ -247,15 +327,32 @@ class Renders:
         )
 
     def _select_sweeps(self) -> list[int]:
-        """Return the indices of the sweeps of the first model that was swept by itself."""
-        models = next((sweep.config.models for sweep in self.sweeps if len(sweep.config.models) == 1), None)
-        return [index for index, sweep in enumerate(self.sweeps) if sweep.config.models == models]
+        """Return the indices of the sweeps of the first model that was swept by
+        itself.
+        """
+        models = next(
+            (
+                sweep.config.models
+                for sweep in self.sweeps
+                if len(sweep.config.models) == 1
+            ),
+            None,
+        )
+        return [
+            index
+            for index, sweep in enumerate(self.sweeps)
+            if sweep.config.models == models
+        ]
 
-    def render_again(self, sweep: workbench.StoredSweep, numbers: Sequence[int]) -> tuple[torch.Tensor, Any]:
-        """Return images (n, H, W, 3) of a sweep of one model, as the model sees them, and what reads its features.
+    def render_again(
+        self, sweep: workbench.StoredSweep, numbers: Sequence[int]
+    ) -> tuple[torch.Tensor, Any]:
+        """Return images (n, H, W, 3) of a sweep of one model, as the model sees them,
+        and what reads its features.
 
         Raises:
-            InputError: the scene is no longer available, or the task is another than classification.
+            InputError: the scene is no longer available, or the task is another than
+                classification.
         """
         features = sweep.scenes.find_features()
         images = []
@@ -265,7 +362,9 @@ class Renders:
         return torch.stack(images), features
 
 
-def is_outside(rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFrame) -> rules.Mask:
+def is_outside(
+    rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFrame
+) -> rules.Mask:
     """Return which rows (n,) lie under none of some rules."""
     mask = np.ones(len(rows), np.bool_)
     for conditions in rule_conditions:
@@ -276,14 +375,20 @@ def is_outside(rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFra
 def find_typical_failures(
     table: pd.DataFrame, counted_rules: Sequence[rules.CountedRule], limit: int
 ) -> list[tuple[int, rules.RuleConditions]]:
-    """Return the indices of failures with the conditions of the rule that they are under, the most typical first.
+    """Return the indices of failures with the conditions of the rule that they are
+    under, the most typical first.
 
-    Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the last to take a
-    turn. The most typical failure of a rule is the one nearest to the mean of its failures, by ranks.
+    Rules take turns, a row belongs to the first that covers it, and what fails under
+    none of them is the last to take a turn. The most typical failure of a rule is the
+    one nearest to the mean of its failures, by ranks.
     """
     columns = [table[name] for name in table.attrs["units"]]
-    values = [column.cat.codes if column.dtype == "category" else column for column in columns]
-    ranks = np.stack(values, axis=1).astype(np.float64).argsort(axis=0).argsort(axis=0) / len(table)
+    values = [
+        column.cat.codes if column.dtype == "category" else column for column in columns
+    ]
+    ranks = np.stack(values, axis=1).astype(np.float64).argsort(axis=0).argsort(
+        axis=0
+    ) / len(table)
     is_left: rules.Mask = ~table["correct"].to_numpy()
     queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), ()):
@@ -292,6 +397,16 @@ def find_typical_failures(
         if not len(indices):
             continue
         distance = np.abs(ranks[indices] - ranks[indices].mean(axis=0)).sum(axis=1)
-        queues.append([(int(index), conditions) for index in indices[np.argsort(distance, kind="stable")]])
-    turns = (failure for turn in zip_longest(*queues) for failure in turn if failure is not None)
+        queues.append(
+            [
+                (int(index), conditions)
+                for index in indices[np.argsort(distance, kind="stable")]
+            ]
+        )
+    turns = (
+        failure
+        for turn in zip_longest(*queues)
+        for failure in turn
+        if failure is not None
+    )
     return list(islice(turns, limit))

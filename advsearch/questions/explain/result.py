@@ -18,50 +18,68 @@ class RightOf(results.Fields):
     interval: results.Interval = Field(description="of the share, 95 %")
     share: float | None = Field(
         default=None,
-        description="right ones of all; where rows share draws, the mean over draws of the share of each",
+        description="right ones of all; where rows share draws, the mean over draws of "
+        "the share of each",
     )
-    outcomes: results.Outcomes = results.optional(f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}")
+    outcomes: results.Outcomes = results.optional(
+        f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}"
+    )
 
     @property
     def text(self) -> str:
-        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a detector, what the others are:
-        ``... of 340 (250 missed, 49 loose)``."""
+        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a
+        detector, what the others are: ``... of 340 (250 missed, 49 loose)``.
+        """
         share = wording.share_of_text(self.right, self.total, self.interval, self.share)
         outcomes = wording.outcomes_text(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
 
     def extent(self, what: str) -> results.Extent:
         """Return the count for a claim; `what` says what is counted."""
-        return results.Extent.from_count(what, self.right, self.total, self.interval, self.share)
+        return results.Extent.from_count(
+            what, self.right, self.total, self.interval, self.share
+        )
 
 
 class Confirmation(RightOf):
     """Fresh renders inside a rule that no rule before it covers."""
 
     held: bool = Field(
-        default=False, description="whether they confirm it: they alone, beside the rows elsewhere, tell the rule"
+        default=False,
+        description="whether they confirm it: they alone, beside the "
+        "rows elsewhere, tell the rule",
     )
 
 
 class RuleRow(RightOf):
-    """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
+    """A rule under which the model is wrong more often than elsewhere, counted on rows
+    that did not choose it.
+    """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
     confirmed: Confirmation | None = Field(
-        description="fresh renders drawn inside the rule, and `held`, whether they tell it again; null where none were "
+        description="fresh renders drawn inside the rule, and `held`, whether they "
+        "tell it again; null where none were "
         "asked for"
     )
 
 
 class RuleNotTold(RightOf):
-    """The best rule that is not told from chance, counted on rows that did not choose it."""
+    """The best rule that is not told from chance, counted on rows that did not choose
+    it.
+    """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
-    chance: float = Field(description="how likely so few right predictions are by chance")
+    chance: float = Field(
+        description="how likely so few right predictions are by chance"
+    )
     asked: float = Field(description="how unlikely they would have to be")
-    rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
+    rows: int | None = Field(
+        description="of so many rows, with these shares, it would "
+        "be told; null where of none"
+    )
 
 
 class ParameterWeight(results.Fields):
@@ -69,10 +87,14 @@ class ParameterWeight(results.Fields):
 
     parameters: list[str]
     share: results.JsonFloat = Field(
-        description="of the variance of the predictions, by which of its parts a value lies in"
+        description="of the variance of the predictions, by which of its parts a value "
+        "lies in"
     )
     interval: results.Interval = Field(description="of the share, 95 %")
-    parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
+    parts: int = Field(
+        default=0,
+        description="into how many its values were cut, of two all pairs of parts",
+    )
 
 
 class EnvelopeRow(RightOf):
@@ -82,11 +104,15 @@ class EnvelopeRow(RightOf):
         description="all of which hold; empty for everything that was looked at"
     )
     accuracy: float = Field(description="what was asked for")
-    held: bool = Field(description="whether the rows that did not choose the box show it")
+    held: bool = Field(
+        description="whether the rows that did not choose the box show it"
+    )
 
 
 class NearestRight(results.Fields):
-    """A failure and the nearest configuration that is right and differs in one value."""
+    """A failure and the nearest configuration that is right and differs in one
+    value.
+    """
 
     values: dict[str, str | float] = Field(description="of the failure")
     parameter: str = Field(description="the one that differs")
@@ -95,14 +121,18 @@ class NearestRight(results.Fields):
     right_at: str | float
     answered: str = Field(description="what the model says of the failure")
     answered_there: str = Field(description="what it says of the other")
-    pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
+    pictures: list[str] = Field(
+        description="files in the run's folder: of the failure, and of the other"
+    )
 
 
 class FailureCluster(results.Fields):
     """Failures that look alike to the model."""
 
     failures: int = Field(description="how many of those that were rendered again")
-    answers: dict[str, int] = Field(description="what the model says of them, and how often")
+    answers: dict[str, int] = Field(
+        description="what the model says of them, and how often"
+    )
     values: dict[str, str | float] = Field(description="of the most typical one")
     picture: str = Field(description="of it: a file in the run's folder")
 
@@ -112,13 +142,19 @@ class FailureClusters(results.Fields):
 
     features: str = Field(description="what these are")
     failures: int = Field(description="failures that were rendered again")
-    silhouette: float | None = Field(description="how well they are apart, -1 to 1; null where all are one cluster")
-    apart: bool = Field(description="whether they are farther apart than groups of a cloud without any")
+    silhouette: float | None = Field(
+        description="how well they are apart, -1 to 1; null where all are one cluster"
+    )
+    apart: bool = Field(
+        description="whether they are farther apart than groups of a cloud without any"
+    )
     listed: list[FailureCluster] = Field(description="the largest first")
 
 
 class ExplainResult(RunResult, RightOf):
-    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and `of` are those of all rows."""
+    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and
+    `of` are those of all rows.
+    """
 
     command: ClassVar[str] = "explain"
 
@@ -127,20 +163,28 @@ class ExplainResult(RunResult, RightOf):
     model: str
     units: int | None = Field(
         default=None,
-        description="draws that the rows are of, such as [drives](drives.md), where some share one; absent where none "
+        description="draws that the rows are of, such as [drives](drives.md), where "
+        "some share one; absent where none "
         "do",
     )
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
-    not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
-    importance: list[ParameterWeight] = Field(description="empty where all predictions are the same")
+    not_told: RuleNotTold | None = Field(
+        default=None, description="the next rule, which is not told; absent without"
+    )
+    importance: list[ParameterWeight] = Field(
+        description="empty where all predictions are the same"
+    )
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
     pairs_sought: int = Field(
         default=0,
-        description="failures for which one was looked for by renders, the most typical; others are left out",
+        description="failures for which one was looked for by renders, the most "
+        "typical; others are left out",
     )
-    clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
+    clusters: FailureClusters | None = Field(
+        default=None, description="null where nothing was rendered for them"
+    )
     renders: int = Field(description="pictures that were rendered")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -150,13 +194,17 @@ class ExplainResult(RunResult, RightOf):
 
 
 CHOSEN = (
-    "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
-    "Chance alone would tell any rule in one of a hundred cases at most. The search of the sweep's page takes the "
+    "Chosen on one half of the rows and counted on the other, each beyond the rules "
+    "before it; 95 % intervals. "
+    "Chance alone would tell any rule in one of a hundred cases at most. The search of "
+    "the sweep's page takes the "
     "words of a rule and shows the pictures under it."
 )
 DECIDES = (
-    "The share of the variance of the predictions, right or wrong, that is between parts of a parameter's values with "
-    "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
+    "The share of the variance of the predictions, right or wrong, that is between "
+    "parts of a parameter's values with "
+    "equally many rows: its first-order Sobol index, by parts. Two parameters stand "
+    "together where they decide "
     "more than each by itself. What differs inside a part is not counted."
 )
 MOST_WEIGHTS = 12  # Rows of it that are shown
@@ -164,13 +212,21 @@ MOST_PREDICTIONS = 3  # Predictions of a cluster that are named
 
 
 def shown(result: ExplainResult) -> ShownResult:
-    said = f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
+    said = (
+        f"{wording.count(len(result.rules), 'rule')} under which the model is "
+        "wrong "
+        "more often than elsewhere."
+    )
     if not result.rules:
         said = (
-            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
+            f"No rule is told from chance in {result.total:,} rows, of which one half "
+            "chooses and the other counts: "
             f"the model is right in {result.text}."
         )
-    rules = [f"{number}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules, start=1)]
+    rules = [
+        f"{number}. {rule_text(number, rule)}"
+        for number, rule in enumerate(result.rules, start=1)
+    ]
     weights: Mapping[str, views.Column] = {
         "parameters": lambda one: " with ".join(one.parameters),
         "decides": lambda one: wording.percent(one.share),
@@ -178,18 +234,34 @@ def shown(result: ExplainResult) -> ShownResult:
         "by parts": lambda one: str(one.parts or ""),
     }
     sections = [
-        ResultPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
-        ResultPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+        ResultPart(
+            "Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""
+        ),
+        ResultPart.table(
+            result.importance[:MOST_WEIGHTS],
+            weights,
+            title="What decides",
+            note=DECIDES,
+        ),
         ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
     if result.pairs_sought:
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
-        wrong, right = (at if isinstance(at, str) else f"{at:.4g}" for at in (pair.wrong_at, pair.right_at))
-        text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
+        wrong, right = (
+            at if isinstance(at, str) else f"{at:.4g}"
+            for at in (pair.wrong_at, pair.right_at)
+        )
+        text = (
+            f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: "
+            f"{pair.answered_there}."
+        )
         captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
-        pictures = [views.Picture(*captioned) for captioned in zip(pair.pictures, captions, strict=False)]
+        pictures = [
+            views.Picture(*captioned)
+            for captioned in zip(pair.pictures, captions, strict=False)
+        ]
         sections.append(ResultPart(text=[text], pictures=[pictures]))
     if result.clusters:
         sections.append(_kinds(result.clusters))
@@ -203,9 +275,14 @@ def shown(result: ExplainResult) -> ShownResult:
 
 
 def rule_text(number: int, rule: RuleRow) -> str:
-    """Return the rule with this number, from 1, in a sentence, with its counts and its confirmation."""
+    """Return the rule with this number, from 1, in a sentence, with its counts and its
+    confirmation.
+    """
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
-    text = f"{wording.conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
+    text = (
+        f"{wording.conditions_text(rule.conditions)}: right in {rule.text}; {rest} "
+        f"{rule.elsewhere.text}."
+    )
     if rule.confirmed is None:
         return text
     verdict = "confirmed" if rule.confirmed.held else "not confirmed"
@@ -222,19 +299,30 @@ def triggering(result: ExplainResult) -> Iterator[str]:
 
 
 def not_told_text(result: ExplainResult) -> str:
-    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
+    """Return the best rule that is not told, why not, and how many rows it would take;
+    empty where there is none.
+    """
     rule = result.not_told
     if rule is None:
         return ""
     text = (
-        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
-        f"{wording.conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of "
-        f"{rule.total} under it and in {rule.elsewhere.right} of {rule.elsewhere.total} elsewhere"
+        f"Not told{' either' if result.rules else ''}, but the best that one half of "
+        "the rows suggests: "
+        f"{wording.conditions_text(rule.conditions)}. In the other half the model is "
+        f"right in {rule.right} of "
+        f"{rule.total} under it and in {rule.elsewhere.right} of "
+        f"{rule.elsewhere.total} elsewhere"
     )
     if rule.rows is None:
         return f"{text}, which is no difference that more rows would tell."
-    chance = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
-    return f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell it: sweep more."
+    chance = (
+        f"chance does that with a probability of {rule.chance:.2g}, and at most "
+        f"{rule.asked:g} is asked"
+    )
+    return (
+        f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell "
+        "it: sweep more."
+    )
 
 
 def envelope_text(result: ExplainResult) -> str:
@@ -244,17 +332,28 @@ def envelope_text(result: ExplainResult) -> str:
         return "No box of enough rows promises the accuracy that was asked for."
     where = wording.conditions_text(box.conditions)
     if not box.held:
-        return f"Not shown: inside {where} the rows that did not choose it are right in {box.text}."
-    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {box.text}."
+        return (
+            f"Not shown: inside {where} the rows that did not choose it are right "
+            f"in {box.text}."
+        )
+    return (
+        f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in "
+        f"{box.text}."
+    )
 
 
 def pairs_text(result: ExplainResult) -> str:
-    """Return for how many failures a right configuration near was sought, and for how many it was found."""
+    """Return for how many failures a right configuration near was sought, and for how
+    many it was found.
+    """
     failures = result.total - result.right
     left = failures - result.pairs_sought
-    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    others = (
+        f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    )
     return (
-        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
+        f"Of the {result.pairs_sought} most typical of {failures} failures, "
+        f"{len(result.pairs)} are right once one "
         f"parameter is another.{others}"
     )
 
@@ -263,12 +362,21 @@ def _kinds(found: FailureClusters) -> ResultPart:
     again = f"the {found.failures} failures that were rendered again"
     text = f"One kind: {again} are alike by {found.features}."
     if found.silhouette is not None:
-        shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
+        shading = (
+            ""
+            if found.apart
+            else (
+                "; they shade into one another: groups of any cloud may be as far apart"
+            )
+        )
         kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
         text = f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
     pictures = []
     for one in found.listed:
-        labels = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_PREDICTIONS])
+        labels = ", ".join(
+            f"{name} {number}"
+            for name, number in [*one.answers.items()][:MOST_PREDICTIONS]
+        )
         pictures.append(views.Picture(one.picture, f"{one.failures}: {labels}"))
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
 
@@ -277,18 +385,27 @@ def claims(result: ExplainResult) -> Iterator[views.Claim]:
     """Yield the claims that the rules and the envelope support."""
     for number, rule in enumerate(result.rules, 1):
         counts: RightOf = rule.confirmed or rule
-        source = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
+        source = (
+            "fresh renders" if rule.confirmed else ("rows that did not choose the rule")
+        )
         extent = counts.extent(f"right, of {source}")
         where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
         inside = f"{wording.share_text(extent)} {source}"
-        statement = f"Where {where} the model is right in {inside}; elsewhere in {rule.elsewhere.text}."
+        statement = (
+            f"Where {where} the model is right in {inside}; elsewhere in "
+            f"{rule.elsewhere.text}."
+        )
         yield views.Claim(kind="measured", statement=statement, extent=extent)
     box = result.envelope
     if box is not None and box.held and box.total:
         extent = box.extent("right, of rows that did not choose the box")
         where = wording.conditions_text(box.conditions)
-        inside = f"{wording.share_text(extent)} configurations that did not choose this box"
-        statement = f"Inside {where} the model is right in {inside}; the sweeps drew no others."
+        inside = (
+            f"{wording.share_text(extent)} configurations that did not choose this box"
+        )
+        statement = (
+            f"Inside {where} the model is right in {inside}; the sweeps drew no others."
+        )
         yield views.Claim(kind="measured", statement=statement, extent=extent)
     elif not result.rules:
         reason = "no box of values was shown to keep the accuracy that was asked for"

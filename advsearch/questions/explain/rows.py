@@ -13,15 +13,18 @@ OUTER = ("object", "environment", "model")
 """Settings of a sweep that its rows have as columns, whether they vary or not."""
 
 EXTENT = ("samples", "keep_pictures", "surface", "trials", "verify_spp")
-"""Settings of a sweep that change neither the image with a number nor its prediction."""
+"""Settings of a sweep that change neither the image with a number nor its
+prediction.
+"""
 
 
 def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     """Read the rows of some sweeps as one frame, with the index of their `sweep`.
 
-    The same draw is one unit (`name_draws`), and the same image, come again in a longer sweep of the same seed, is left
-    out (`name_images`). Object, environment and model have the names that figures give them, and the values of
-    parameters that a sweep does not have are missing.
+    The same draw is one unit (`name_draws`), and the same image, come again in a longer
+    sweep of the same seed, is left out (`name_images`). Object, environment and model
+    have the names that figures give them, and the values of parameters that a sweep
+    does not have are missing.
     """
     frames = []
     for index, sweep in enumerate(sweeps):
@@ -36,7 +39,9 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         rows["image"] = name_images(sweep, rows)
         frames.append(rows.assign(sweep=index))
 
-    units = {name: unit for frame in frames for name, unit in frame.attrs["units"].items()}
+    units = {
+        name: unit for frame in frames for name, unit in frame.attrs["units"].items()
+    }
     units = {**units, **dict.fromkeys(OUTER, "")}
     table = pd.concat(frames, ignore_index=True)
     table = table[~table.duplicated("image")].reset_index(drop=True)
@@ -51,26 +56,41 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 
 
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
-    """Return a name of the draw of each row (n,) of a sweep, the same in another sweep of the same draw.
+    """Return a name of the draw of each row (n,) of a sweep, the same in another sweep
+    of the same draw.
 
-    What is drawn follows from the seed and the number of the draw, however many there are and whatever they are placed
-    in: sweeps of one seed share their draws. Where nothing is drawn, images of the same values, or drives that begin
-    with the same, differ in noise alone.
+    What is drawn follows from the seed and the number of the draw, however many there
+    are and whatever they are placed in: sweeps of one seed share their draws. Where
+    nothing is drawn, images of the same values, or drives that begin with the same,
+    differ in noise alone.
     """
     if sweep.summary.sampler is not None:
         return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
-    columns = [name for name in ("object", "environment", *rows.attrs["units"]) if name not in ("model", "answer")]
-    first_rows = rows.drop_duplicates("unit").set_index("unit")[list(dict.fromkeys(columns))].astype(str)
+    columns = [
+        name
+        for name in ("object", "environment", *rows.attrs["units"])
+        if name not in ("model", "answer")
+    ]
+    first_rows = (
+        rows.drop_duplicates("unit")
+        .set_index("unit")[list(dict.fromkeys(columns))]
+        .astype(str)
+    )
     values_of_unit = first_rows.agg(" ".join, axis=1)
     return [f"values {values_of_unit[unit]}" for unit in rows["unit"]]
 
 
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
-    """Return a name of each row (n,) of a sweep: equal ones are the same prediction of the same image.
+    """Return a name of each row (n,) of a sweep: equal ones are the same prediction of
+    the same image.
 
     It consists of settings, number, values and model.
     """
-    deciding = {name: value for name, value in sweep.config.deciding().items() if name not in EXTENT}
+    deciding = {
+        name: value
+        for name, value in sweep.config.deciding().items()
+        if name not in EXTENT
+    }
     parameters = [name for name in rows.attrs["units"] if name not in OUTER]
     values = rows[[*OUTER, *parameters]].astype(str).agg(" ".join, axis=1)
     cells = zip(rows["step"], values, rows["correct"], strict=True)
@@ -80,4 +100,7 @@ def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 def read_values(rows: pd.DataFrame, index: int) -> dict[str, float | str]:
     """Return the values of the parameters that a row has, by name."""
     values = rows.loc[index, list(rows.attrs["units"])].dropna().items()
-    return {name: value if isinstance(value, str) else float(value) for name, value in values}
+    return {
+        name: value if isinstance(value, str) else float(value)
+        for name, value in values
+    }

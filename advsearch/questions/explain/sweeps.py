@@ -1,4 +1,6 @@
-"""Settings of sweeps that render what rows have shown: inside a rule, and along one factor from a failure."""
+"""Settings of sweeps that render what rows have shown: inside a rule, and along one
+factor from a failure.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,18 @@ N_ALONG = 9  # values of a factor that are tried on the way to a right predictio
 
 
 def sweep_inside(
-    config: SweepConfig, table: pd.DataFrame, conditions: rules.RuleConditions, samples: int, seed: int, arc: int = 0
+    config: SweepConfig,
+    table: pd.DataFrame,
+    conditions: rules.RuleConditions,
+    samples: int,
+    seed: int,
+    arc: int = 0,
 ) -> SweepConfig:
     """Return the settings of a sweep most of whose configurations lie under conditions.
 
-    Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the
-    rows have there; names to those that are left. The caller has to leave out what cannot be cut.
+    Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of
+    a grid to the values that the rows have there; names to those that are left. The
+    caller has to leave out what cannot be cut.
 
     Args:
         config: settings of the sweep that it is like.
@@ -32,18 +40,34 @@ def sweep_inside(
         arc: of an angle that may lie on either side, the index of the side.
     """
     inside = table[rules.find_covered(conditions, table)]
-    values_inside = {name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]}
+    values_inside = {
+        name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
+    }
 
     outer = {name: getattr(config, name) for name in OUTER}
     for name in OUTER:
         if name in values_inside and outer[name] is not None:
-            names = [given for value in values_inside[name] for given in find_names(config, name, value)]
+            names = [
+                given
+                for value in values_inside[name]
+                for given in find_names(config, name, value)
+            ]
             outer[name] = ",".join(names) or outer[name]
-    n_scenes = math.prod(len(settings.split_names(names)) if names else 1 for names in outer.values())
+    n_scenes = math.prod(
+        len(settings.split_names(names)) if names else 1 for names in outer.values()
+    )
 
-    grid: dict[str, Any] = {name: values_inside.get(name, values) for name, values in config.grid.items()}
-    axis_sizes = {name: len(values) if isinstance(values, list) else 1 for name, values in grid.items()}
-    while math.prod(axis_sizes.values()) * n_scenes > 2 * samples and max(axis_sizes.values(), default=1) > 1:
+    grid: dict[str, Any] = {
+        name: values_inside.get(name, values) for name, values in config.grid.items()
+    }
+    axis_sizes = {
+        name: len(values) if isinstance(values, list) else 1
+        for name, values in grid.items()
+    }
+    while (
+        math.prod(axis_sizes.values()) * n_scenes > 2 * samples
+        and max(axis_sizes.values(), default=1) > 1
+    ):
         longest = max(axis_sizes, key=axis_sizes.__getitem__)
         grid[longest] = grid[longest][::2]
         axis_sizes[longest] = len(grid[longest])
@@ -51,13 +75,17 @@ def sweep_inside(
 
     controls = cut_controls(config, table, conditions, arc)
     draws = math.ceil(samples / n_points) if controls else None
-    return make_quiet(config, grid=grid, controls=controls, samples=draws, seed=seed, **outer)
+    return make_quiet(
+        config, grid=grid, controls=controls, samples=draws, seed=seed, **outer
+    )
 
 
 def cut_controls(
     config: SweepConfig, table: pd.DataFrame, conditions: rules.RuleConditions, arc: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls of a sweep with the ranges of what is drawn cut to conditions; see `sweep_inside`."""
+    """Return the controls of a sweep with the ranges of what is drawn cut to
+    conditions; see `sweep_inside`.
+    """
     controls = {name: dict(given) for name, given in config.controls.items()}
     for condition in conditions:
         if condition.options is not None or not is_drawn(config, condition.factor):
@@ -74,16 +102,23 @@ def cut_controls(
         has_ranges = bool(declared.keys() & config.controls[instance].keys())
         if not has_ranges:
             # With a range for one parameter, the others would stay as they are.
-            for name, values in observed_ranges(config, table, instance, declared).items():
+            for name, values in observed_ranges(
+                config, table, instance, declared
+            ).items():
                 controls[instance].setdefault(name, values)
         controls[instance][parameter] = [low, high]
     return controls
 
 
 def observed_ranges(
-    config: SweepConfig, table: pd.DataFrame, instance: str, declared: Mapping[str, Parameter]
+    config: SweepConfig,
+    table: pd.DataFrame,
+    instance: str,
+    declared: Mapping[str, Parameter],
 ) -> dict[str, Any]:
-    """Return the ranges that rows have of the parameters of a control that are drawn."""
+    """Return the ranges that rows have of the parameters of a control that are
+    drawn.
+    """
     ranges: dict[str, Any] = {}
     for name, parameter in declared.items():
         column = table.get(f"{instance}.{name}")
@@ -97,46 +132,85 @@ def observed_ranges(
 
 
 def sweep_along(
-    config: SweepConfig, row: Mapping[str, float | str], factor: str, table: pd.DataFrame, seed: int
+    config: SweepConfig,
+    row: Mapping[str, float | str],
+    factor: str,
+    table: pd.DataFrame,
+    seed: int,
 ) -> SweepConfig:
-    """Return the settings of a sweep along one factor, everything else as in a row; the row's own value comes first."""
+    """Return the settings of a sweep along one factor, everything else as in a row; the
+    row's own value comes first.
+    """
     column = table[factor]
     if column.dtype == "category":
         candidates: Sequence[float | str] = column.cat.categories.tolist()
     else:
-        candidates = [float(f"{value:.4g}") for value in np.linspace(column.min(), column.max(), N_ALONG)]
+        candidates = [
+            float(f"{value:.4g}")
+            for value in np.linspace(column.min(), column.max(), N_ALONG)
+        ]
     values = list(dict.fromkeys([row[factor], *candidates]))
 
-    grid: dict[str, object] = {name: [row[name]] for name in row if "." in name and is_settable(config, name)}
-    outer = {name: next(iter(find_names(config, name, str(row[name]))), None) for name in OUTER}
+    grid: dict[str, object] = {
+        name: [row[name]] for name in row if "." in name and is_settable(config, name)
+    }
+    outer = {
+        name: next(iter(find_names(config, name, str(row[name]))), None)
+        for name in OUTER
+    }
     if factor in OUTER:
-        outer[factor] = ",".join(name for value in values for name in find_names(config, factor, str(value)))
+        outer[factor] = ",".join(
+            name for value in values for name in find_names(config, factor, str(value))
+        )
     else:
         grid[factor] = values
 
-    set_values = {name: value for name, value in config.set_.items() if name not in grid}
+    set_values = {
+        name: value for name, value in config.set_.items() if name not in grid
+    }
     changes: dict[str, object] = {"keep_pictures": "all", "set": set_values}
-    changes |= {"workers": None, "cluster": None}  # ten images take less than a worker takes to load
+    # ten images take less than a worker takes to load
+    changes |= {"workers": None, "cluster": None}
     controls = keep_choices(config, grid)
-    return make_quiet(config, grid=grid, controls=controls, samples=None, seed=seed, **changes, **outer)
+    return make_quiet(
+        config,
+        grid=grid,
+        controls=controls,
+        samples=None,
+        seed=seed,
+        **changes,
+        **outer,
+    )
 
 
-def keep_choices(config: SweepConfig, grid: Mapping[str, object]) -> dict[str, dict[str, Any]]:
-    """Return the controls of a sweep whose choices matter though a grid sets all of their parameters."""
+def keep_choices(
+    config: SweepConfig, grid: Mapping[str, object]
+) -> dict[str, dict[str, Any]]:
+    """Return the controls of a sweep whose choices matter though a grid sets all of
+    their parameters.
+    """
     controls = {}
     for instance, given in config.controls.items():
         control_type = config.find_control_type(instance)
         if control_type is None:
             continue
         choices = {choice.name for choice in control_type.choices} & given.keys()
-        parameters = [f"{instance}.{parameter.name}" for parameter in control_type.declared(given)]
+        parameters = [
+            f"{instance}.{parameter.name}" for parameter in control_type.declared(given)
+        ]
         if choices and all(name in grid for name in parameters):
-            controls[instance] = {name: value for name, value in given.items() if name in {*choices, "kind"}}
+            controls[instance] = {
+                name: value
+                for name, value in given.items()
+                if name in {*choices, "kind"}
+            }
     return controls
 
 
 def is_drawn(config: SweepConfig, factor: str) -> bool:
-    """Return whether a sweep draws a parameter by chance, from a range that it can be given."""
+    """Return whether a sweep draws a parameter by chance, from a range that it can be
+    given.
+    """
     instance, dot, parameter = factor.partition(".")
     is_frame = bool(config.path) and parameter == "time"
     if not dot or is_frame or factor in config.grid or instance not in config.controls:
@@ -145,21 +219,37 @@ def is_drawn(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a sweep takes a value of its rows; others follow from those, as `path.distance` from the time."""
+    """Return whether a sweep takes a value of its rows; others follow from those, as
+    `path.distance` from the time.
+    """
     instance, dot, parameter = name.partition(".")
     declared = config.declared_parameters(instance)
     return not dot or declared is None or parameter in declared
 
 
 def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
-    """Return the names that a sweep was given and that its rows write as a value; else the first one."""
-    given = settings.split_names(getattr(config, setting)) if getattr(config, setting) else ()
+    """Return the names that a sweep was given and that its rows write as a value; else
+    the first one.
+    """
+    given = (
+        settings.split_names(getattr(config, setting))
+        if getattr(config, setting)
+        else ()
+    )
     matching = [name for name in given if value in (name, wording.figure_value(name))]
     return matching or list(given[:1])
 
 
 def make_quiet(config: SweepConfig, **changes: object) -> SweepConfig:
-    """Return the settings of a sweep with changes that renders its images and nothing else."""
-    quiet = {"trials": 0, "verify_spp": None, "keep_pictures": "none", "aov": None, "surface": False}
+    """Return the settings of a sweep with changes that renders its images and nothing
+    else.
+    """
+    quiet = {
+        "trials": 0,
+        "verify_spp": None,
+        "keep_pictures": "none",
+        "aov": None,
+        "surface": False,
+    }
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.plain(), **quiet, **changes, **sampler})

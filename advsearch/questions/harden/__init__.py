@@ -1,4 +1,6 @@
-"""Train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw."""
+"""Train a copy of a model on its worst cases, and measure it before and after on scenes
+that training never saw.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from advsearch.questions.harden.result import HardenConfig, HardenResult, claims
 
 @experiment(
     "harden --model reference --control texture --epsilon 0.03 --quick",
-    "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",
+    "harden --model mypackage:network@weights.safetensors --labels labels.json "
+    "--control texture,pose,light",
     positional_args=("model",),
     python_arguments="advsearch.questions.harden.carry_out:hardened",
     resumes_in_python=True,
@@ -18,24 +21,30 @@ from advsearch.questions.harden.result import HardenConfig, HardenResult, claims
     claims=claims,
 )
 def harden(asked: RunContext[HardenConfig], **given: Any) -> HardenResult:
-    """Train a copy of a model on its worst cases, and prove what it is better at (docs/harden.md).
+    """Train a copy of a model on its worst cases, and prove what it is better at
+    (docs/harden.md).
 
-    All other arguments are the settings of `advsearch harden`. The run is kept, in `run` or under runs/. The model that
-    is given stays as it is.
+    All other arguments are the settings of `advsearch harden`. The run is kept, in
+    `run` or under runs/. The model that is given stays as it is.
 
     Args:
-        model: a classifier, a detector or a segmenter: what `load_model` takes, and no exported program.
-        optimiser: makes one of the list of parameters, such as ``lambda p: torch.optim.SGD(p, 0.01)``; its learning
-            rate is then the highest, in place of `rate`.
-        beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
-            (N,). One is taken with each step. Not of a detector, which `data` is for.
-        loss: of a detector whose network returns none in training: a function of the network, its input (N, 3, H, W)
-            and, for each picture, a mapping with "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels"
-            (K,), indices of the model's labels; of a segmenter with "classes" (h, w) int64, the class that each pixel
-            of its output should have, and "object" (h, w) bool, those of the object. It returns a number that is
-            smaller where the network is better.
-        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
-            was.
+        model: a classifier, a detector or a segmenter: what `load_model` takes, and no
+            exported program.
+        optimiser: makes one of the list of parameters, such as ``lambda p:
+            torch.optim.SGD(p, 0.01)``; its learning rate is then the highest, in place
+            of `rate`.
+        beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3)
+            sRGB in [0, 1], class indices (N,). One is taken with each step. Not of a
+            detector, which `data` is for.
+        loss: of a detector whose network returns none in training: a function of the
+            network, its input (N, 3, H, W) and, for each picture, a mapping with
+            "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels" (K,),
+            indices of the model's labels; of a segmenter with "classes" (h, w) int64,
+            the class that each pixel of its output should have, and "object" (h, w)
+            bool, those of the object. It returns a number that is smaller where the
+            network is better.
+        resume: go on with the run of that name, if there is one, where it was stopped;
+            everything else has to be as it was.
     """
     from advsearch.questions.harden.carry_out import hardened  # imports torch
 

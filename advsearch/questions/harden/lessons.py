@@ -1,10 +1,13 @@
-"""What a model is trained on: plain renders of scenes, and the worst configurations of them that short searches find.
+"""What a model is trained on: plain renders of scenes, and the worst configurations of
+them that short searches find.
 
-Where light arrives linearly (textures, patches), a lesson holds a matrix of light transport of one view, which says the
-picture of any texture and its derivative without rendering: its adversarial texture is searched further each time that
-the lesson comes up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views share is one of
-expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations: twice
-to train on, as new scenes teach more than further configurations of one, and more often to choose weights by.
+Where light arrives linearly (textures, patches), a lesson holds a matrix of light
+transport of one view, which says the picture of any texture and its derivative without
+rendering: its adversarial texture is searched further each time that the lesson comes
+up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views
+share is one of expectation over transformation (EOT, Athalye et al. 2018). Everything
+else is rendered at random configurations: twice to train on, as new scenes teach more
+than further configurations of one, and more often to choose weights by.
 """
 
 from __future__ import annotations
@@ -22,12 +25,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import Model, Problem, RunDirectory, color, policies, seeds, writing
+from advsearch.extend import (
+    Model,
+    Problem,
+    RunDirectory,
+    color,
+    policies,
+    seeds,
+    writing,
+)
 
 PICTURES = "artifacts/pictures"  # what was trained on, in the run
-SPP, MATRIX_SPP, DEPTH = 2, 4, 4
-"""Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many
-lessons with some noise teach more than few without."""
+SPP = 2
+MATRIX_SPP = 4
+DEPTH = 4
+"""Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments
+of the longest path: many lessons with some noise teach more than few without.
+"""
 STEP = 0.5  # a step of an adversarial texture, as a share of its budget
 TOGETHER = 32  # pictures that a model is asked about at once
 
@@ -53,9 +67,11 @@ class Lesson:
 
 @dataclass(eq=False)
 class TextureLesson(Lesson):
-    """A lesson whose pictures `linear` says, the scene being let go of: the space and the domain of its texture, the
-    numbers of the conditions that it was made for, and the adversarial texture (d,), which other views may share and
-    which changes in place."""
+    """A lesson whose pictures `linear` says, the scene being let go of: the space and
+    the domain of its texture, the numbers of the conditions that it was made for, and
+    the adversarial texture (d,), which other views may share and which changes in
+    place.
+    """
 
     space: Any
     domain: policies.Domain
@@ -78,16 +94,27 @@ class TextureLesson(Lesson):
 
 @dataclass(eq=False)
 class RenderedLesson(Lesson):
-    """A lesson whose pictures (N, H, W, 3) uint8 were rendered at random configurations, with the loss (N,) of each
-    when a model last looked at it; infinite of those that none has."""
+    """A lesson whose pictures (N, H, W, 3) uint8 were rendered at random
+    configurations, with the loss (N,) of each when a model last looked at it; infinite
+    of those that none has.
+    """
 
     pictures: Tensor
     losses: Tensor
 
     @classmethod
-    def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
-        """Return a lesson of a picture (H, W, 3) and some (N, H, W, 3) in [0, 1], the first the worst so far."""
-        return cls(right, color.levels_of(plain), color.levels_of(pictures), torch.full((len(pictures),), torch.inf))
+    def of(
+        cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor
+    ) -> RenderedLesson:
+        """Return a lesson of a picture (H, W, 3) and some (N, H, W, 3) in [0, 1], the
+        first the worst so far.
+        """
+        return cls(
+            right,
+            color.levels_of(plain),
+            color.levels_of(pictures),
+            torch.full((len(pictures),), torch.inf),
+        )
 
     @property
     def worst(self) -> Tensor:
@@ -95,19 +122,34 @@ class RenderedLesson(Lesson):
 
 
 def lessons(
-    problem: Problem, views: int, seed: int, *, plain: int = 0, tries: int | None = None, shared: bool = False
+    problem: Problem,
+    views: int,
+    seed: int,
+    *,
+    plain: int = 0,
+    tries: int | None = None,
+    shared: bool = False,
 ) -> list[Lesson]:
-    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance, and from `plain`
-    views of it as it is, which nothing makes harder. Where no matrix says the pictures, `tries` configurations are
-    rendered beside each view as it is (see `tried`); None for two renders of a view: one of the controls moved, and all
-    of them. Views that are `shared` have one adversarial texture."""
-    domain, start = problem.domain, problem.domain.start
-    linear, quickly, drawn = views and problem.is_linear, problem.renderer.like(quick=True), list[Lesson]()
+    """Draw lessons from so many views of one scene, each with conditions of its own,
+    drawn by chance, and from `plain` views of it as it is, which nothing makes harder.
+    Where no matrix says the pictures, `tries` configurations are rendered beside each
+    view as it is (see `tried`); None for two renders of a view: one of the controls
+    moved, and all of them. Views that are `shared` have one adversarial texture.
+    """
+    domain = problem.domain
+    start = problem.domain.start
+    linear = views and problem.is_linear
+    quickly = problem.renderer.like(quick=True)
+    drawn = list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
-    space, whole_space = (replace(space, scene=None) for space in (problem.searched_space, problem.space))
+    space, whole_space = (
+        replace(space, scene=None) for space in (problem.searched_space, problem.space)
+    )
 
     def begun(seed: int) -> Tensor:
-        return domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0].clone()
+        return domain.sample(torch.Generator().manual_seed(seed), extreme=True)[
+            0
+        ].clone()
 
     common = begun(seed)
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
@@ -117,30 +159,51 @@ def lessons(
             numbers = whole[domain.dim :].clone()  # and not all that it is a part of
             if linear:
                 made = problem.linearised(whole, view, MATRIX_SPP)
-                levels, texture = color.levels_of(made(whole)), common if shared else begun(view)
+                levels = color.levels_of(made(whole))
+                texture = common if shared else begun(view)
                 made.let_go(whole_space)
-                drawn.append(TextureLesson(right, levels, space, domain, made, numbers, texture))
+                drawn.append(
+                    TextureLesson(right, levels, space, domain, made, numbers, texture)
+                )
                 continue
             generator = torch.Generator().manual_seed(view)
             if tries is None:
-                *alone, together = tried(domain, generator, 1 + len(problem.searched_space.controls))
-                wanted = [alone[torch.randint(len(alone), (), generator=generator)], together]
+                *alone, together = tried(
+                    domain, generator, 1 + len(problem.searched_space.controls)
+                )
+                wanted = [
+                    alone[torch.randint(len(alone), (), generator=generator)],
+                    together,
+                ]
             else:
                 wanted = [start, *tried(domain, generator, tries)]
-            first, *pictures = (quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted)
+            first, *pictures = (
+                quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted
+            )
             drawn.append(RenderedLesson.of(right, first, torch.stack(pictures)))
         for number in range(plain):
             view = seeds.stream(seed, "plain lesson", number)
-            drawn.append(Lesson(right, color.levels_of(quickly(problem.whole(start, view), seed=view, spp=SPP))))
+            drawn.append(
+                Lesson(
+                    right,
+                    color.levels_of(
+                        quickly(problem.whole(start, view), seed=view, spp=SPP)
+                    ),
+                )
+            )
     return drawn
 
 
 def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Tensor:
-    """Draw configurations (count, d) at random. In half of them each number is moved to the nearer end of its range by
-    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends. Of several
-    controls each moves alone in turn, then all of them at once."""
+    """Draw configurations (count, d) at random. In half of them each number is moved to
+    the nearer end of its range by chance, as searches end where several numbers are.
+    Choices, and numbers that are periodic, have no ends. Of several controls each moves
+    alone in turn, then all of them at once.
+    """
     drawn = domain.sample(generator, count)
-    at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (torch.rand(count, 1, generator=generator) < 0.5)
+    at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (
+        torch.rand(count, 1, generator=generator) < 0.5
+    )
     owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
     controls = list(dict.fromkeys(owners))
     turn = torch.arange(count) % (len(controls) + 1)
@@ -150,39 +213,66 @@ def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Te
         still = (turn != controls.index(owner)) & (turn != len(controls))
         drawn[still, part] = domain.start[part]
         at_ends[still, part] = False
-    ends = torch.where(drawn - domain.lower < domain.upper - drawn, domain.lower, domain.upper)
-    return torch.stack([domain.project(row) for row in torch.where(at_ends, ends, drawn)])
+    ends = torch.where(
+        drawn - domain.lower < domain.upper - drawn, domain.lower, domain.upper
+    )
+    return torch.stack(
+        [domain.project(row) for row in torch.where(at_ends, ends, drawn)]
+    )
 
 
 def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
-    """Return (N,): the negative logarithm of the probability that logits (N, C) give to the right classes of each."""
+    """Return (N,): the negative logarithm of the probability that logits (N, C) give to
+    the right classes of each.
+    """
     known = F.log_softmax(logits, dim=1)
-    return torch.stack([-row[list(of)].logsumexp(dim=0) for row, of in zip(known, right, strict=True)])
+    return torch.stack(
+        [-row[list(of)].logsumexp(dim=0) for row, of in zip(known, right, strict=True)]
+    )
 
 
 def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
     """Those lessons that something makes harder."""
-    return [lesson for lesson in some if isinstance(lesson, (TextureLesson, RenderedLesson))]
+    return [
+        lesson for lesson in some if isinstance(lesson, (TextureLesson, RenderedLesson))
+    ]
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
-    """Make lessons harder for a model: further steps of textures, and a look at what was rendered more than once."""
+    """Make lessons harder for a model: further steps of textures, and a look at what
+    was rendered more than once.
+    """
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         ascend(part, partial(slopes, model=model), steps)
-        several = [lesson for lesson in part if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1]
+        several = [
+            lesson
+            for lesson in part
+            if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1
+        ]
         if several:
             with torch.no_grad():
                 pictures = torch.cat([lesson.pictures for lesson in several]) / 255.0
-                loss = surprise(model(pictures), [lesson.right for lesson in several for _ in lesson.pictures])
-            for lesson, losses in zip(several, loss.split([len(each.pictures) for each in several]), strict=True):
+                loss = surprise(
+                    model(pictures),
+                    [lesson.right for lesson in several for _ in lesson.pictures],
+                )
+            for lesson, losses in zip(
+                several,
+                loss.split([len(each.pictures) for each in several]),
+                strict=True,
+            ):
                 lesson.losses = losses.clone()
 
 
 def ascend(
-    some: Sequence[Lesson], slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]], steps: int = 1
+    some: Sequence[Lesson],
+    slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
+    steps: int = 1,
 ) -> None:
-    """Steps uphill of textures, by what `slopes` says; views that share one add up. Other lessons stay as they are."""
+    """Steps uphill of textures, by what `slopes` says; views that share one add up.
+    Other lessons stay as they are.
+    """
     chosen = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
     for _ in range(steps if chosen else 0):
         total = dict[int, Tensor]()
@@ -190,7 +280,9 @@ def ascend(
             total[id(lesson.texture)] = slope + total.get(id(lesson.texture), 0.0)
         for lesson in {id(lesson.texture): lesson for lesson in chosen}.values():
             steepest = lesson.domain.steepest(lesson.texture, total[id(lesson.texture)])
-            lesson.texture.copy_(lesson.domain.project(lesson.texture + STEP * steepest))
+            lesson.texture.copy_(
+                lesson.domain.project(lesson.texture + STEP * steepest)
+            )
 
 
 def slopes(
@@ -198,18 +290,29 @@ def slopes(
     model: Callable[[Tensor], Tensor],
     change: Callable[[Tensor], Tensor] = lambda images: images,
 ) -> Sequence[Tensor]:
-    """Return the derivative (d,) of each lesson's loss by its texture; `change` is of the pictures (N, H, W, 3)."""
+    """Return the derivative (d,) of each lesson's loss by its texture; `change` is of
+    the pictures (N, H, W, 3).
+    """
     leaves = [lesson.texture.clone().requires_grad_() for lesson in chosen]
-    pictures = torch.stack([lesson.picture(u) for lesson, u in zip(chosen, leaves, strict=True)])
-    return torch.autograd.grad(surprise(model(change(pictures)), [lesson.right for lesson in chosen]).sum(), leaves)
+    pictures = torch.stack(
+        [lesson.picture(u) for lesson, u in zip(chosen, leaves, strict=True)]
+    )
+    return torch.autograd.grad(
+        surprise(model(change(pictures)), [lesson.right for lesson in chosen]).sum(),
+        leaves,
+    )
 
 
-def save_pictures(run: RunDirectory, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
-    """Write the pictures of a round's lessons into `PICTURES` of the run, and those of all rounds as a WebDataset.
+def save_pictures(
+    run: RunDirectory, number: int, chosen: Sequence[Lesson], labels: Sequence[str]
+) -> None:
+    """Write the pictures of a round's lessons into `PICTURES` of the run, and those of
+    all rounds as a WebDataset.
 
-    The pictures are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``. The WebDataset stands beside their folder.
-    It has of each picture a ``.png``, a ``.cls`` with the index of its class and a ``.json`` with that and the kind of
-    picture. Members have no time and no owner, so that equal pictures make equal files.
+    The pictures are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``. The
+    WebDataset stands beside their folder. It has of each picture a ``.png``, a ``.cls``
+    with the index of its class and a ``.json`` with that and the kind of picture.
+    Members have no time and no owner, so that equal pictures make equal files.
     """
     folder = run.path / PICTURES
     for place, lesson in enumerate(chosen):
@@ -217,12 +320,22 @@ def save_pictures(run: RunDirectory, number: int, chosen: Sequence[Lesson], labe
         class_folder = f"{PICTURES}/{lesson.right[0]:04d}-{name}"
         (run.path / class_folder).mkdir(parents=True, exist_ok=True)
         for kind in ("plain", "worst") if with_worst([lesson]) else ("plain",):
-            run.save_image(f"{number:03d}-{place:05d}-{kind}", getattr(lesson, kind), class_folder)
-    with writing.replacing(folder.with_suffix(".tar")) as part, tarfile.open(part, "w") as tar:
+            run.save_image(
+                f"{number:03d}-{place:05d}-{kind}", getattr(lesson, kind), class_folder
+            )
+    with (
+        writing.replacing(folder.with_suffix(".tar")) as part,
+        tarfile.open(part, "w") as tar,
+    ):
         for path in sorted(folder.glob("*/*.png")):
-            index, kind = int(path.parent.name[:4]), path.stem.rpartition("-")[2]
+            index = int(path.parent.name[:4])
+            kind = path.stem.rpartition("-")[2]
             facts = json.dumps({"class": index, "kind": kind})
-            for suffix, data in {"png": path.read_bytes(), "cls": str(index).encode(), "json": facts.encode()}.items():
+            for suffix, data in {
+                "png": path.read_bytes(),
+                "cls": str(index).encode(),
+                "json": facts.encode(),
+            }.items():
                 member = tarfile.TarInfo(f"{path.parent.name}-{path.stem}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))

@@ -22,21 +22,33 @@ from advsearch.extend import (
 
 STEPS = 40  # of a search, as of an attack
 ALL = "all"  # the objects of a command that takes all bundled ones
-PLAIN_SCENES, RENDERED_SCENES = 6, 15
-"""Scenes that come with each one of the training, of which nothing is drawn but one view: plain ones, where nothing is
-rendered, or such as are rendered. What is learned is lost on other scenes where there are few, and so is clean
-accuracy."""
+PLAIN_SCENES = 6
+RENDERED_SCENES = 15
+"""Scenes that come with each one of the training, of which nothing is drawn but one
+view: plain ones, where nothing is rendered, or such as are rendered. What is learned is
+lost on other scenes where there are few, and so is clean accuracy.
+"""
 
 TEXTURE_LOOKS = 6
-"""How often an epoch looks at a scene with a texture, over its views: it is another one each time, while what was
-rendered stays."""
+"""How often an epoch looks at a scene with a texture, over its views: it is another one
+each time, while what was rendered stays.
+"""
 
-QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
+QUICK: dict[str, int] = {
+    "rounds": 1,
+    "scenes": 14,
+    "views": 2,
+    "epochs": 6,
+    "measured": 14,
+    "steps": 20,
+}
 """What `quick` takes where nothing else was said: minutes instead of an hour."""
 
 
 class HardenConfig(AttackConfig):
-    """Everything that decides what `harden` does: training on worst cases, and the measurement before and after."""
+    """Everything that decides what `harden` does: training on worst cases, and the
+    measurement before and after.
+    """
 
     # fmt: off
     command: ClassVar[str] = "harden"
@@ -50,7 +62,8 @@ class HardenConfig(AttackConfig):
 
     object: str = setting_as_in(
         AttackConfig, "object", default=ALL,
-        description="objects to train on, separated by commas; all: every bundled one that the model has a class for; "
+        description="objects to train on, separated by commas; all: every bundled one "
+                    "that the model has a class for; "
         "a file is called as its class: coffee-mug.glb",
     )
     environment: str | None = setting_as_in(
@@ -59,7 +72,8 @@ class HardenConfig(AttackConfig):
         otherwise="the bundled environments that the reference model was trained in",
     )
     held_out: str | None = setting(
-        None, "scene", "objects that training never sees, which are measured, separated by commas",
+        None, "scene", "objects that training never sees, which are measured, "
+                       "separated by commas",
         "names of objects or files", otherwise="other instances of the bundled objects", min_length=1,
     )
     held_out_environment: str | None = setting(
@@ -68,38 +82,46 @@ class HardenConfig(AttackConfig):
         otherwise="the bundled environments that the reference model was not trained in", min_length=1,
     )
     task: str | dict[str, JsonValue] = setting_as_in(
-        AttackConfig, "task", description="what the model does: classification, detection or segmentation"
+        AttackConfig, "task", description="what the model does: classification, "
+                                          "detection or segmentation"
     )
     data: str | None = setting(
-        None, "training", "pictures of your own that a detector is trained on too: `annotations.json` and `images/`",
+        None, "training", "pictures of your own that a detector is trained on too: "
+                          "`annotations.json` and `images/`",
         "a folder, as of `export --format coco`", otherwise="none", min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
     scenes: int = setting(
         336, "training",
-        f"new scenes a round for each control; of what is rendered {RENDERED_SCENES + 1} times as many",
+        "new scenes a round for each control; of what is rendered "
+        f"{RENDERED_SCENES + 1} times as many",
         ge=1, le=100_000,
     )
     views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
     epochs: int = setting(
         3, "training",
-        "how often a round looks at each view; where a texture is searched, as many times as often as makes "
+        "how often a round looks at each view; where a texture is searched, as many "
+        "times as often as makes "
         f"{TEXTURE_LOOKS} for a scene, at most, over its views",
         ge=1, le=10_000,
     )
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
-        0.02, "training", "clean accuracy that may be lost; weights that lose more are not kept", ge=0.0, le=1.0
+        0.02, "training", "clean accuracy that may be lost; weights that lose more are "
+                          "not kept", ge=0.0, le=1.0
     )
-    measured: int = setting(28, "verification", "held-out scenes that are attacked, before and after", ge=1, le=100_000)
+    measured: int = setting(28, "verification", "held-out scenes that are attacked, "
+                                                "before and after", ge=1, le=100_000)
     steps: int = setting_as_in(AttackConfig, "steps", default=STEPS, otherwise="")
     trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="worker processes that share the scenes that are drawn and attacked"
+        AttackConfig, "workers", description="worker processes that share the scenes "
+                                             "that are drawn and attacked"
     )
-    quick: bool = setting(False, "training", "minutes instead of an hour: fewer rounds, scenes and steps")
+    quick: bool = setting(False, "training", "minutes instead of an hour: fewer "
+                                             "rounds, scenes and steps")
     # fmt: on
 
     @model_validator(mode="before")
@@ -120,11 +142,14 @@ class Share(results.Fields):
     """A share of right predictions."""
 
     accuracy: float = Field(description="`right` of `count`")
-    interval: results.Interval = Field(description="of that share, 95 %, over scenes of the objects at hand")
+    interval: results.Interval = Field(
+        description="of that share, 95 %, over scenes of the objects at hand"
+    )
     right: int
     count: int
     outcomes: results.Outcomes = results.optional(
-        f"of plain pictures, {results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}"
+        f"of plain pictures, {results.WHAT_BECOMES} in the other ones; "
+        f"{results.ONLY_OF_BOXES}"
     )
 
 
@@ -133,23 +158,34 @@ class HardenedControl(results.Fields):
 
     control: str
     before: Share
-    stronger_before: Share = Field(description="before, against the search `stronger_search`")
+    stronger_before: Share = Field(
+        description="before, against the search `stronger_search`"
+    )
     after: Share
     stronger: Share = Field(description="after, against the search `stronger_search`")
 
 
 class TrainingRound(results.Fields):
-    """One round of search and training, judged on scenes of the training's environments that it was not trained on."""
+    """One round of search and training, judged on scenes of the training's environments
+    that it was not trained on.
+    """
 
     lessons: int = Field(description="views that it was trained on")
-    part: float = Field(description="of the way from the weights that were given to the trained ones, in 0 to 1")
+    part: float = Field(
+        description="of the way from the weights that were given to "
+        "the trained ones, in 0 to 1"
+    )
     clean: float = Field(description="share of plain pictures that are right")
-    robust: float = Field(description="share of the worst pictures, searched for against these weights")
+    robust: float = Field(
+        description="share of the worst pictures, searched for against these weights"
+    )
     kept: bool = Field(description="whether its weights are the result")
 
 
 class SplitSide(results.Fields):
-    """What one side of the split consists of; no object and, held out, no environment is on two sides."""
+    """What one side of the split consists of; no object and, held out, no environment
+    is on two sides.
+    """
 
     objects: list[str]
     environments: list[str]
@@ -166,32 +202,55 @@ class HardenResult(views.InNotebook, RunResult):
     model: str
     task: str = Field(description="what judges the predictions")
     before: Share | None = Field(
-        description="held-out scenes that are right and in which no search over any control has found a wrong "
+        description="held-out scenes that are right and in which no search over any "
+        "control has found a wrong "
         "prediction; null if it was interrupted, as are the others"
     )
-    after: Share | None = Field(description="the same, of the hardened model, searched again")
-    clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
+    after: Share | None = Field(
+        description="the same, of the hardened model, searched again"
+    )
+    clean_before: Share | None = Field(
+        description="plain renders of held-out scenes that are right"
+    )
     clean_after: Share | None
     gained: int | None = Field(
         default=None,
-        description="held-out scenes that are robust after and were not before; null if it was interrupted",
+        description="held-out scenes that are robust after and were not before; null "
+        "if it was interrupted",
     )
-    lost: int | None = Field(default=None, description="held-out scenes that were robust before and are not after")
+    lost: int | None = Field(
+        default=None,
+        description="held-out scenes that were robust before and are not after",
+    )
     p: float | None = Field(
         default=None,
-        description="how likely it is by chance that one is so much larger, in further scenes of the same objects: "
+        description="how likely it is by chance that one is so much larger, in further "
+        "scenes of the same objects: "
         "McNemar's exact test over scenes. Of other objects it says nothing",
     )
     table: list[HardenedControl]
-    search: str = Field(description="policy and steps of the searches of `before` and `after`")
-    stronger_search: str = Field(description="another policy with three times the steps")
-    split: dict[str, SplitSide] = Field(description="by side: `training`, `further training`, `validation`, `held out`")
+    search: str = Field(
+        description="policy and steps of the searches of `before` and `after`"
+    )
+    stronger_search: str = Field(
+        description="another policy with three times the steps"
+    )
+    split: dict[str, SplitSide] = Field(
+        description="by side: `training`, `further training`, `validation`, `held out`"
+    )
     rounds: list[TrainingRound]
-    hardened: str | None = Field(description="what `model` takes to load the hardened one; null if nothing was kept")
+    hardened: str | None = Field(
+        description="what `model` takes to load the hardened "
+        "one; null if nothing was kept"
+    )
     weights: str | None = Field(description="the hardened weights, safetensors")
-    pictures: str | None = Field(description="folder of the pictures of the training, a folder for each class")
+    pictures: str | None = Field(
+        description="folder of the pictures of the training, a folder for each class"
+    )
     shared: results.SharedWork | None = Field(
-        default=None, description="how [workers](cluster.md) did that shared the work; absent without"
+        default=None,
+        description="how [workers](cluster.md) did that shared the work; "
+        "absent without",
     )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -199,16 +258,22 @@ class HardenResult(views.InNotebook, RunResult):
     def brief(self) -> str:
         if self.before is None or self.after is None:
             return ""
-        return f"robust in {self.after.right} of {self.after.count} scenes, before {self.before.right}"
+        return (
+            f"robust in {self.after.right} of {self.after.count} scenes, before "
+            f"{self.before.right}"
+        )
 
 
 ROBUST = (
-    "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % intervals over "
-    "scenes: Clopper-Pearson; of plain pictures, two of each scene, by bets. Scenes are of the objects that are named: "
+    "Robust: the plain picture of a held-out scene is right, and the search finds no "
+    "wrong one. 95 % intervals over "
+    "scenes: Clopper-Pearson; of plain pictures, two of each scene, by bets. Scenes "
+    "are of the objects that are named: "
     "intervals and p say nothing of other objects."
 )
 TRAINED = (
-    "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on scenes in "
+    "Round 0 is the model as it was. Weights are part of the way from those to the "
+    "trained ones. Judged on scenes in "
     "the training's environments on which it was not trained."
 )
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
@@ -230,11 +295,16 @@ SPLIT: Mapping[str, views.Column] = {
 
 
 def shown(result: HardenResult) -> ShownResult:
-    """Return how robust the model was and is, what it was trained on, and what never was."""
+    """Return how robust the model was and is, what it was trained on, and what never
+    was.
+    """
     shares: dict[str, tuple[Share | None, Share | None]] = {}
     for row in result.table:
         shares[f"robust to {row.control}"] = row.before, row.after
-        shares[f"robust to {row.control}, stronger search"] = row.stronger_before, row.stronger
+        shares[f"robust to {row.control}, stronger search"] = (
+            row.stronger_before,
+            row.stronger,
+        )
     if len(result.table) > 1:
         shares["robust to each"] = result.before, result.after
     if result.clean_after is not None:
@@ -242,10 +312,15 @@ def shown(result: HardenResult) -> ShownResult:
 
     def draw(axes: Any) -> None:
         bars = {
-            name: [None if share is None else (share.accuracy, share.interval) for share in both]
+            name: [
+                None if share is None else (share.accuracy, share.interval)
+                for share in both
+            ]
             for name, both in shares.items()
         }
-        figures.draw_shares(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
+        figures.draw_shares(
+            axes, bars, ("before", "after"), (figures.RED, figures.BLUE)
+        )
         axes.set(xlabel="share that is right, with 95 % interval")
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
         axes.figure.legend(loc="outside lower center", ncols=2)
@@ -253,7 +328,9 @@ def shown(result: HardenResult) -> ShownResult:
     measured = []
     for name, both in shares.items():
         cells = [
-            (wording.percent(share.accuracy), wording.interval_text(share.interval)) if share else ("", "")
+            (wording.percent(share.accuracy), wording.interval_text(share.interval))
+            if share
+            else ("", "")
             for share in both
         ]
         measured.append([name, *cells[0], *cells[1]])
@@ -265,36 +342,84 @@ def shown(result: HardenResult) -> ShownResult:
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
-    before, after, clean, left = result.before, result.after, result.clean_before, result.clean_after
+    before = result.before
+    after = result.after
+    clean = result.clean_before
+    left = result.clean_after
     said = "Stopped before the hardened model was measured."
-    if before is not None and after is not None and clean is not None and left is not None:
+    if (
+        before is not None
+        and after is not None
+        and clean is not None
+        and left is not None
+    ):
         said = (
-            f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
-            f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
+            f"Of {after.count} held-out scenes the searches leave {after.right} right, "
+            f"before {before.right}; "
+            f"of {left.count} plain pictures {left.right} are right, before "
+            f"{clean.right}."
         )
         for when, share in (("Now", left), ("Before", clean)):
             others = wording.outcomes_text(share.outcomes, result.task)
             said += f" {when}, the other plain pictures are {others}." if others else ""
         if result.lost is not None:
-            said += f" Scene by scene: {result.gained} got better, {result.lost} worse (p = {result.p:.2g}, "
+            said += (
+                f" Scene by scene: {result.gained} got better, {result.lost} "
+                "worse "
+                f"(p = {result.p:.2g}, "
+            )
             said += "for scenes of these objects; of other objects it says nothing)."
-    chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
+    chart: dict[str, Any] = (
+        {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
+    )
     sections = [
-        ResultPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),
-        ResultPart.table(enumerate(result.rounds), ROUNDS, title="The training", note=TRAINED, only="page"),
-        ResultPart.table(result.split.items(), SPLIT, title="What it was trained and measured on", only="page"),
+        ResultPart(
+            "Before and after",
+            heads=HEADS,
+            rows=measured,
+            note=ROBUST,
+            height=110 + 44 * len(shares),
+            **chart,
+        ),
+        ResultPart.table(
+            enumerate(result.rounds),
+            ROUNDS,
+            title="The training",
+            note=TRAINED,
+            only="page",
+        ),
+        ResultPart.table(
+            result.split.items(),
+            SPLIT,
+            title="What it was trained and measured on",
+            only="page",
+        ),
     ]
-    return ShownResult(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
+    return ShownResult(
+        said,
+        sections,
+        facts,
+        about=[",".join(result.objects), ", ".join(result.controls)],
+    )
 
 
 def claims(result: HardenResult) -> Iterator[views.Claim]:
     """Yield the shares of held-out scenes without a failure."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:
-            extent = {"what": "held-out scenes", "count": share.right, "of": share.count, "interval": share.interval}
+            extent = {
+                "what": "held-out scenes",
+                "count": share.right,
+                "of": share.count,
+                "interval": share.interval,
+            }
             text = (
-                f"{when}, the searches ({result.search}) found no failure in {share.right} of {share.count} "
-                f"({wording.percent(share.accuracy)}, 95 % interval {wording.interval_text(share.interval)}) held-out "
+                f"{when}, the searches ({result.search}) found no failure in "
+                f"{share.right} of {share.count} "
+                f"({wording.percent(share.accuracy)}, 95 % interval "
+                f"{wording.interval_text(share.interval)}) held-out "
                 "scenes. This does not show that there is none."
             )
-            yield views.Claim.of({"kind": "measured", "statement": text, "extent": extent})
+            yield views.Claim.of(
+                {"kind": "measured", "statement": text, "extent": extent}
+            )

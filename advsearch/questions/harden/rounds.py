@@ -1,5 +1,7 @@
-"""The rounds of a hardening: scenes are drawn, a copy of the model is trained on all of them, and that part of the way
-to its weights is kept which is best on scenes that it was not trained on."""
+"""The rounds of a hardening: scenes are drawn, a copy of the model is trained on all of
+them, and that part of the way to its weights is kept which is best on scenes that it
+was not trained on.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-import torch._dynamo  # by optimisers, too: before there are scenes, whose changes make Python collect what is new
+
+# by optimisers, too: before there are scenes, whose changes make Python collect what is
+# new
+import torch._dynamo
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 
@@ -31,27 +36,36 @@ PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Of the way from the weights that were given to the trained ones, which are judged."""
 
 MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
-Take = Callable[[Sequence[Any], np.random.Generator], None]  # leaves the gradient of a batch with the parameters
+# leaves the gradient of a batch with the parameters
+Take = Callable[[Sequence[Any], np.random.Generator], None]
 
 
 class Score(NamedTuple):
-    """How a model does on scenes that it was not trained on: its share of plain pictures, and of the worst ones."""
+    """How a model does on scenes that it was not trained on: its share of plain
+    pictures, and of the worst ones.
+    """
 
     clean: float
     robust: float
 
 
 class Course(ABC):
-    """How models of one kind are trained, on items of which each has one picture of a scene or more.
+    """How models of one kind are trained, on items of which each has one picture of a
+    scene or more.
 
     Attributes:
-        work, student: what draws from scenes, with the model as it was given; the copy that is trained.
-        optimiser: makes one of the parameters, whose own learning rate counts; None for AdamW.
+        work, student: what draws from scenes, with the model as it was given; the copy
+            that is trained.
+        optimiser: makes one of the parameters, whose own learning rate counts; None for
+            AdamW.
         own: items that are trained on beside those that are drawn.
         further: scenes that are drawn on top of each one of the training.
-        views: that are drawn of a scene of the training, and of one by which weights are chosen.
-        batch, warm_up: items of a step; share of the steps in which the learning rate rises.
-        average: weight of the past in the average of the weights, per step, which a round ends with.
+        views: that are drawn of a scene of the training, and of one by which weights
+            are chosen.
+        batch, warm_up: items of a step; share of the steps in which the learning rate
+            rises.
+        average: weight of the past in the average of the weights, per step, which a
+            round ends with.
     """
 
     batch: ClassVar[int]
@@ -61,9 +75,17 @@ class Course(ABC):
     views: tuple[int, int]
 
     def __init__(
-        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None, own: Sequence[Any] = ()
+        self,
+        work: SceneWork,
+        student: Trainable,
+        optimiser: MakeOptimiser | None = None,
+        own: Sequence[Any] = (),
     ) -> None:
-        self.work, self.config, self.student, self.optimiser, self.own = work, work.config, student, optimiser, own
+        self.work = work
+        self.config = work.config
+        self.student = student
+        self.optimiser = optimiser
+        self.own = own
 
     @property
     def further(self) -> int:
@@ -71,7 +93,9 @@ class Course(ABC):
 
     @abstractmethod
     def draw(self, title: str, split: str, places: range) -> list[Any]:
-        """Return items of the scenes with these numbers of a split; `title` is what the progress says."""
+        """Return items of the scenes with these numbers of a split; `title` is what the
+        progress says.
+        """
 
     @abstractmethod
     def looks(self, item: Any) -> int:
@@ -79,11 +103,15 @@ class Course(ABC):
 
     @abstractmethod
     def gradients(self, new: Sequence[Any]) -> AbstractContextManager[Take]:
-        """Begin a round in which these are new; inside there is what takes gradients."""
+        """Begin a round in which these are new; inside there is what takes
+        gradients.
+        """
 
     @abstractmethod
     def score(self, held_back: Sequence[Any]) -> Score:
-        """Judge the student on items that it was not trained on, which stay as they are."""
+        """Judge the student on items that it was not trained on, which stay as they
+        are.
+        """
 
     @abstractmethod
     def save(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
@@ -93,25 +121,38 @@ class Course(ABC):
         return self.config.epochs * -(-sum(map(self.looks, pool)) // self.batch)
 
     def round(
-        self, number: int, pool: Sequence[Any], new: Sequence[Any] = (), tick: Callable[[], None] = lambda: None
+        self,
+        number: int,
+        pool: Sequence[Any],
+        new: Sequence[Any] = (),
+        tick: Callable[[], None] = lambda: None,
     ) -> None:
         """Train on items in an order that the number of the round decides."""
-        parameters, rate = self.student.parameters(), self.config.rate
-        make = self.optimiser or partial(torch.optim.AdamW, lr=rate, weight_decay=self.weight_decay)
+        parameters = self.student.parameters()
+        rate = self.config.rate
+        make = self.optimiser or partial(
+            torch.optim.AdamW, lr=rate, weight_decay=self.weight_decay
+        )
         optimiser = make(parameters)
         n_rates = self.steps(pool) + 1
         rates = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, [float(group["lr"]) for group in optimiser.param_groups], total_steps=n_rates,
             pct_start=warm_up_fraction(self.warm_up, n_rates), cycle_momentum=False,
         )  # fmt: skip
-        average, done = [parameter.detach().clone() for parameter in parameters], 0
+        average = [parameter.detach().clone() for parameter in parameters]
+        done = 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
-        places = [place for place, item in enumerate(pool) for _ in range(self.looks(item))]
+        places = [
+            place for place, item in enumerate(pool) for _ in range(self.looks(item))
+        ]
         with self.gradients(new) as take:
             for _ in range(self.config.epochs):
                 order = rng.permutation(places)
                 for begin in range(0, len(order), self.batch):
-                    take([pool[place] for place in order[begin : begin + self.batch]], rng)
+                    take(
+                        [pool[place] for place in order[begin : begin + self.batch]],
+                        rng,
+                    )
                     nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
                     optimiser.step()
                     rates.step()
@@ -126,7 +167,8 @@ class Course(ABC):
 
 
 def warm_up_fraction(fraction: float, n_rates: int) -> float:
-    """Return the fraction of the steps in which the rate rises, or a little more where that is a single step.
+    """Return the fraction of the steps in which the rate rises, or a little more where
+    that is a single step.
 
     OneCycleLR divides by the steps of its rise but one.
     """
@@ -134,33 +176,55 @@ def warm_up_fraction(fraction: float, n_rates: int) -> float:
 
 
 class Rounds:
-    """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
+    """The rounds of a run; `done` is what each came to, of which the first is the model
+    as it was.
+    """
 
     def __init__(self, run: RunDirectory, course: Course) -> None:
-        self.run, self.course, self.config = run, course, course.config
+        self.run = run
+        self.course = course
+        self.config = course.config
         self.progress = course.work.progress
-        self.done = [TrainingRound.of(noted) for noted in json.loads(run.store.note(ROUNDS) or "[]")]
+        self.done = [
+            TrainingRound.of(noted)
+            for noted in json.loads(run.store.note(ROUNDS) or "[]")
+        ]
 
     @property
     def judged(self) -> int:
-        """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""
+        """Scenes by which weights are chosen, for each control: a third as many as a
+        round adds, up to `JUDGED`.
+        """
         return min(-(-self.config.scenes // 3), JUDGED)
 
     @property
     def best(self) -> int:
-        """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
-        allowed = [number for number, done in enumerate(self.done) if self._allowed(done.clean)]
-        return max(allowed, key=lambda number: (self.done[number].robust, number), default=0)
+        """The round whose weights are kept: the most robust one whose clean accuracy is
+        within what may be lost.
+        """
+        allowed = [
+            number for number, done in enumerate(self.done) if self._allowed(done.clean)
+        ]
+        return max(
+            allowed, key=lambda number: (self.done[number].robust, number), default=0
+        )
 
     def _allowed(self, clean: float) -> bool:
         return clean >= self.done[0].clean - self.config.clean_loss - 1e-9
 
     def carry_out(self) -> None:
-        """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
-        course, config, net = self.course, self.config, self.course.student.net
+        """Do what is left of the rounds; the student has the best weights afterwards,
+        which the run keeps.
+        """
+        course = self.course
+        config = self.config
+        net = self.course.student.net
         if len(self.done) <= config.rounds:
-            pool, begun = list(course.own), 0
-            held_back = course.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged))
+            pool = list(course.own)
+            begun = 0
+            held_back = course.draw(
+                "drawing scenes to choose weights by", VALIDATION, range(self.judged)
+            )
             if not self.done:
                 self.progress.stage("judging the model as it is")
                 self.keep(0, [], course.score(held_back), 0, 0.0)
@@ -174,8 +238,12 @@ class Rounds:
                 self.progress.stage(f"round {number}: training", course.steps(pool))
                 with workbench.all_for_torch():
                     # others are as hard as their training left them
-                    course.round(number, pool, pool[begun:], lambda: self.progress.advance(1))
-                    self.progress.stage(f"round {number}: choosing weights", len(PARTS), at_most=True)
+                    course.round(
+                        number, pool, pool[begun:], lambda: self.progress.advance(1)
+                    )
+                    self.progress.stage(
+                        f"round {number}: choosing weights", len(PARTS), at_most=True
+                    )
                     judged, part = self.mixed(held_back)
                 begun = len(pool)
                 self.keep(number, new, judged, len(pool), part)
@@ -183,13 +251,17 @@ class Rounds:
         self._save(WEIGHTS)
 
     def mixed(self, held_back: Sequence[Any]) -> tuple[Score, float]:
-        """Leave the student with the best part of the way from the weights that were given; return its score and it.
+        """Leave the student with the best part of the way from the weights that were
+        given; return its score and it.
 
-        The best one is right most often on the worst pictures among those that lose no more on plain ones than they
-        may; where all lose more, it is the one that loses least. Less of the way learned less: once that shows, the
-        smaller parts are not looked at, as each costs a search of its own.
+        The best one is right most often on the worst pictures among those that lose no
+        more on plain ones than they may; where all lose more, it is the one that loses
+        least. Less of the way learned less: once that shows, the smaller parts are not
+        looked at, as each costs a search of its own.
         """
-        net, given, scores = self.course.student.net, self._weights(0), dict[float, Score]()
+        net = self.course.student.net
+        given = self._weights(0)
+        scores = dict[float, Score]()
         learned = {name: weight.clone() for name, weight in net.state_dict().items()}
 
         def take(part: float) -> None:
@@ -201,25 +273,44 @@ class Rounds:
             take(part)
             scores[part] = self.course.score(held_back)
             self.progress.advance(1, worst=scores[part].robust)
-            allowed = {part: score.robust for part, score in scores.items() if self._allowed(score.clean)}
+            allowed = {
+                part: score.robust
+                for part, score in scores.items()
+                if self._allowed(score.clean)
+            }
             if allowed and [*allowed.values()][-1] < max(allowed.values()):
                 break
-        best = max(allowed or scores, key=lambda part: allowed[part] if allowed else scores[part].clean)
+        best = max(
+            allowed or scores,
+            key=lambda part: allowed[part] if allowed else scores[part].clean,
+        )
         take(best)
         return scores[best], best
 
-    def keep(self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float) -> None:
+    def keep(
+        self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float
+    ) -> None:
         """Keep the weights of a round, with its new pictures and what it came to."""
         self._save(ROUND.format(number))
         self.course.save(self.run, number, new)
-        self.done.append(TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False))
-        self.run.store.set_note(ROUNDS, json.dumps([done.model_dump() for done in self.done]))
+        self.done.append(
+            TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False)
+        )
+        self.run.store.set_note(
+            ROUNDS, json.dumps([done.model_dump() for done in self.done])
+        )
         clean, worst = map(wording.percent, judged)
-        self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
+        self.progress.message(
+            f"round {number}: {clean} of plain pictures right, {worst} of the worst"
+        )
 
     def _save(self, name: str) -> None:
-        state = self.course.student.net.state_dict()  # two names may be of one tensor, which safetensors refuses
-        kept = {key: weight.clone(memory_format=torch.contiguous_format) for key, weight in state.items()}
+        # two names may be of one tensor, which safetensors refuses
+        state = self.course.student.net.state_dict()
+        kept = {
+            key: weight.clone(memory_format=torch.contiguous_format)
+            for key, weight in state.items()
+        }
         self.run.write_file(name, safetensors.save(kept))
 
     def _weights(self, number: int) -> dict[str, Tensor]:

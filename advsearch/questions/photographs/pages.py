@@ -21,15 +21,18 @@ from advsearch.questions.photographs.result import (
     table_html,
 )
 
-KEY = "X-Advsearch-Key"  # the header with which this server's page sends a photograph; another page could not send it
+# the header with which this server's page sends a photograph; another page could not
+# send it
+KEY = "X-Advsearch-Key"
 
 
 class PhotographPages:
-    """The pages on which photographs of a run are taken (see `advsearch.viewer.server.PhotographServer`).
+    """The pages on which photographs of a run are taken (see
+    `advsearch.viewer.server.PhotographServer`).
 
     Args:
-        photographs: judges and keeps them; None for `Photographs`, which needs PyTorch, and is loaded when a page of
-            photographs is first opened.
+        photographs: judges and keeps them; None for `Photographs`, which needs PyTorch,
+            and is loaded when a page of photographs is first opened.
     """
 
     def __init__(self, photographs: Any = None) -> None:
@@ -39,38 +42,56 @@ class PhotographPages:
     def _photographs(self) -> Any:
         if self._given is not None:
             return self._given
-        from advsearch.questions.photographs.carry_out import Photographs  # takes seconds
+        # takes seconds
+        from advsearch.questions.photographs.carry_out import Photographs
 
         return Photographs()
 
     def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
         """Return the page of a run's photographs; arguments as for `align_page`."""
-        return align_page(name, rendering_names(run), self._photographs.agreement(run), key, elsewhere)
+        return align_page(
+            name, rendering_names(run), self._photographs.agreement(run), key, elsewhere
+        )
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
-        """Return the type and the data of a "rendering", or of a "photo" that was kept."""
+        """Return the type and the data of a "rendering", or of a "photo" that was
+        kept.
+        """
         with refused(HTTPStatus.NOT_FOUND):
-            file = rendering_file(run, name) if kind == "rendering" else photo_file(run, name)
+            file = (
+                rendering_file(run, name)
+                if kind == "rendering"
+                else photo_file(run, name)
+            )
         return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
 
     def take(
-        self, run: Path, name: str, headers: Message, key: str, read_data: Callable[[], bytes]
+        self,
+        run: Path,
+        name: str,
+        headers: Message,
+        key: str,
+        read_data: Callable[[], bytes],
     ) -> tuple[str, bytes]:
-        """Take a photograph of a rendering in, from this server's own page: another one has no origin, or not the key.
+        """Take a photograph of a rendering in, from this server's own page: another one
+        has no origin, or not the key.
 
-        `read_data` reads what was sent, once there is something to compare it with. It is refused where there is no
-        such rendering, or it is no photograph.
+        `read_data` reads what was sent, once there is something to compare it with. It
+        is refused where there is no such rendering, or it is no photograph.
         """
         sent = headers.get(KEY, "").encode("utf-8", "replace")
         if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
             raise markup.Refused(
-                HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew"
+                HTTPStatus.FORBIDDEN,
+                "a photograph is sent by the page that this server shows; open it anew",
             )
         with refused(HTTPStatus.NOT_FOUND):
             rendering_file(run, name)
         with refused(HTTPStatus.BAD_REQUEST):
             table = self._photographs.add(run, name, read_data())
-        return "application/json", json.dumps({"table": str(table_html(table))}).encode()
+        return "application/json", json.dumps(
+            {"table": str(table_html(table))}
+        ).encode()
 
 
 @contextmanager

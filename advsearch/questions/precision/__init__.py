@@ -14,7 +14,10 @@ from advsearch.questions.precision.result import PrecisionConfig, PrecisionResul
     view=shown,
 )
 def precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
-    """Measure error against run time of a scene and its gradients (docs/precision.md)."""
-    from advsearch.questions.precision.carry_out import measure_precision  # imports torch
+    """Measure error against run time of a scene and its gradients
+    (docs/precision.md).
+    """
+    # imports torch
+    from advsearch.questions.precision.carry_out import measure_precision
 
     return measure_precision(context)

@@ -12,7 +12,16 @@ from typing import Any, cast
 
 import torch
 
-from advsearch.extend import InputError, Problem, Progress, RunContext, gradients, results, seeds, workbench
+from advsearch.extend import (
+    InputError,
+    Problem,
+    Progress,
+    RunContext,
+    gradients,
+    results,
+    seeds,
+    workbench,
+)
 from advsearch.questions.precision.benches import (
     OIDN,
     GradientBench,
@@ -41,21 +50,26 @@ from advsearch.questions.precision.rule import (
     summarize_samples,
 )
 
-SHARES = {"image": 0.6, "gradient": 0.4}  # of the time, by quantity; what one doesn't use is the others'
+# of the time, by quantity; what one doesn't use is the others'
+SHARES = {"image": 0.6, "gradient": 0.4}
 REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference
-CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
-"""Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
-count, and at most."""
+CONFIRM_SHARE = 0.4
+CONFIRM_LEAST = 4
+CONFIRM_MOST = 64
+"""Of the time of a gradient's measurements, for measuring the recommended setting
+again; how often at least for that to count, and at most.
+"""
 
 
 def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
-    The image and the gradient of each control are measured one after the other, each in one sitting, so that their
-    times are comparable; what is done is stored at once, and a run that was stopped goes on with the next, in the
-    seconds that are left.
+    The image and the gradient of each control are measured one after the other, each in
+    one sitting, so that their times are comparable; what is done is stored at once, and
+    a run that was stopped goes on with the next, in the seconds that are left.
     """
-    config, start_time = context.config, time.perf_counter()
+    config = context.config
+    start_time = time.perf_counter()
     hint = f"then {config.seconds:g} seconds of measurements; `seconds` sets them"
     context.progress.stage(workbench.LOADING, hint=hint)
     run = context.run
@@ -79,7 +93,8 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
         def join(name: str) -> list[Any]:
             return [row for sitting in sittings for row in getattr(sitting, name)]
 
-        points, warnings = join("points"), join("warnings")
+        points = join("points")
+        warnings = join("warnings")
         slopes = []
         for line in group_by_line(points).values():
             slope = fit_line(line, job.or_steeper(line[0]))
@@ -97,15 +112,24 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
         )  # fmt: skip
 
     result = measurements.collect(measure_sittings(), make_result)
-    written = [run.write_file(f"images/precision.{suffix}", data) for suffix, data in precision_figures(result).items()]
+    written = [
+        run.write_file(f"images/precision.{suffix}", data)
+        for suffix, data in precision_figures(result).items()
+    ]
     return result.model_copy(update={"figures": [str(path) for path in written]})
 
 
 class Measurement:
-    """What can be measured, sitting by sitting: of each its name, its share of the time, and what measures it."""
+    """What can be measured, sitting by sitting: of each its name, its share of the
+    time, and what measures it.
+    """
 
-    def __init__(self, config: PrecisionConfig, problem: Problem, progress: Progress) -> None:
-        self._config, self._problem, self._progress = config, problem, progress
+    def __init__(
+        self, config: PrecisionConfig, problem: Problem, progress: Progress
+    ) -> None:
+        self._config = config
+        self._problem = problem
+        self._progress = progress
         self._seed = seeds.stream(config.seed, "precision")
         self._is_linear = config.loss == "linear"
         self._renderer = problem.renderer
@@ -113,30 +137,49 @@ class Measurement:
         if self._is_linear:
             self._renderer = problem.renderer.like(denoiser="none", transfer="linear")
             self._renderer.plan = self._renderer.plan.at_a_pixel()
-            self._loss = gradients.smooth_loss(self._renderer.formation.resolution, config.seed)
+            self._loss = gradients.smooth_loss(
+                self._renderer.formation.resolution, config.seed
+            )
 
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in config.measured_quantities:
             self.sittings.append(("image", SHARES["image"], self._measure_image))
         if "gradient" in config.measured_quantities:
-            parts = list_gradient_parts(self._renderer.plan.groups, linear=self._is_linear)
+            parts = list_gradient_parts(
+                self._renderer.plan.groups, linear=self._is_linear
+            )
             if not parts:
                 names = ",".join(config.controls)
-                raise InputError(f"`controls` {names}: has no derivative; leave gradient out of `quantities`")
+                raise InputError(
+                    f"`controls` {names}: has no derivative; leave "
+                    "gradient out of `quantities`"
+                )
             share = SHARES["gradient"] / len(parts)
             for part in parts:
-                self.sittings.append((f"gradient of {part.name}", share, partial(self._measure_gradient, part)))
+                self.sittings.append(
+                    (
+                        f"gradient of {part.name}",
+                        share,
+                        partial(self._measure_gradient, part),
+                    )
+                )
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
-        """Return the next number of samples that a setting takes. A line of the image is named after its sampler; one
-        of a gradient has that of the run."""
+        """Return the next number of samples that a setting takes. A line of the image
+        is named after its sampler; one of a gradient has that of the run.
+        """
         is_gradient = point.quantity == "gradient"
-        sampler = self._config.pixel_sampler if is_gradient else point.estimator.removesuffix(OIDN)
+        sampler = (
+            self._config.pixel_sampler
+            if is_gradient
+            else point.estimator.removesuffix(OIDN)
+        )
         return self._renderer.scene.next_count(samples, sampler)
 
     def or_steeper(self, point: PrecisionPoint) -> bool | None:
-        """Return whether the error of a line may fall faster than that of independent samples; None where theory says
-        nothing: differences have the bias of their step, the material form its limits, and the denoiser its own.
+        """Return whether the error of a line may fall faster than that of independent
+        samples; None where theory says nothing: differences have the bias of their
+        step, the material form its limits, and the denoiser its own.
 
         Stratification never makes the slope shallower, and often steeper (Owen 1997).
         """
@@ -152,45 +195,75 @@ class Measurement:
         def margin(image: torch.Tensor) -> float:
             return -problem.judge(image, u).score
 
-        bench = PictureBench(problem.renderer, u, margin, self._config.compared_samplers)
+        bench = PictureBench(
+            problem.renderer, u, margin, self._config.compared_samplers
+        )
         return self._measure_settings("the picture", bench, budget)
 
     def _measure_gradient(self, part: GradientPart, budget: TimeBudget) -> Sitting:
-        renderer, title, start_time = self._renderer, f"gradient of {part.name}", time.perf_counter()
-        bench = GradientBench(renderer, self._loss, gradients.interior_point(renderer), part)
+        renderer = self._renderer
+        title = f"gradient of {part.name}"
+        start_time = time.perf_counter()
+        bench = GradientBench(
+            renderer, self._loss, gradients.interior_point(renderer), part
+        )
         first_share = 1.0 - CONFIRM_SHARE * (1.0 - REFERENCE_SHARE)
         sitting = self._measure_settings(title, bench, budget.share(first_share))
         remark = None
-        chosen = recommend_settings(sitting.points, [], self._config.error, self.round_up, self.or_steeper)[0]
+        chosen = recommend_settings(
+            sitting.points, [], self._config.error, self.round_up, self.or_steeper
+        )[0]
         if budget.left > 0.0:
             remark = bench.bias(self._seed)
         again = self._confirm(title, bench, chosen, budget)
         warnings = [remark] if remark else []
         took = time.perf_counter() - start_time
-        return sitting.model_copy(update={"again": again, "warnings": warnings, "took": took})
+        return sitting.model_copy(
+            update={"again": again, "warnings": warnings, "took": took}
+        )
 
     def _confirm(
         self, title: str, bench: GradientBench, chosen: Recommended, budget: TimeBudget
     ) -> list[PrecisionPoint]:
-        """Measure the recommended setting of a gradient again; return its point, if it was measured often enough."""
+        """Measure the recommended setting of a gradient again; return its point, if it
+        was measured often enough.
+        """
         if chosen.estimator is None or chosen.spp is None:
             return []
-        known = next(setting for setting in bench.settings if setting.estimator == chosen.estimator)
-        setting = replace(known, spp=chosen.spp, cost=known.cost / known.spp * chosen.spp)
-        tick = self._begin_stage(f"{title}: {chosen.estimator} with {chosen.spp} samples again", budget)
+        known = next(
+            setting
+            for setting in bench.settings
+            if setting.estimator == chosen.estimator
+        )
+        setting = replace(
+            known, spp=chosen.spp, cost=known.cost / known.spp * chosen.spp
+        )
+        tick = self._begin_stage(
+            f"{title}: {chosen.estimator} with {chosen.spp} samples again", budget
+        )
         seed = seeds.stream(self._seed, "confirm")
         measured = measure_in_rounds(
-            [setting], bench.measure, budget, rounds=CONFIRM_MOST, seed=seed, on_done=lambda _: tick()
+            [setting],
+            bench.measure,
+            budget,
+            rounds=CONFIRM_MOST,
+            seed=seed,
+            on_done=lambda _: tick(),
         )
         samples = [numbers["gradient"] for numbers in measured.results[setting]]
         if len(samples) < CONFIRM_LEAST:
             return []
         return [summarize_samples(setting, samples, bench.floor(setting, "gradient"))]
 
-    def _measure_settings(self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget) -> Sitting:
+    def _measure_settings(
+        self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
+    ) -> Sitting:
         """Take a bench's references, and measure all of its settings in rounds."""
-        start_time, share = time.perf_counter(), budget.share(REFERENCE_SHARE)
-        references = bench.refer(share, self._seed, self._begin_stage(f"{title}: references", share))
+        start_time = time.perf_counter()
+        share = budget.share(REFERENCE_SHARE)
+        references = bench.refer(
+            share, self._seed, self._begin_stage(f"{title}: references", share)
+        )
         tick = self._begin_stage(f"{title}: measuring every setting in rounds", budget)
         measured = measure_in_rounds(
             bench.settings, bench.measure, budget, rounds=self._config.rounds, seed=self._seed,
@@ -201,17 +274,34 @@ class Measurement:
             for quantity in samples[0]:
                 numbers = [sample[quantity] for sample in samples]
                 points.append(
-                    summarize_samples(replace(setting, quantity=quantity), numbers, bench.floor(setting, quantity))
+                    summarize_samples(
+                        replace(setting, quantity=quantity),
+                        numbers,
+                        bench.floor(setting, quantity),
+                    )
                 )
         skipped_counts: dict[str, list[str]] = {}
         for setting in measured.left_out:
-            skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(str(setting.spp))
-        left_out = [f"{line}: {', '.join(counts)} samples" for line, counts in skipped_counts.items()]
-        return Sitting(points=points, references=references, left_out=left_out, took=time.perf_counter() - start_time)
+            skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(
+                str(setting.spp)
+            )
+        left_out = [
+            f"{line}: {', '.join(counts)} samples"
+            for line, counts in skipped_counts.items()
+        ]
+        return Sitting(
+            points=points,
+            references=references,
+            left_out=left_out,
+            took=time.perf_counter() - start_time,
+        )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
-        total, done = max(1, math.ceil(budget.left)), 0
-        self._progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
+        total = max(1, math.ceil(budget.left))
+        done = 0
+        self._progress.stage(
+            name, total, hint="counted in seconds; `seconds` sets them", at_most=True
+        )
 
         def tick(**info: float | str) -> None:
             nonlocal done
@@ -222,19 +312,26 @@ class Measurement:
         return tick
 
 
-def group_by_line(points: Sequence[PrecisionPoint]) -> dict[tuple[str, ...], list[PrecisionPoint]]:
+def group_by_line(
+    points: Sequence[PrecisionPoint],
+) -> dict[tuple[str, ...], list[PrecisionPoint]]:
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
-        lines.setdefault((point.quantity, point.control, point.family, point.estimator), []).append(point)
-    return {key: sorted(line, key=lambda point: point.spp) for key, line in lines.items()}
+        lines.setdefault(
+            (point.quantity, point.control, point.family, point.estimator), []
+        ).append(point)
+    return {
+        key: sorted(line, key=lambda point: point.spp) for key, line in lines.items()
+    }
 
 
 def recommend_settings(
     points: Sequence[PrecisionPoint], again: Sequence[PrecisionPoint], goal: float, round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:  # fmt: skip
-    """Return, for each thing that can be asked for, the setting that reaches a goal soonest, if any is known to; one
-    that was measured `again` by what that said."""
+    """Return, for each thing that can be asked for, the setting that reaches a goal
+    soonest, if any is known to; one that was measured `again` by what that said.
+    """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
     for key, line in group_by_line(points).items():
         candidate = recommend_count(line, goal, round_up, or_steeper(line[0]))
@@ -242,10 +339,15 @@ def recommend_settings(
     best = []
     for (quantity, control, family), reached in candidates.items():
         chosen = min(
-            reached, key=lambda row: row.seconds or 0.0, default=Recommended(quantity=quantity, control=control)
+            reached,
+            key=lambda row: row.seconds or 0.0,
+            default=Recommended(quantity=quantity, control=control),
         )
         for point in again:
-            if (point.control, point.estimator) == (chosen.control, chosen.estimator) and quantity == "gradient":
+            if (point.control, point.estimator) == (
+                chosen.control,
+                chosen.estimator,
+            ) and quantity == "gradient":
                 chosen = confirm_recommendation(chosen, point, round_up)
         best.append(chosen.model_copy(update={"family": family}))
     return best

@@ -28,7 +28,9 @@ SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler
 
 
 class PrecisionConfig(DerivativeConfig):
-    """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
+    """Everything that decides what `precision` does: error against run time, for a
+    scene, its controls and a model.
+    """
 
     # fmt: off
     command: ClassVar[str] = "precision"
@@ -44,14 +46,16 @@ class PrecisionConfig(DerivativeConfig):
         "image,gradient", "search", "what is measured, separated by commas", ", ".join(QUANTITIES)
     )
     seconds: float = setting(120.0, "search", "time that all measurements may take", unit="seconds", gt=0.0, le=1e9)
-    error: float = setting(0.05, "search", "relative error that the recommended settings should have", gt=0.0, le=1.0)
+    error: float = setting(0.05, "search", "relative error that the recommended "
+                                           "settings should have", gt=0.0, le=1.0)
     rounds: int = setting(8, "search", "measurements of every setting, at most", ge=3, le=1000)
     samplers: str = setting(
         ",".join(SAMPLERS), "search", "samplers that are compared, separated by commas", ", ".join(SAMPLERS)
     )
     loss: Literal["linear", "model"] = setting(
         "linear", "search",
-        "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
+        "whose gradient is measured: a smooth linear loss of the raw picture, or the "
+        "model's in its image formation",
     )
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
     # fmt: on
@@ -59,12 +63,18 @@ class PrecisionConfig(DerivativeConfig):
     @field_validator("quantities", "samplers", mode="before")
     @classmethod
     def _names_from_list(cls, value: Any) -> Any:
-        return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
+        return (
+            ",".join(str(part) for part in value)
+            if isinstance(value, (list, tuple))
+            else value
+        )
 
     @field_validator("quantities", "samplers")
     @classmethod
     def _several(cls, value: str, info: Any) -> str:
-        """Refuse lists with nothing in them, with something twice, and with names that are not known."""
+        """Refuse lists with nothing in them, with something twice, and with names that
+        are not known.
+        """
         names = settings.split_names(value)
         known = QUANTITIES if info.field_name == "quantities" else SAMPLERS
         if not "".join(names).strip() or not set(names) <= set(known):
@@ -90,14 +100,22 @@ class PrecisionPoint(results.Measured):
 
     family: str = Field(
         default="",
-        description="what it is recommended among: `raw`, `oidn`, `depth` or `predicted`; absent of gradients",
+        description="what it is recommended among: `raw`, `oidn`, `depth` or "
+        "`predicted`; absent of gradients",
     )
-    heavy_tailed: bool = Field(default=False, description="a few pixels hold the error, so that it has no interval")
-    wall_seconds: results.JsonFloat | None = results.optional("by the clock; `seconds` are processor time")
+    heavy_tailed: bool = Field(
+        default=False,
+        description="a few pixels hold the error, so that it has no interval",
+    )
+    wall_seconds: results.JsonFloat | None = results.optional(
+        "by the clock; `seconds` are processor time"
+    )
 
     @property
     def known(self) -> bool:
-        """Whether the error is well above the reference's own; else it is an upper limit."""
+        """Whether the error is well above the reference's own; else it is an upper
+        limit.
+        """
         return self.status == "ok"
 
     @property
@@ -107,7 +125,9 @@ class PrecisionPoint(results.Measured):
 
 
 class PrecisionSlope(results.Fields):
-    """A line through the points of one estimator: logarithm of the error against that of the samples."""
+    """A line through the points of one estimator: logarithm of the error against that
+    of the samples.
+    """
 
     quantity: str
     control: str
@@ -139,20 +159,28 @@ class Recommended(results.Fields):
     control: str
     family: str = ""
     goal: float | None = None
-    estimator: str | None = results.optional("null where nothing that was measured reaches it")
+    estimator: str | None = results.optional(
+        "null where nothing that was measured reaches it"
+    )
     spp: int | None = None
     seconds: results.JsonFloat | None = None
     error: results.JsonFloat | None = None
-    basis: str | None = results.optional("measured, fitted, interpolated, extrapolated or confirmed")
+    basis: str | None = results.optional(
+        "measured, fitted, interpolated, extrapolated or confirmed"
+    )
     repeats: int | None = results.optional("measurements that confirm it")
 
 
 class Sitting(results.Fields):
-    """What was measured in one sitting: of the picture and the margin, or of the gradient of a control."""
+    """What was measured in one sitting: of the picture and the margin, or of the
+    gradient of a control.
+    """
 
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])
-    again: list[PrecisionPoint] = Field(default=[], description="recommended settings, measured anew")
+    again: list[PrecisionPoint] = Field(
+        default=[], description="recommended settings, measured anew"
+    )
     warnings: list[str] = Field(default=[])
     left_out: list[str] = Field(default=[])
     took: float = Field(default=0.0, description="seconds by the clock")
@@ -189,13 +217,18 @@ class PrecisionResult(RunResult):
 
 
 WARM_UP = 3
-"""Calls of a setting whose times don't count where there are more: the first compiles and records kernels, the second
-may record them again, and so may the first one after other scenes were rendered."""
+"""Calls of a setting whose times don't count where there are more: the first compiles
+and records kernels, the second may record them again, and so may the first one after
+other scenes were rendered.
+"""
 FAMILIES = {"none": " without denoiser", "oidn": " with denoiser"}
 READING = (
-    "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
-    "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the right "
-    "prediction leads the wrong one, in logits; a cosine of 1 means that a gradient points the right way."
+    "Each row is a setting: its error beside a reference of far more samples, with the "
+    "95 % interval of that "
+    "error, and the processor time, in seconds, that one picture or gradient takes. A "
+    "margin is how far the right "
+    "prediction leads the wrong one, in logits; a cosine of 1 means that a gradient "
+    "points the right way."
 )
 
 
@@ -208,11 +241,17 @@ SLOPES: Mapping[str, views.Column] = {
     "estimator": "{0.estimator}",
     "slope": "{0.slope:.2f}",
     "95 %": "{0.interval[0]:.2f} to {0.interval[1]:.2f}",
-    "theory": lambda slope: "" if slope.theory is None else f"{slope.theory:.3g}" + " or steeper" * slope.or_steeper,
+    "theory": lambda slope: (
+        ""
+        if slope.theory is None
+        else f"{slope.theory:.3g}" + " or steeper" * slope.or_steeper
+    ),
     "points": "{0.points}",
-    "": lambda slope: {True: "agrees", False: "DISAGREES", None: "" if slope.theory is None else "can't be told"}[
-        slope.agrees
-    ],
+    "": lambda slope: {
+        True: "agrees",
+        False: "DISAGREES",
+        None: "" if slope.theory is None else "can't be told",
+    }[slope.agrees],
 }
 REFERENCES: Mapping[str, views.Column] = {
     "what": lambda reference: reference.control or reference.quantity,
@@ -225,18 +264,36 @@ REFERENCES: Mapping[str, views.Column] = {
 
 def shown(result: PrecisionResult) -> ShownResult:
     machine = result.machine
-    threads = " and ".join(f"{count} of {name}" for name, count in machine.threads.items())
+    threads = " and ".join(
+        f"{count} of {name}" for name, count in machine.threads.items()
+    )
     stopped = "It was stopped: only a part was measured. " if result.goes_on else ""
     return ShownResult(
         stopped + make_headline(result),
         [
             ResultPart(
-                "Recommended", [describe_recommendation(found, result.goal) for found in result.recommendations]
+                "Recommended",
+                [
+                    describe_recommendation(found, result.goal)
+                    for found in result.recommendations
+                ],
             ),
             ResultPart(text=[READING], only="text"),
-            *(_make_error_table(quantity, result.points) for quantity in ("picture", "margin", "gradient")),
-            ResultPart.table(result.slopes, SLOPES, title="Slopes: logarithm of the error against that of samples"),
-            ResultPart.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
+            *(
+                _make_error_table(quantity, result.points)
+                for quantity in ("picture", "margin", "gradient")
+            ),
+            ResultPart.table(
+                result.slopes,
+                SLOPES,
+                title="Slopes: logarithm of the error against that of samples",
+            ),
+            ResultPart.table(
+                result.references,
+                REFERENCES,
+                title="References, with their own errors",
+                note=READING,
+            ),
             ResultPart("Not measured, the time was up", result.left_out),
         ],
         {
@@ -251,7 +308,10 @@ def shown(result: PrecisionResult) -> ShownResult:
 def make_headline(result: PrecisionResult) -> str:
     found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
-        return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."
+        return (
+            "Nothing that was measured is known to reach the error: give it more "
+            "`seconds` or a larger `error`."
+        )
     quantity = describe_quantity(found.quantity, found.control)
     return (
         f"For {100 * result.goal:.3g} % error of {quantity}: {found.spp} samples "
@@ -261,27 +321,42 @@ def make_headline(result: PrecisionResult) -> str:
 
 def describe_recommendation(found: Recommended, goal: float) -> str:
     quantity = describe_quantity(found.quantity, found.control)
-    goal_text = f"{100 * goal:.3g} % error of {quantity}{FAMILIES.get(found.family, '')}"
+    goal_text = (
+        f"{100 * goal:.3g} % error of {quantity}{FAMILIES.get(found.family, '')}"
+    )
     if found.estimator is None:
-        return f"{goal_text}: not reached by anything that was measured; give it more `seconds` or a larger `error`"
+        return (
+            f"{goal_text}: not reached by anything that was measured; give it more "
+            "`seconds` or a larger `error`"
+        )
     basis = "" if found.basis in ("interpolated", "fitted") else f" ({found.basis})"
-    return f"{goal_text}: {found.estimator}, {found.spp} samples, {found.seconds:.2g} s{basis}"
+    return (
+        f"{goal_text}: {found.estimator}, {found.spp} samples, {found.seconds:.2g} "
+        f"s{basis}"
+    )
 
 
 def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
-    """Return what has to be known of points: errors of few pixels, and a machine that most of the time, by the clock,
-    took over twice the processor time."""
+    """Return what has to be known of points: errors of few pixels, and a machine that
+    most of the time, by the clock, took over twice the processor time.
+    """
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
-    waited = [point.wall_seconds > 2.0 * point.seconds for point in points if point.wall_seconds is not None]
+    waited = [
+        point.wall_seconds > 2.0 * point.seconds
+        for point in points
+        if point.wall_seconds is not None
+    ]
     warnings = []
     if heavy:
         warnings.append(
-            f"{', '.join(heavy)}: a few pixels hold most of the error (fireflies), so that repeats say too little and "
+            f"{', '.join(heavy)}: a few pixels hold most of the error (fireflies), so "
+            "that repeats say too little and "
             "it has no interval; a denoiser or more `rounds` help"
         )
     if 2 * sum(waited) > len(waited):
         warnings.append(
-            "the machine was busy with something else: by the clock, most pictures and gradients took over twice their "
+            "the machine was busy with something else: by the clock, most pictures and "
+            "gradients took over twice their "
             "processor time; measure again when it is quiet"
         )
     return warnings
@@ -289,21 +364,33 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     rows = [point for point in points if point.quantity == quantity]
-    columns: dict[str, views.Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
+    columns: dict[str, views.Column] = (
+        {"control": "{0.control}"} if quantity == "gradient" else {}
+    )
     columns |= {
         "estimator": "{0.estimator}",
         "samples": "{0.spp}",
         "error": lambda point: f"{'' if point.known else '< '}{100 * point.rms:.3g} %",
-        "95 %": lambda point: "heavy tails" if point.heavy_tailed else _format_interval(point.interval),
+        "95 %": lambda point: (
+            "heavy tails" if point.heavy_tailed else _format_interval(point.interval)
+        ),
     }
     if quantity == "gradient":
-        columns["cosine"] = lambda point: f"{math.nan if point.cosine is None else point.cosine:.3f}"
+        columns["cosine"] = lambda point: (
+            f"{math.nan if point.cosine is None else point.cosine:.3f}"
+        )
     columns["seconds"] = "{0.seconds:.3g}"
-    return ResultPart.table(rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize())
+    return ResultPart.table(
+        rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize()
+    )
 
 
 def _format_interval(interval: results.Interval | None) -> str:
-    return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
+    return (
+        ""
+        if interval is None
+        else (f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}")
+    )
 
 
 GREY = figures.GREY
@@ -316,10 +403,11 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def precision_figures(result: PrecisionResult) -> figures.Figures:
-    """Return work-precision diagrams as files: error against seconds, both logarithmic; none where nothing is known.
+    """Return work-precision diagrams as files: error against seconds, both logarithmic;
+    none where nothing is known.
 
-    Filled markers are known errors; open ones with an arrow are limits: the reference is no better than that. The
-    dashed line falls as independent samples do.
+    Filled markers are known errors; open ones with an arrow are limits: the reference
+    is no better than that. The dashed line falls as independent samples do.
     """
     panels: dict[str, list[PrecisionPoint]] = {}
     for point in result.points:
@@ -330,17 +418,30 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
         return {}
     wide = min(2, len(panels))
     tall = math.ceil(len(panels) / wide)
-    machine, points, (height, width) = result.machine, result.points, result.image_formation.resolution
-    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())
+    machine = result.machine
+    points = result.points
+    (height, width) = result.image_formation.resolution
+    threads = ", ".join(
+        f"{count} {name} thread" + "s" * (count != 1)
+        for name, count in machine.threads.items()
+    )
     most = max(point.repeats for point in points)
     seconds = f"of the last of {most} repeats at most"
     if most > WARM_UP + 1:
         seconds = f"medians of at most {most - WARM_UP} interleaved repeats"
-    key = "Filled: known" + (", with its 95 % interval." if any(point.interval for point in points) else ".")
+    key = "Filled: known" + (
+        ", with its 95 % interval." if any(point.interval for point in points) else "."
+    )
     if not all(point.known for point in points):
         key += " Open, with an arrow: at most this, the reference is no better."
-    below = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are {seconds}.\n{key}"
-    what = f"{result.object} in {result.environment}, {result.model}, {width} x {height} pixels"
+    below = (
+        f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
+        f"{seconds}.\n{key}"
+    )
+    what = (
+        f"{result.object} in {result.environment}, {result.model}, {width} x "
+        f"{height} pixels"
+    )
 
     def draw(figure: Any) -> None:
         for number, (title, shown) in enumerate(panels.items(), start=1):
@@ -353,59 +454,144 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
     return figures.drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
 
 
-def _draw_errors(axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult) -> None:
-    slopes = {(slope.quantity, slope.control, slope.estimator): slope for slope in result.slopes}
+def _draw_errors(
+    axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult
+) -> None:
+    slopes = {
+        (slope.quantity, slope.control, slope.estimator): slope
+        for slope in result.slopes
+    }
     for number, name in enumerate(dict.fromkeys(point.estimator for point in points)):
-        line = sorted((point for point in points if point.estimator == name), key=lambda point: point.spp)
-        label, slope = name, slopes.get((line[0].quantity, line[0].control, name))
+        line = sorted(
+            (point for point in points if point.estimator == name),
+            key=lambda point: point.spp,
+        )
+        label = name
+        slope = slopes.get((line[0].quantity, line[0].control, name))
         if slope is not None:  # and theory where that disagrees
             doubt = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
             label = f"{name}  {slope.slope:.2f}{doubt}".replace(" -", f" {MINUS}")
         _draw_line(axes, line, number, label)
-    axes.set(xscale="log", yscale="log", xlabel="seconds of processor time", ylabel="relative error, %")
-    low, high = min(point.seconds for point in points), max(point.seconds for point in points)
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="seconds of processor time",
+        ylabel="relative error, %",
+    )
+    low = min(point.seconds for point in points)
+    high = max(point.seconds for point in points)
     if high >= 1.5 * low:  # theory: a dashed line of slope -1/2 under the points
-        at = PERCENT * min(point.rms * math.sqrt(point.seconds) for point in points) * 0.8
+        at = (
+            PERCENT
+            * min(point.rms * math.sqrt(point.seconds) for point in points)
+            * 0.8
+        )
         middle = math.sqrt(low * high)
-        axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color=GREY, linewidth=1.0, linestyle="--")
-        axes.annotate(f"{MINUS}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color=GREY, ha="right", va="top")
+        axes.plot(
+            [low, high],
+            [at / math.sqrt(low), at / math.sqrt(high)],
+            color=GREY,
+            linewidth=1.0,
+            linestyle="--",
+        )
+        axes.annotate(
+            f"{MINUS}1/2",
+            (middle, at / math.sqrt(middle)),
+            fontsize=8,
+            color=GREY,
+            ha="right",
+            va="top",
+        )
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
-    goal, (low, high) = result.goal * PERCENT, axes.get_ylim()
+    goal = result.goal * PERCENT
+    (low, high) = axes.get_ylim()
     if low < goal < high:
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
         where = ("axes fraction", "data")
-        axes.annotate(f"{goal:g} %", (1.0, goal), xycoords=where, ha="right", va="bottom", fontsize=8)
+        axes.annotate(
+            f"{goal:g} %",
+            (1.0, goal),
+            xycoords=where,
+            ha="right",
+            va="bottom",
+            fontsize=8,
+        )
     axes.grid(True, which="major")
-    place: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2, "handlelength": 1.6}
-    place |= {"title": "slope against samples", "title_fontsize": 8, "alignment": "left"}
+    place: dict[str, Any] = {
+        "bbox_to_anchor": (1.0, 1.0),
+        "borderaxespad": 0.2,
+        "handlelength": 1.6,
+    }
+    place |= {
+        "title": "slope against samples",
+        "title_fontsize": 8,
+        "alignment": "left",
+    }
     axes.legend(loc="upper left", **place)
 
 
-def _draw_line(axes: Any, line: Sequence[PrecisionPoint], number: int, label: str) -> None:
-    color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
-    axes.plot([p.seconds for p in line], [PERCENT * p.rms for p in line], color=color, linewidth=1.0, alpha=0.55)
+def _draw_line(
+    axes: Any, line: Sequence[PrecisionPoint], number: int, label: str
+) -> None:
+    color = COLORS[number % len(COLORS)]
+    marker = MARKERS[number % len(MARKERS)]
+    axes.plot(
+        [p.seconds for p in line],
+        [PERCENT * p.rms for p in line],
+        color=color,
+        linewidth=1.0,
+        alpha=0.55,
+    )
     for point in line:
-        x, y = point.seconds, PERCENT * point.rms
+        x = point.seconds
+        y = PERCENT * point.rms
         low, high = (PERCENT * end for end in point.interval or (math.nan, math.nan))
         if high < 4.0 * y:
             axes.plot([x, x], [low, high], color=color, linewidth=0.8, alpha=0.6)
-        axes.plot([x], [y], marker=marker, markersize=5, color=color, markerfacecolor=color if point.known else "white")
+        axes.plot(
+            [x],
+            [y],
+            marker=marker,
+            markersize=5,
+            color=color,
+            markerfacecolor=color if point.known else "white",
+        )
         if not point.known:
-            arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 0.8, "shrinkA": 3}
+            arrow = {
+                "arrowstyle": "-|>",
+                "color": color,
+                "linewidth": 0.8,
+                "shrinkA": 3,
+            }
             axes.annotate("", (x, y * 0.72), (x, y), arrowprops=arrow)
-    axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
+    axes.plot(
+        [], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label
+    )
 
 
 def _plain_axis(axis: Any) -> None:
-    """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # takes long to import
+    """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as
+    plain numbers.
+    """
+    # takes long to import
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
     low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     finest = [1.0 + 0.2 * k for k in range(45)]
-    for factors in ([1.0], [1.0, 2.0, 5.0], [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0], finest):
-        ticks = [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]
+    for factors in (
+        [1.0],
+        [1.0, 2.0, 5.0],
+        [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0],
+        finest,
+    ):
+        ticks = [
+            factor * 10.0**power
+            for power in powers
+            for factor in factors
+            if low <= factor * 10.0**power <= high
+        ]
         if len(ticks) >= 3:
             break
     axis.set_major_locator(FixedLocator(ticks))

@@ -9,12 +9,15 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
 @experiment(
     "recipe list",
     "recipe backgrounds --quick",
-    'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
+    "recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 "
+    '--label "coffee mug,cup"',
     "show recipe backgrounds > mine.yaml",
     "recipe mine.yaml",
     positional_args=("recipe",),
     about="recipe",
-    positional=PositionalArgument("NAME", "a recipe, or list", "; list shows the recipes that there are"),
+    positional=PositionalArgument(
+        "NAME", "a recipe, or list", "; list shows the recipes that there are"
+    ),
     choices="advsearch.questions.recipe.description:titles",
     choice_description="advsearch.questions.recipe.description:describe",
     view=shown,

@@ -1,4 +1,6 @@
-"""The settings of `recipe`, and its result: what its runs were, its figures with their numbers, and what they say."""
+"""The settings of `recipe`, and its result: what its runs were, its figures with their
+numbers, and what they say.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,14 @@ Cell = str | int | float | None
 NAMED = "what the recipe names"
 
 
-SCENE_SETTINGS: Any = SceneConfig  # whose validators check the settings of the same names
+# whose validators check the settings of the same names
+SCENE_SETTINGS: Any = SceneConfig
 
 
 class RecipeConfig(Config):
-    """Everything that decides what `recipe` does: which recipe, and on what objects, environments and models."""
+    """Everything that decides what `recipe` does: which recipe, and on what objects,
+    environments and models.
+    """
 
     command: ClassVar[str] = "recipe"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
@@ -46,13 +51,15 @@ class RecipeConfig(Config):
     )
     quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
     photographs: str | None = setting(
-        None, "recipe", "photographs to compare with renderings, of each object in a folder of its name", "a folder",
+        None, "recipe", "photographs to compare with renderings, of each object in a "
+                        "folder of its name", "a folder",
         otherwise="those taken with advsearch dashboard",
     )
     object: str | None = setting_as_in(SweepConfig, "object", default=None, otherwise=NAMED)
     environment: str | None = setting_as_in(
         SceneConfig, "environment", otherwise=NAMED,
-        description="the environment map that lights the scene; several, separated by commas",
+        description="the environment map that lights the scene; several, separated by "
+                    "commas",
         expects="names of environments or .hdr or .exr files",
     )
     up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
@@ -60,7 +67,8 @@ class RecipeConfig(Config):
     size: float | None = setting_as_in(SceneConfig, "size")
     unit: Literal["mm", "cm", "m", "in"] | None = setting_as_in(SceneConfig, "unit")
     resolution: tuple[int, int] | None = setting_as_in(
-        SceneConfig, "resolution", otherwise="what the recipe says, or what the model takes"
+        SceneConfig, "resolution", otherwise="what the recipe says, or what the model "
+                                             "takes"
     )
     model: str | None = setting_as_in(
         SceneConfig, "model", default=None, otherwise=NAMED,
@@ -70,11 +78,13 @@ class RecipeConfig(Config):
     prompt: str | None = setting_as_in(SceneConfig, "prompt")
     value_range: tuple[float, float] | None = setting_as_in(SceneConfig, "value_range")
     task: str | dict[str, JsonValue] | None = setting_as_in(
-        SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
+        SceneConfig, "task", default=None, otherwise="what the recipe says, or "
+                                                     "classification"
     )
     label: dict[str, str] = setting(
         dict, "model",
-        "the right labels, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
+        "the right labels, separated by commas, for all objects or one "
+        "(OBJECT=LABELS); may be repeated",
         'names of classes, such as "coffee mug,cup" or mug="coffee mug,cup"',
         read_texts=settings.parse_choices, metavar="LABELS", otherwise="each object's own",
     )
@@ -86,14 +96,34 @@ class RecipeConfig(Config):
     # fmt: on
 
     _named = field_validator(
-        "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
+        "recipe",
+        "photographs",
+        "object",
+        "environment",
+        "model",
+        "labels",
+        "task",
+        "run",
+        mode="before",
     )(lambda value, info: SCENE_SETTINGS._as_text(value, info))
-    _prompts = field_validator("prompt", mode="before")(lambda value: SCENE_SETTINGS._prompts_as_text(value))
-    _range = field_validator("value_range", mode="before")(lambda value: SCENE_SETTINGS._range_from_text(value))
-    _range_in_order = field_validator("value_range")(lambda value: SCENE_SETTINGS._range_in_order(value))
-    _sized = field_validator("resolution", mode="before")(lambda value: SCENE_SETTINGS._resolution_from_text(value))
-    _sides_in_range = field_validator("resolution")(lambda value: SCENE_SETTINGS._sides_in_range(value))
-    _task = field_validator("task", mode="before")(lambda value: SCENE_SETTINGS._task_with_options(value))
+    _prompts = field_validator("prompt", mode="before")(
+        lambda value: SCENE_SETTINGS._prompts_as_text(value)
+    )
+    _range = field_validator("value_range", mode="before")(
+        lambda value: SCENE_SETTINGS._range_from_text(value)
+    )
+    _range_in_order = field_validator("value_range")(
+        lambda value: SCENE_SETTINGS._range_in_order(value)
+    )
+    _sized = field_validator("resolution", mode="before")(
+        lambda value: SCENE_SETTINGS._resolution_from_text(value)
+    )
+    _sides_in_range = field_validator("resolution")(
+        lambda value: SCENE_SETTINGS._sides_in_range(value)
+    )
+    _task = field_validator("task", mode="before")(
+        lambda value: SCENE_SETTINGS._task_with_options(value)
+    )
 
     @field_validator("photographs")
     @classmethod
@@ -104,25 +134,42 @@ class RecipeConfig(Config):
     @field_validator("label")
     @classmethod
     def _labels_with_names(cls, value: dict[str, str]) -> dict[str, str]:
-        if any(not text.strip(" ,\t\n") or "\0" in name + text for name, text in value.items()):
+        if any(
+            not text.strip(" ,\t\n") or "\0" in name + text
+            for name, text in value.items()
+        ):
             raise ValueError("an empty name")
         return value
 
     @property
     def title(self) -> tuple[str, ...]:
-        return (Path(self.recipe).stem, *(Path(name).stem for name in settings.split_names(self.object or "")[:1]))
+        return (
+            Path(self.recipe).stem,
+            *(Path(name).stem for name in settings.split_names(self.object or "")[:1]),
+        )
 
     @property
     def task_name(self) -> str | None:
         """The name of the task, or None where the recipe says it."""
-        return self.task if self.task is None or isinstance(self.task, str) else str(self.task["name"])
+        return (
+            self.task
+            if self.task is None or isinstance(self.task, str)
+            else str(self.task["name"])
+        )
 
     def label_of(self, name: str) -> str | None:
-        """Return what was said to be the right label for an object; None for its own."""
-        return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(settings.FOR_ALL)
+        """Return what was said to be the right label for an object; None for its
+        own.
+        """
+        return (
+            self.label.get(name)
+            or self.label.get(Path(name).stem)
+            or self.label.get(settings.FOR_ALL)
+        )
 
 
-SHARES = ("share", "low", "high")  # columns of a figure's numbers that are a share and the ends of its 95 % interval
+# columns of a figure's numbers that are a share and the ends of its 95 % interval
+SHARES = ("share", "low", "high")
 
 
 class RecipePart(results.Fields):
@@ -142,7 +189,9 @@ class RecipeFigure(results.Fields):
     figure: str = Field(description="its kind")
     title: str
     text: list[str] = Field(description="what it says, in sentences")
-    columns: list[str] = Field(description="of its numbers; `low` and `high` are a share's 95 % interval")
+    columns: list[str] = Field(
+        description="of its numbers; `low` and `high` are a share's 95 % interval"
+    )
     rows: list[list[Cell]] = Field(description="of its numbers")
 
 
@@ -153,7 +202,9 @@ class RecipeResult(views.InNotebook, RunResult):
 
     recipe: str = Field(description="its name, or its file")
     title: str = Field(description="what it asks")
-    about: str = Field(description="what is done for a result, and whose experiment it is")
+    about: str = Field(
+        description="what is done for a result, and whose experiment it is"
+    )
     quick: bool = Field(description="whether it was few small pictures")
     objects: list[str]
     model: str
@@ -167,37 +218,86 @@ class RecipeResult(views.InNotebook, RunResult):
 
 
 def shown(result: RecipeResult) -> ShownResult:
-    """Return each figure with what it says and its numbers, and the runs that it took."""
+    """Return each figure with what it says and its numbers, and the runs that it
+    took.
+    """
     sections = [ResultPart(text=[result.about], only="page")]
-    for number, (made, texts) in enumerate(zip(result.figures, told_once(result.figures), strict=True), start=1):
+    for number, (made, texts) in enumerate(
+        zip(result.figures, told_once(result.figures), strict=True), start=1
+    ):
         rows = [list(map(_cell, made.columns, row)) for row in made.rows]
-        sections.append(ResultPart(made.title, texts, figure=f"images/figure-{number}.png"))
-        sections.append(ResultPart("The numbers", heads=made.columns, rows=rows, folded=True, only="page"))
-    rows = [[run.name, run.command, run.ending, str(run.renders)] for run in result.parts]
-    heads, names = ("run in parts/", "command", "ending", "renders"), [run.name for run in result.parts]
+        sections.append(
+            ResultPart(made.title, texts, figure=f"images/figure-{number}.png")
+        )
+        sections.append(
+            ResultPart(
+                "The numbers", heads=made.columns, rows=rows, folded=True, only="page"
+            )
+        )
+    rows = [
+        [run.name, run.command, run.ending, str(run.renders)] for run in result.parts
+    ]
+    heads = ("run in parts/", "command", "ending", "renders")
+    names = [run.name for run in result.parts]
     title = wording.count(len(result.parts), "run")
-    sections.append(ResultPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page"))
+    sections.append(
+        ResultPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page")
+    )
     of_what = result.objects, result.environment.split(","), result.model.split(",")
-    objects, environments, models = (", ".join(map(wording.short_name, listed)) for listed in of_what)
-    facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
+    objects, environments, models = (
+        ", ".join(map(wording.short_name, listed)) for listed in of_what
+    )
+    facts = {
+        "objects": objects,
+        "environments": environments,
+        "models": models,
+        "runs": str(len(result.parts)),
+    }
     facts |= {"renders": str(sum(run.renders for run in result.parts))}
-    quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
-    return ShownResult(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
+    quick = (
+        ["Made with few and small pictures, to see what comes out; no result."]
+        if result.quick
+        else []
+    )
+    return ShownResult(
+        result.title,
+        sections,
+        facts,
+        [PurePath(result.recipe).stem, models, objects],
+        quick,
+    )
 
 
 def _cell(column: str, value: Cell) -> str:
     if column in SHARES:
         return wording.percent(value) if isinstance(value, (int, float)) else ""
-    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+    return (
+        f"{value:.4g}"
+        if isinstance(value, float)
+        else ""
+        if value is None
+        else str(value)
+    )
 
 
 def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
-    """Return what each figure says without counts that a figure before it has told; where nothing is left, that."""
-    said, told = set[str](), list[list[str]]()
+    """Return what each figure says without counts that a figure before it has told;
+    where nothing is left, that.
+    """
+    said = set[str]()
+    told = list[list[str]]()
     for before, figure in zip([None, *figures], figures, strict=False):
-        new = [text for text in figure.text if text not in said or not re.search(r"\d of \d", text)]
+        new = [
+            text
+            for text in figure.text
+            if text not in said or not re.search(r"\d of \d", text)
+        ]
         same = before is not None and figure.text == before.text
-        nothing = ["It says the same as the figure before it." if same else "It says what figures before it say."]
+        nothing = [
+            "It says the same as the figure before it."
+            if same
+            else "It says what figures before it say."
+        ]
         told.append(nothing if same or not new else new)
         said |= set(figure.text)
     return told

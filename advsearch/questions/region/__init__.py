@@ -11,7 +11,9 @@ from advsearch.questions.region.result import RegionConfig, RegionResult, claims
 
 
 def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the run around whose adversarial configuration a box grows brings: scene, model and controls."""
+    """Return what the run around whose adversarial configuration a box grows brings:
+    scene, model and controls.
+    """
     return RegionConfig.shared(AttackConfig.from_yaml(file))
 
 
@@ -25,7 +27,9 @@ def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]
     claims=claims,
 )
 def region(context: RunContext[RegionConfig]) -> RegionResult:
-    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
+    """Grow the box around a configuration in which the verdict stays what it is
+    (docs/questions.md).
+    """
     from advsearch.questions.region.growing import find_region  # imports torch
 
     return find_region(context)

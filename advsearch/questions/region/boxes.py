@@ -1,4 +1,6 @@
-"""Boxes that grow around a point while a property stays the same, and what samples show of them."""
+"""Boxes that grow around a point while a property stays the same, and what samples show
+of them.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,18 @@ ATTEMPTS = 4  # Final checks at most
 PROBES = 8  # Random points at which what a face would win is probed
 USUAL_PROBED = 100  # Images of growing for each parameter, usually
 MAX_PROBED = 400
-"""Images of growing for each parameter: that is more than twice what boxes, balls, planes and noise have taken."""
+"""Images of growing for each parameter: that is more than twice what boxes, balls,
+planes and noise have taken.
+"""
 MIN_STEP = 1e-3  # A face does not move by less
-PULLED_IN = 0.98  # Share of the distance between the centre and an exception at which a face lies that excludes it
+# Share of the distance between the centre and an exception at which a face lies that
+# excludes it
+PULLED_IN = 0.98
 
 IsSame = Callable[[Tensor, int], bool]
-"""(u, number) -> whether the prediction at u is that of the centre; number numbers its seed."""
+"""(u, number) -> whether the prediction at u is that of the centre; number numbers its
+seed.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +54,12 @@ class GrownBox:
     def interval(self) -> tuple[float, float]:
         """The 95 % interval of the share of the box with the centre's prediction.
 
-        It holds for all `ATTEMPTS` together, since the last box is the one that passed (Bonferroni).
+        It holds for all `ATTEMPTS` together, since the last box is the one that passed
+        (Bonferroni).
         """
-        return statistics.intervals.clopper_pearson(self.same, self.samples, 1.0 - 0.05 / ATTEMPTS)
+        return statistics.intervals.clopper_pearson(
+            self.same, self.samples, 1.0 - 0.05 / ATTEMPTS
+        )
 
     @property
     def volume(self) -> float:
@@ -56,15 +67,22 @@ class GrownBox:
 
 
 def grow(
-    is_same: IsSame, center: Tensor, *, seed: int, samples: int = 200, on_check: Callable[[], None] = lambda: None
+    is_same: IsSame,
+    center: Tensor,
+    *,
+    seed: int,
+    samples: int = 200,
+    on_check: Callable[[], None] = lambda: None,
 ) -> GrownBox:
     """Grow a box around a point, then check it with samples that nothing was fitted to.
 
-    Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
-    which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
-    prediction, it moves. Growing ends after `MAX_PROBED` images for each parameter at the latest. Then the box is
-    sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
-    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows.
+    Each face in turn tries to move out by a share of what is left to the bound (1/2 at
+    first, halved at every level at which no face can move any more). The slab that it
+    would win is probed at random points; if all have the centre's prediction, it moves.
+    Growing ends after `MAX_PROBED` images for each parameter at the latest. Then the
+    box is sampled; on an exception, the face that cuts off the least of the box moves
+    in to it and the box is sampled anew, with other seeds, `ATTEMPTS` times at most;
+    the last check counts whatever it shows.
 
     Args:
         is_same: whether a point has the prediction of the centre.
@@ -79,7 +97,9 @@ def grow(
     if samples < 1:
         raise InputError(f"samples: expected at least 1, got {samples}")
     if not bool(((center >= 0.0) & (center <= 1.0)).all()):
-        raise InputError("the centre of a region has to lie inside the ranges of its parameters")
+        raise InputError(
+            "the centre of a region has to lie inside the ranges of its parameters"
+        )
     box = GrowingBox(is_same, center, seed)
     box.grow()
     n_exceptions = 0
@@ -91,7 +111,9 @@ def grow(
             break
         for point in exceptions:
             box.exclude(point)
-    return GrownBox(center, box.low, box.high, samples - n_exceptions, samples, box.n_evaluated)
+    return GrownBox(
+        center, box.low, box.high, samples - n_exceptions, samples, box.n_evaluated
+    )
 
 
 class GrowingBox:
@@ -125,22 +147,33 @@ class GrowingBox:
             share /= 2.0
 
     def sample_exceptions(self, count: int) -> Tensor:
-        """Sample points of the box, and return those (n, d) that have another prediction than the centre."""
+        """Sample points of the box, and return those (n, d) that have another
+        prediction than the centre.
+        """
         points = self._sample(self.low, self.high, count)
         return points[[not self._evaluate(point) for point in points]]
 
     def exclude(self, point: Tensor) -> None:
-        """Move the face in that takes the least of the box away, so that a point lies outside."""
+        """Move the face in that takes the least of the box away, so that a point lies
+        outside.
+        """
         if not bool(((point >= self.low) & (point <= self.high)).all()):
             return
         width = (self.high - self.low).clamp_min(1e-12)
-        loss = torch.where(point > self._center, (self.high - point) / width, (point - self.low) / width)
-        axis = int(torch.where(point == self._center, torch.inf, loss).argmin())  # the centre stays inside
+        loss = torch.where(
+            point > self._center,
+            (self.high - point) / width,
+            (point - self.low) / width,
+        )
+        # the centre stays inside
+        axis = int(torch.where(point == self._center, torch.inf, loss).argmin())
         face = self.high if point[axis] > self._center[axis] else self.low
         face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
     def _push(self, face: int, share: float) -> bool:
-        """Move a face out if the slab that it wins has the centre's prediction; return whether it moved."""
+        """Move a face out if the slab that it wins has the centre's prediction; return
+        whether it moved.
+        """
         axis, is_upper = divmod(face, 2)
         room = float(1.0 - self.high[axis] if is_upper else self.low[axis])
         step = room if room < 4.0 * MIN_STEP else share * room
@@ -169,6 +202,10 @@ class GrowingBox:
 
     def _sample(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         """Return points (count, d) uniform in a box, other ones at every call."""
-        generator = torch.Generator().manual_seed(seeds.stream(self._seed, "region", self._n_draws))
+        generator = torch.Generator().manual_seed(
+            seeds.stream(self._seed, "region", self._n_draws)
+        )
         self._n_draws += 1
-        return torch.lerp(low, high, torch.rand(count, len(self._center), generator=generator))
+        return torch.lerp(
+            low, high, torch.rand(count, len(self._center), generator=generator)
+        )

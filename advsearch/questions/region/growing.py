@@ -1,4 +1,6 @@
-"""The box around a configuration in which the model's verdict stays, and a map of its margin."""
+"""The box around a configuration in which the model's verdict stays, and a map of its
+margin.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,14 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.region import boxes
-from advsearch.questions.region.result import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
+from advsearch.questions.region.result import (
+    AxisRange,
+    BoxSide,
+    GrownRegion,
+    MarginMap,
+    RegionConfig,
+    RegionResult,
+)
 
 MAX_PARAMETERS = 8  # in which a box is grown
 CENTRE_TRIALS = 20
@@ -62,7 +71,9 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     stages.begin("setup", workbench.LOADING)
     budget: dict[str, object] = {}
     if config.around is not None:  # its centre has to lie within
-        attack_config = AttackConfig.from_yaml(directory.find_run(config.around) / directory.CONFIG)
+        attack_config = AttackConfig.from_yaml(
+            directory.find_run(config.around) / directory.CONFIG
+        )
         budget = {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
     problem, warnings = workbench.problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:
@@ -85,14 +96,18 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         image_formation=problem.renderer.formation,
         clean={"moved": problem.space.moved},
         warnings=warnings,
-        transport=findings.transport_summary if findings.transport or findings.rendered_because else None,
+        transport=findings.transport_summary
+        if findings.transport or findings.rendered_because
+        else None,
         renders=count_renders(verifier),
         seconds={**stages.seconds, "total": stages.total},
     )
 
 
 def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
-    """Return the images that were rendered, and those that were predicted if there are any."""
+    """Return the images that were rendered, and those that were predicted if there are
+    any.
+    """
     findings = verifier.findings
     renders = {"verification": findings.verification_renders}
     if findings.transport is not None:
@@ -107,7 +122,8 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
-        InputError: there are too few or too many, or `around` is a run over other controls.
+        InputError: there are too few or too many, or `around` is a run over other
+            controls.
     """
     coordinate_of: dict[str, int] = {}
     for group in problem.space.groups:
@@ -116,7 +132,11 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
         for index in range(group.size):
             name = f"{group.name}.{index}" if group.size > 1 else group.name
             coordinate_of[name] = group.begin + index
-    names = tuple(coordinate_of) if config.vary is None else settings.split_names(config.vary)
+    names = (
+        tuple(coordinate_of)
+        if config.vary is None
+        else settings.split_names(config.vary)
+    )
     for name in names:
         if name not in coordinate_of:
             raise errors.UnknownNameError("parameter in `vary`", name, coordinate_of)
@@ -126,21 +146,30 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
             f"name some of {', '.join(coordinate_of)}"
         )
     if config.map and len(names) != 2:
-        raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
+        raise InputError(
+            f"map: expected two parameters in `vary`, got {len(names)}: "
+            f"{', '.join(names)}"
+        )
     coordinates = torch.tensor([coordinate_of[name] for name in names])
     return VariedParameters(names, coordinates, read_centre(problem, config))
 
 
 def read_centre(problem: Problem, config: RegionConfig) -> Tensor:
-    """Return the configuration around which the box grows (d,): the scene's own, or the adversarial one of a run."""
+    """Return the configuration around which the box grows (d,): the scene's own, or the
+    adversarial one of a run.
+    """
     centre: Tensor = problem.domain.start.clone()
     if config.around is None:
         return centre
-    values = torch.from_numpy(workbench.read_configuration(directory.find_run(config.around)))
+    values = torch.from_numpy(
+        workbench.read_configuration(directory.find_run(config.around))
+    )
     if values.shape != centre.shape:
         raise InputError(
-            f"`around` {config.around}: expected a run over the same controls, whose configuration has "
-            f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own "
+            f"`around` {config.around}: expected a run over the same controls, whose "
+            "configuration has "
+            f"{problem.domain.dim} numbers, got one with {len(values)}; leave "
+            "`controls` out so that the run's own "
             "are taken"
         )
     return problem.domain.project(values)
@@ -150,7 +179,10 @@ class RegionSearch:
     """Grows and checks the box of one run."""
 
     def __init__(
-        self, context: RunContext[RegionConfig], verifier: workbench.Verifier, varied: VariedParameters
+        self,
+        context: RunContext[RegionConfig],
+        verifier: workbench.Verifier,
+        varied: VariedParameters,
     ) -> None:
         self._config = context.config
         self._run = context.run
@@ -168,14 +200,27 @@ class RegionSearch:
         self._centre_verdict = find_verdict(verifier, varied.centre)
         if config.specialise:
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
-            workbench.prepare_surface_light(verifier, varied.centre, varied.coordinates, n_images)
+            workbench.prepare_surface_light(
+                verifier, varied.centre, varied.coordinates, n_images
+            )
 
         spp = verifier.findings.spp
-        hint = f"pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+        hint = (
+            f"pictures of {spp} samples a pixel; fewer parameters in `vary` or "
+            "`verify_spp` shorten it"
+        )
         limit = boxes.MAX_PROBED * len(varied.names)
-        verifier.stages.begin("search", "growing the box", limit, hint=hint, at_most=True)
+        verifier.stages.begin(
+            "search", "growing the box", limit, hint=hint, at_most=True
+        )
         seed = seeds.stream(config.seed, "region")
-        grown = boxes.grow(self._is_same, varied.start, seed=seed, samples=config.samples, on_check=self._begin_check)
+        grown = boxes.grow(
+            self._is_same,
+            varied.start,
+            seed=seed,
+            samples=config.samples,
+            on_check=self._begin_check,
+        )
         sides = describe_box(verifier.problem, grown, varied)
         margin_map = None
         if config.map:
@@ -197,18 +242,24 @@ class RegionSearch:
             return
         self._is_checking = True
         limit = boxes.ATTEMPTS * self._config.samples
-        hint = f"{self._config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
+        hint = (
+            f"{self._config.samples} pictures, and as many again where one is an "
+            "exception; `samples` shortens it"
+        )
         title = "checking the box with fresh samples"
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at some values of the parameters (k,) is that of the centre.
+        """Return whether the verdict at some values of the parameters (k,) is that of
+        the centre.
 
         An image without the object is neither right nor wrong.
         """
         predictor = None if self._is_checking else self._verifier.findings.transport
         u = self._varied.place(values)
-        (trial,) = self._verifier.trials("region", {number: u}, sought=False, predictor=predictor)
+        (trial,) = self._verifier.trials(
+            "region", {number: u}, sought=False, predictor=predictor
+        )
         is_counted = not trial.prediction.is_out_of_view and not trial.not_a_number
         return is_counted and trial.success == self._centre_verdict
 
@@ -217,42 +268,56 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
     """Return whether the model is wrong at the centre.
 
     Raises:
-        InputError: that depends on the noise, or predictions are not numbers, or the object is not in the image.
+        InputError: that depends on the noise, or predictions are not numbers, or the
+            object is not in the image.
     """
     verifier.stages.begin("verification", "looking at the centre", CENTRE_TRIALS)
-    trials = list(verifier.trials("centre", dict.fromkeys(range(CENTRE_TRIALS), centre), sought=False))
+    trials = list(
+        verifier.trials(
+            "centre", dict.fromkeys(range(CENTRE_TRIALS), centre), sought=False
+        )
+    )
     n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
     if n_hidden:
         raise InputError(
-            f"the object is not to be seen in {n_hidden} of {CENTRE_TRIALS} trials at the centre, so there is no "
+            f"the object is not to be seen in {n_hidden} of {CENTRE_TRIALS} trials at "
+            "the centre, so there is no "
             "verdict; choose another centre"
         )
     n_without_number = sum(trial.not_a_number for trial in trials)
     if n_without_number:
         raise InputError(
-            f"the model's prediction is not a number in {n_without_number} of {CENTRE_TRIALS} trials at the centre, "
+            f"the model's prediction is not a number in {n_without_number} of "
+            f"{CENTRE_TRIALS} trials at the centre, "
             "so there is no verdict; choose another centre, or mend the model"
         )
     n_wrong = sum(trial.success for trial in trials)
     verdict = verifier.problem.rule.decided(n_wrong, CENTRE_TRIALS)
     if verdict is None:
         raise InputError(
-            f"the model is wrong in {n_wrong} of {CENTRE_TRIALS} trials at the centre, so its verdict there depends on "
+            f"the model is wrong in {n_wrong} of {CENTRE_TRIALS} trials at the centre, "
+            "so its verdict there depends on "
             "the noise; choose another centre, or more samples with `verify_spp`"
         )
     return verdict
 
 
-def describe_box(problem: Problem, grown: boxes.GrownBox, varied: VariedParameters) -> list[BoxSide]:
-    """Return the range of each parameter in its unit; of a number that nobody describes, as shares of the range."""
+def describe_box(
+    problem: Problem, grown: boxes.GrownBox, varied: VariedParameters
+) -> list[BoxSide]:
+    """Return the range of each parameter in its unit; of a number that nobody
+    describes, as shares of the range.
+    """
     low_values, high_values, centre_values = (
-        problem.describe(varied.place(values)) for values in (grown.low, grown.high, grown.center)
+        problem.describe(varied.place(values))
+        for values in (grown.low, grown.high, grown.center)
     )
     sides = []
     for index, name in enumerate(varied.names):
         vector_name, _, component = name.rpartition(".")
         if name in low_values:
-            described, component = name, ""
+            described = name
+            component = ""
         else:
             described = vector_name
         if described in low_values:
@@ -276,10 +341,19 @@ def read_component(described: Mapping[str, Any], component: str = "") -> float:
 
 
 def draw_map(
-    verifier: workbench.Verifier, size: int, varied: VariedParameters, box: Sequence[BoxSide], run: RunDirectory
+    verifier: workbench.Verifier,
+    size: int,
+    varied: VariedParameters,
+    box: Sequence[BoxSide],
+    run: RunDirectory,
 ) -> MarginMap:
-    """Draw the margin over two parameters, with the line at which the verdict changes, and the box."""
-    hint = f"{size * size} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
+    """Draw the margin over two parameters, with the line at which the verdict changes,
+    and the box.
+    """
+    hint = (
+        f"{size * size} pictures of {verifier.findings.spp} samples a pixel; `map` "
+        "or `verify_spp` shorten it"
+    )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
     steps = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
@@ -287,30 +361,57 @@ def draw_map(
         return varied.place(torch.stack([steps[number % size], steps[number // size]]))
 
     transport = verifier.findings.transport
-    trials = verifier.trials_of("map", size * size, find_configuration, sought=False, predictor=transport)
+    trials = verifier.trials_of(
+        "map", size * size, find_configuration, sought=False, predictor=transport
+    )
     margins = [-trial.score for trial in trials]
     rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]
 
-    low_values, high_values = (verifier.problem.describe(varied.place(torch.full((2,), end))) for end in (0.0, 1.0))
+    low_values, high_values = (
+        verifier.problem.describe(varied.place(torch.full((2,), end)))
+        for end in (0.0, 1.0)
+    )
     axis_ranges = []
     for side in box:
-        low, high = 0.0, 1.0
+        low = 0.0
+        high = 1.0
         if side.name in low_values:
             low = read_component(low_values[side.name])
             high = read_component(high_values[side.name])
-        axis_ranges.append(AxisRange(name=side.name, unit=side.unit, low=low, high=high))
+        axis_ranges.append(
+            AxisRange(name=side.name, unit=side.unit, low=low, high=high)
+        )
     first_range, second_range = axis_ranges
     first_side, second_side = box
 
     def draw(axes: Any) -> None:
-        extent = (first_range.low, first_range.high, second_range.low, second_range.high)
+        extent = (
+            first_range.low,
+            first_range.high,
+            second_range.low,
+            second_range.high,
+        )
         first_title = figures.axis_title(first_range.name, first_range.unit)
         second_title = figures.axis_title(second_range.name, second_range.unit)
         figures.heat(axes, rows, extent, figures.MARGIN, first_title, second_title)
         if min(margins) < 0.0 < max(margins):
-            axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
-        corners_x = [first_side.low, first_side.high, first_side.high, first_side.low, first_side.low]
-        corners_y = [second_side.low, second_side.low, second_side.high, second_side.high, second_side.low]
+            axes.contour(
+                rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0
+            )
+        corners_x = [
+            first_side.low,
+            first_side.high,
+            first_side.high,
+            first_side.low,
+            first_side.low,
+        ]
+        corners_y = [
+            second_side.low,
+            second_side.low,
+            second_side.high,
+            second_side.high,
+            second_side.low,
+        ]
         axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
         axes.plot(first_side.centre, second_side.centre, "k+", label="centre")
         axes.legend(loc="upper right", frameon=True)

@@ -20,12 +20,15 @@ from advsearch.extend import (
 )
 
 FEWEST_SAMPLES = 8
-"""With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
-`questions.region.boxes.GrownBox.interval`."""
+"""With fewer, not even a box without exceptions has one verdict in more than half of
+it, at the confidence of `questions.region.boxes.GrownBox.interval`.
+"""
 
 
 class RegionConfig(SceneConfig):
-    """Everything that decides what `region` does: the box around a configuration in which the verdict stays."""
+    """Everything that decides what `region` does: the box around a configuration in
+    which the verdict stays.
+    """
 
     command: ClassVar[str] = "region"
     without: ClassVar[tuple[str, ...]] = ("spp",)
@@ -33,7 +36,8 @@ class RegionConfig(SceneConfig):
     # fmt: off
     around: str | None = setting(
         None, "region",
-        "a run whose adversarial configuration is the centre; it brings scene, model and controls with it",
+        "a run whose adversarial configuration is the centre; it brings scene, model "
+        "and controls with it",
         "the name or the folder of a run", otherwise="the scene as it is",
     )
     vary: str | None = setting(
@@ -44,16 +48,20 @@ class RegionConfig(SceneConfig):
         200, "region", "fresh samples that check the box", unit="renders", ge=FEWEST_SAMPLES, le=1_000_000
     )
     map: int = setting(
-        0, "region", "side of the map of the margin, where there are two parameters; 0 for none", unit="points",
+        0, "region", "side of the map of the margin, where there are two parameters; 0 "
+                     "for none", unit="points",
         ge=0, le=512,
     )
     specialise: bool = setting_as_in(
         AttackConfig, "specialise", group="region",
-        description="predict pictures from new viewpoints while the box grows, and those of the map",
+        description="predict pictures from new viewpoints while the box grows, and "
+                    "those of the map",
         switched="render every picture",
     )
     # fmt: on
-    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")
+    verify_spp: int | None = setting_as_in(
+        AttackConfig, "verify_spp", group="region", description="samples per pixel"
+    )
 
 
 class AxisRange(results.Fields):
@@ -83,16 +91,27 @@ class MarginMap(results.Fields):
 class GrownRegion(results.Fields):
     """What is known of a region; nothing yet if it was interrupted."""
 
-    verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
-    box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
-    same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")
+    verdict: str | None = Field(
+        default=None, description="`right` or `wrong`, at the centre"
+    )
+    box: list[BoxSide] | None = Field(
+        default=None, description="for each parameter, the range of its values"
+    )
+    same: int | None = Field(
+        default=None, description="fresh samples of the box that had that verdict"
+    )
     samples: int | None = Field(default=None, description="all fresh samples of it")
-    rate: float | None = Field(default=None, description="the share of those that had it")
+    rate: float | None = Field(
+        default=None, description="the share of those that had it"
+    )
     interval: results.Interval | None = Field(default=None, description="of that share")
-    volume: float | None = Field(default=None, description="share of the ranges that the box takes up")
+    volume: float | None = Field(
+        default=None, description="share of the ranges that the box takes up"
+    )
     spp: int | None = Field(default=None, description="samples a pixel")
     map: MarginMap | None = Field(
-        default=None, description="the margin over two parameters; only where `map` asks for it"
+        default=None,
+        description="the margin over two parameters; only where `map` asks for it",
     )
 
 
@@ -105,15 +124,22 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
     clean: results.CleanScene
     warnings: list[str] = Field(description="sentences that a reader has to know")
     transport: results.LinearTransport | None = Field(
-        default=None, description="what predicted pictures from new viewpoints; absent where no camera moves"
+        default=None,
+        description="what predicted pictures from new viewpoints; absent "
+        "where no camera moves",
     )
     renders: Annotated[dict[str, int], results.having("verification")] = Field(
-        description="of the `verification`: all that were rendered; of the `products`: all that were predicted"
+        description="of the `verification`: all that were rendered; of the `products`: "
+        "all that were predicted"
     )
 
     @property
     def brief(self) -> str:
-        return f"{self.verdict} in {self.same} of {self.samples} samples of the box" if self.samples else ""
+        return (
+            f"{self.verdict} in {self.same} of {self.samples} samples of the box"
+            if self.samples
+            else ""
+        )
 
 
 def shown(result: RegionResult) -> ShownResult:
@@ -128,24 +154,39 @@ def shown(result: RegionResult) -> ShownResult:
         "unit": "{0.unit}",
     }
     return ShownResult(
-        f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: with 95 % "
+        f"The model is {result.verdict} in {result.same} of {result.samples} fresh "
+        "samples of this box: with 95 % "
         f"confidence in at least {wording.percent(result.interval[0])} of it.",
         [ResultPart.table(result.box, box, title="The box")],
-        {"share of the space": wording.percent(result.volume), "samples a pixel": str(result.spp or "")},
+        {
+            "share of the space": wording.percent(result.volume),
+            "samples a pixel": str(result.spp or ""),
+        },
     )
 
 
 def claims(result: RegionResult) -> Iterator[views.Claim]:
     """Yield the claim about the box, if it is known."""
-    if not result.samples or result.same is None or result.interval is None or result.verdict is None:
+    if (
+        not result.samples
+        or result.same is None
+        or result.interval is None
+        or result.verdict is None
+    ):
         return
     what = f"samples that are {result.verdict}"
-    extent = results.Extent.from_count(what, result.same, result.samples, result.interval)
-    sides = [f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip() for side in result.box or ()]
+    extent = results.Extent.from_count(
+        what, result.same, result.samples, result.interval
+    )
+    sides = [
+        f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip()
+        for side in result.box or ()
+    ]
     box = ", ".join(sides) or "the box"
     inside = f"{wording.share_text(extent)} samples drawn evenly from it"
     statement = (
-        f"Inside {box} the model is {result.verdict} in {inside}. Certified by sampling: single points of it may "
+        f"Inside {box} the model is {result.verdict} in {inside}. Certified by "
+        "sampling: single points of it may "
         "differ."
     )
     yield views.Claim(kind="measured", statement=statement, extent=extent)

@@ -1,4 +1,6 @@
-"""Render the adversarial scene of a run again under other conditions, beside the clean scene."""
+"""Render the adversarial scene of a run again under other conditions, beside the clean
+scene.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims
     claims=claims,
 )
 def replay(asked: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
-    """Render the adversarial scene of a run under other conditions, each beside the clean scene."""
+    """Render the adversarial scene of a run under other conditions, each beside the
+    clean scene.
+    """
     from advsearch.questions.replay.conditions import rendered_again  # imports torch
 
     return rendered_again(asked, parts)

@@ -1,5 +1,6 @@
-"""`replay`: the adversarial scene of a run under other conditions than it was searched and verified under, in other
-pictures."""
+"""`replay`: the adversarial scene of a run under other conditions than it was searched
+and verified under, in other pictures.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +26,20 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.replay.cycles import BlenderError, Cycles
-from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
+from advsearch.questions.replay.result import (
+    NOT_DONE,
+    ReplayConfig,
+    ReplayResult,
+    ReplayRow,
+)
 
 AttackResult = workbench.AttackResult
 Watched = workbench.Watched
 
 OWN = "as verified"  # The way in which nothing is changed
-OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
+# What conditions share whose pictures come of the radiance that the run itself would
+# render
+OWN_LIGHT = "own"
 QUALITIES = (90, 75, 50)
 
 SENSORS: dict[str, dict[str, float]] = {
@@ -40,18 +48,27 @@ SENSORS: dict[str, dict[str, float]] = {
         "shot": 0.08, "read": 0.02, "mosaic": 1.0, "aberration": 0.002, "red": 0.1, "blue": -0.1, "compression": 25.0,
     },
 }  # fmt: skip
-"""Values of the control `sensor`, by what they stand for; those that are not named are 0."""
-CURVES = {"gamma": "a power of 1/2.2 in place of sRGB", "reinhard": "highlights rolled off, x / (1 + x)"}
+"""Values of the control `sensor`, by what they stand for; those that are not named are
+0.
+"""
+CURVES = {
+    "gamma": "a power of 1/2.2 in place of sRGB",
+    "reinhard": "highlights rolled off, x / (1 + x)",
+}
 """Other tone curves, by `ImageFormation.transfer`."""
 OWN_MODEL = "the run's own"  # What no other model is called
-SHORT, LONG = 2, 16  # Longest light paths in segments: direct light alone, and far more than a run renders
+# Longest light paths in segments: direct light alone, and far more than a run renders
+SHORT = 2
+LONG = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """One condition of a replay: what is changed and to what; the problem under it, made anew, as it may hold a scene
-    of its own; and why it cannot be had, empty where it can. The others are as those of `RetrialCondition`, by default
-    with pictures of its own."""
+    """One condition of a replay: what is changed and to what; the problem under it,
+    made anew, as it may hold a scene of its own; and why it cannot be had, empty where
+    it can. The others are as those of `RetrialCondition`, by default with pictures of
+    its own.
+    """
 
     name: str
     text: str
@@ -65,33 +82,63 @@ class Way:
     def condition(self) -> workbench.RetrialCondition:
         title = self.text if self.name == OWN else f"{self.name}: {self.text}"
         source = self.source or title
-        return workbench.RetrialCondition(title, self.problem(), self.spp, source, self.change, self.light)
+        return workbench.RetrialCondition(
+            title, self.problem(), self.spp, source, self.change, self.light
+        )
 
 
-def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
-    """Yield every condition of a problem's configuration but other models; the first changes nothing. `spp` is that of
-    the run's verification, and `sized` makes the same problem at another (height, width) in pixels."""
+def ways_of(
+    problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]
+) -> Iterator[Way]:
+    """Yield every condition of a problem's configuration but other models; the first
+    changes nothing. `spp` is that of the run's verification, and `sized` makes the same
+    problem at another (height, width) in pixels.
+    """
     renderer = problem.renderer
-    scene, formation = renderer.scene, renderer.formation
+    scene = renderer.scene
+    formation = renderer.formation
 
-    def same(name: str, text: str, count: int = spp, change: Callable[[Tensor, int], Tensor] | None = None) -> Way:
+    def same(
+        name: str,
+        text: str,
+        count: int = spp,
+        change: Callable[[Tensor, int], Tensor] | None = None,
+    ) -> Way:
         return Way(name, text, lambda: problem, count, OWN_LIGHT, OWN_LIGHT, change)
 
     def traced(name: str, text: str, **made: Any) -> Way:
         sampler = {"sampler": made["sampler"]} if "sampler" in made else {}
-        return Way(name, text, lambda: replace(problem, renderer=renderer.like(scene.like(**made), **sampler)), spp)
+        return Way(
+            name,
+            text,
+            lambda: replace(
+                problem, renderer=renderer.like(scene.like(**made), **sampler)
+            ),
+            spp,
+        )
 
     def formed(name: str, text: str, light: str | None = None, **fields: Any) -> Way:
-        return Way(name, text, lambda: replace(problem, renderer=renderer.like(**fields)), spp, light)
+        return Way(
+            name,
+            text,
+            lambda: replace(problem, renderer=renderer.like(**fields)),
+            spp,
+            light,
+        )
 
     yield same(OWN, OWN)
     for count in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
         if count != spp:
             yield same("samples", f"{count} a pixel", count)
     height, width = formation.resolution
-    for size in ((max(8, height // 2), max(8, width // 2)), (min(4096, 2 * height), min(4096, 2 * width))):
+    for size in (
+        (max(8, height // 2), max(8, width // 2)),
+        (min(4096, 2 * height), min(4096, 2 * width)),
+    ):
         if size != (height, width):
-            yield Way("resolution", f"{size[0]} x {size[1]} pixels", partial(sized, size), spp)
+            yield Way(
+                "resolution", f"{size[0]} x {size[1]} pixels", partial(sized, size), spp
+            )
     for depth in (SHORT, LONG):
         if depth != scene.max_depth:
             yield traced("depth", f"light paths of {depth} segments", max_depth=depth)
@@ -111,9 +158,15 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     def by_blender() -> Problem:
         return replace(problem, renderer=renderer.like(source=cycles.radiance))
 
-    denoise, missing = formation.denoiser != "none", ""
+    denoise = formation.denoiser != "none"
+    missing = ""
     try:
-        cycles = Cycles(scene.made[0], formation.resolution, max_depth=scene.max_depth, denoise=denoise)
+        cycles = Cycles(
+            scene.made[0],
+            formation.resolution,
+            max_depth=scene.max_depth,
+            denoise=denoise,
+        )
     except BlenderError as error:
         missing = str(error)
     yield Way("blender", "Cycles, Blender's renderer", by_blender, spp, missing=missing)
@@ -126,25 +179,41 @@ def _file(quality: int, picture: Tensor, _seed: int) -> Tensor:
 def _sensed(values: Mapping[str, float], picture: Tensor, seed: int) -> Tensor:
     control = workbench.CONTROLS["sensor"]()
     control.chosen["seed"] = seed
-    of_control = {parameter.name: values.get(parameter.name, 0.0) for parameter in control.parameters}
-    changed: Tensor = control.on_picture({name: torch.tensor(value) for name, value in of_control.items()}, picture)
+    of_control = {
+        parameter.name: values.get(parameter.name, 0.0)
+        for parameter in control.parameters
+    }
+    changed: Tensor = control.on_picture(
+        {name: torch.tensor(value) for name, value in of_control.items()}, picture
+    )
     return changed
 
 
 @workbench.asks(ReplayConfig)
-def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any) -> ReplayResult:
-    """Render the adversarial scene of a run under other conditions, each beside the clean scene (docs/questions.md).
+def replay(
+    attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any
+) -> ReplayResult:
+    """Render the adversarial scene of a run under other conditions, each beside the
+    clean scene (docs/questions.md).
 
     Args:
-        attack: one that was kept and has ended: its result, or name or folder of its run.
+        attack: one that was kept and has ended: its result, or name or folder of its
+            run.
     """
-    parts, only_now, run = None, list[settings.PythonOnly](), attack
+    parts = None
+    only_now = list[settings.PythonOnly]()
+    run = attack
     if isinstance(attack, AttackResult):
         if attack.run is None:
-            raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
+            raise InputError(
+                "attack: expected an attack that was kept, got one that "
+                "was not; give it a `run`"
+            )
         run = attack.run
         only_now = [
-            part for part in directory.read_python_only(Path(run)) if part.role not in workbench.ROLES_IN_SEARCH
+            part
+            for part in directory.read_python_only(Path(run))
+            if part.role not in workbench.ROLES_IN_SEARCH
         ]
         parts = None if attack.parts is None else attack.parts()
     config = workbench.configured(ReplayConfig, attack=run, **options)
@@ -155,18 +224,23 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **opt
     return made
 
 
-def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None) -> ReplayResult:
-    """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
-    with the next. `parts` is what the attack was asked with; None loads what its run names. Raises InputError where the
-    run has no adversarial configuration, or its scene is another one now, and FileFormatError where it did not end, or
-    is of another command."""
+def rendered_again(
+    asked: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None
+) -> ReplayResult:
+    """Render an adversarial scene again as a configuration describes; every trial is
+    stored at once, and a run goes on with the next. `parts` is what the attack was
+    asked with; None loads what its run names. Raises InputError where the run has no
+    adversarial configuration, or its scene is another one now, and FileFormatError
+    where it did not end, or is of another command.
+    """
     config = asked.config
     asked.progress.stage(workbench.LOADING)
     folder = directory.find_run(config.attack)
     summary = workbench.attack_of(folder)
     if summary.adversarial is None:
         raise InputError(
-            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to render again"
+            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial "
+            "configuration to render again"
         )
     settings.check_once((OWN_MODEL, *config.models), "model")
     parts = parts or workbench.parts_in(folder)
@@ -175,15 +249,34 @@ def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts
     problem, warnings = again()
     warnings += _changed(folder, parts)
     u = workbench.kept_configuration(folder, problem)
-    spp = summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
+    spp = (
+        summary.sample_count.spp
+        if summary.sample_count
+        else summary.verified.spp
+        if summary.verified
+        else 64
+    )
     own, *others = ways_of(problem, spp, lambda size: again(resolution=size)[0])
     ways = [own, *(way for way in others if way.name in config.chosen)]
-    for name in config.models:  # those that are shown pictures as the run's own model is take its renders
+    # those that are shown pictures as the run's own model is take its renders
+    for name in config.models:
         other = again(model=name, ensemble=None)[0]
-        light = OWN_LIGHT if other.renderer.formation == problem.renderer.formation else name
-        other = replace(other, renderer=problem.renderer) if light == OWN_LIGHT else other
+        light = (
+            OWN_LIGHT
+            if other.renderer.formation == problem.renderer.formation
+            else name
+        )
+        other = (
+            replace(other, renderer=problem.renderer) if light == OWN_LIGHT else other
+        )
         ways.append(Way("model", name, partial(replace, other), spp, light, light))
-    table = _Table(u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
+    table = _Table(
+        u,
+        config.trials,
+        seeds.stream(parts.config.seed, "replay"),
+        asked.run,
+        asked.progress,
+    )
     together = [way for way in ways if way.light == OWN_LIGHT and way.spp == spp]
     with asked.until_interrupted():
         for batch in (together, *([way] for way in ways if way not in together)):
@@ -206,7 +299,9 @@ def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts
 
 @dataclass
 class _Table:
-    """The rows so far, by their condition, for a configuration (d,), and the pictures rendered."""
+    """The rows so far, by their condition, for a configuration (d,), and the pictures
+    rendered.
+    """
 
     u: torch.Tensor
     trials: int
@@ -217,31 +312,55 @@ class _Table:
     renders: int = 0
 
     def fill(self, ways: Sequence[Way]) -> None:
-        """Add the rows of some conditions that share their renders: the clean scene under all of them, then the
-        adversarial one. A condition that cannot be had, or that Blender fails at, gets a row that says why."""
-        renderers, before = list[Any](), 0
+        """Add the rows of some conditions that share their renders: the clean scene
+        under all of them, then the adversarial one. A condition that cannot be had, or
+        that Blender fails at, gets a row that says why.
+        """
+        renderers = list[Any]()
+        before = 0
         try:
             if missing := next((way.missing for way in ways if way.missing), ""):
                 raise BlenderError(missing)
-            text = ", ".join(dict.fromkeys(way.name for way in ways)) + (f": {ways[0].text}" if len(ways) == 1 else "")
+            text = ", ".join(dict.fromkeys(way.name for way in ways)) + (
+                f": {ways[0].text}" if len(ways) == 1 else ""
+            )
             total = 2 * self.trials * len(ways)
-            self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
+            self.progress.stage(
+                f"replaying, {text}", total, hint="`trials` or `ways` shorten it"
+            )
             conditions = {way: way.condition() for way in ways}
-            renderers += {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
+            renderers += {
+                id(one.problem.renderer): one.problem.renderer
+                for one in conditions.values()
+            }.values()
             before = sum(renderer.renders for renderer in renderers)
             retrials = workbench.Retrials(
-                [*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed
+                [*conditions.values()],
+                self.run,
+                self.progress,
+                trials=self.trials,
+                seed=self.seed,
             )
-            clean = {way: workbench.control_group(retrials.clean(one), one.spp) for way, one in conditions.items()}
+            clean = {
+                way: workbench.control_group(retrials.clean(one), one.spp)
+                for way, one in conditions.items()
+            }
             for way, condition in conditions.items():
                 checked = retrials.adversarial("answer", self.u, condition)
-                ending, rate = checked.ending.value, workbench.verified_rate(checked)
+                ending = checked.ending.value
+                rate = workbench.verified_rate(checked)
                 self.rows[way] = ReplayRow(
-                    way=way.name, condition=way.text, ending=ending, clean=clean[way], verified=rate
+                    way=way.name,
+                    condition=way.text,
+                    ending=ending,
+                    clean=clean[way],
+                    verified=rate,
                 )
         except BlenderError as error:
             for way in ways:
-                self.rows[way] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=str(error))
+                self.rows[way] = ReplayRow(
+                    way=way.name, condition=way.text, ending=NOT_DONE, reason=str(error)
+                )
         finally:
             self.renders += sum(renderer.renders for renderer in renderers) - before
 
@@ -249,4 +368,11 @@ class _Table:
 def _changed(folder: Path, parts: workbench.AttackParts) -> list[str]:
     """A caution where a file was another one when the run was made."""
     name = RunDirectory.find_file_changed_since(folder, parts.config)
-    return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
+    return (
+        [
+            f"{name} is not what it was when the run was made: what does not hold may "
+            "come from that."
+        ]
+        if name
+        else []
+    )

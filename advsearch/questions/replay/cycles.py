@@ -1,7 +1,8 @@
-"""Pictures of a scene by Cycles, Blender's path tracer, in a process of Blender's own that reads the scene as glTF.
+"""Pictures of a scene by Cycles, Blender's path tracer, in a process of Blender's own
+that reads the scene as glTF.
 
-It is the same scene in other words, not the same picture: textures have 8 bits, surfaces are Blender's, round lamps are
-faceted, and light is sampled in Cycles' way.
+It is the same scene in other words, not the same picture: textures have 8 bits,
+surfaces are Blender's, round lamps are faceted, and light is sampled in Cycles' way.
 """
 
 from __future__ import annotations
@@ -21,7 +22,16 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.extend import SceneDescription, assets, color, errors, geometry, parts, stored_files, workbench
+from advsearch.extend import (
+    SceneDescription,
+    assets,
+    color,
+    errors,
+    geometry,
+    parts,
+    stored_files,
+    workbench,
+)
 
 LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
 MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
@@ -115,70 +125,129 @@ class BlenderError(Exception):
 
 
 class Cycles:
-    """Renders the configurations of one scene at a size (height, width) by Cycles, with light paths of at most so
-    many segments, and with Blender's Open Image Denoise or without. Raises BlenderError: there is no Blender, or the
-    scene has what is not carried over."""
+    """Renders the configurations of one scene at a size (height, width) by Cycles, with
+    light paths of at most so many segments, and with Blender's Open Image Denoise or
+    without. Raises BlenderError: there is no Blender, or the scene has what is not
+    carried over.
+    """
 
-    def __init__(self, description: SceneDescription, size: tuple[int, int], *, max_depth: int, denoise: bool) -> None:
+    def __init__(
+        self,
+        description: SceneDescription,
+        size: tuple[int, int],
+        *,
+        max_depth: int,
+        denoise: bool,
+    ) -> None:
         try:
-            self._command = workbench.find_blender("Blender's Cycles has to render it", "leave `ways=blender` out")
+            self._command = workbench.find_blender(
+                "Blender's Cycles has to render it", "leave `ways=blender` out"
+            )
         except errors.FileFormatError as error:
             raise BlenderError(str(error)) from None
         known = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
-        unknown = [part.name for part in description.parts if not isinstance(part, known)]
+        unknown = [
+            part.name for part in description.parts if not isinstance(part, known)
+        ]
         own = [name for name, mesh in description.meshes.items() if mesh.surface]
         unknown += [f"a surface of Mitsuba's own on the {name}" for name in own]
-        unknown += ["a lens"] if description.thin_lens or description.camera_model else []
+        unknown += (
+            ["a lens"] if description.thin_lens or description.camera_model else []
+        )
         unknown += ["a plain background"] if description.backdrop else []
         if unknown:
-            raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
-        self._description, self._resolution = description, size
-        self._depth, self._denoise = max_depth, denoise
+            raise BlenderError(
+                f"the scene has {', '.join(unknown[:5])}, which is not "
+                "carried over to Blender"
+            )
+        self._description = description
+        self._resolution = size
+        self._depth = max_depth
+        self._denoise = denoise
         self._held: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises BlenderError: Blender stopped, or took
-        too long."""
+        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises
+        BlenderError: Blender stopped, or took too long.
+        """
         held = self._held
-        same = held.keys() == inputs.keys() and all(torch.equal(held[name], inputs[name]) for name in inputs)
+        same = held.keys() == inputs.keys() and all(
+            torch.equal(held[name], inputs[name]) for name in inputs
+        )
         if self._process is None or not same:
             self._process = None
             self._process = _Process(self._command, *self._told(inputs))
-            self._held = {name: value.detach().clone() for name, value in inputs.items()}
+            self._held = {
+                name: value.detach().clone() for name, value in inputs.items()
+            }
         return self._process.picture(seed, spp)
 
-    def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
-        scene, (height, width) = self._description, self._resolution
+    def _told(
+        self, inputs: Mapping[str, Tensor]
+    ) -> tuple[dict[str, object], bytes, np.ndarray | None]:
+        scene = self._description
+        (height, width) = self._resolution
         values = {name: value.detach().cpu() for name, value in inputs.items()}
         meshes = [workbench.posed(part, values) for part in scene.meshes.values()]
         meshes += _ground(scene, values.get("ground.reflectance"))
-        pose = values.get("camera.to_world", torch.from_numpy(geometry.camera_to_world(scene, width / height)))
+        pose = values.get(
+            "camera.to_world",
+            torch.from_numpy(geometry.camera_to_world(scene, width / height)),
+        )
         camera = pose.double().numpy()
-        fov = float(values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
-        shift = [float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
+        fov = float(
+            values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0]
+        )
+        shift = [
+            float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0])
+            for axis in "xy"
+        ]
         lamps: list[dict[str, object]] = []
         for lamp in scene.lamps.values():
-            place, shape = np.eye(4), list[list[float]]()
+            place = np.eye(4)
+            shape = list[list[float]]()
             if isinstance(lamp, parts.BallLamp):
                 ball = assets.pose_of(lamp.radius * np.eye(3), lamp.place)
-                shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
+                shape = (
+                    values.get(f"{lamp.name}.ball", torch.from_numpy(ball))
+                    .double()
+                    .tolist()
+                )
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:
                 assert isinstance(lamp, parts.PointLamp)  # others are refused before
-                place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
-                color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+                place[:3, 3] = values.get(
+                    f"{lamp.name}.position", torch.tensor(lamp.position)
+                ).numpy()
+                color = values.get(
+                    f"{lamp.name}.intensity", torch.tensor(lamp.intensity)
+                )
             if bool((color > 0.0).any()):
-                lamps.append({"ball": shape or None, "place": place.tolist(), "color": color.tolist()})
-        radiance = None if scene.environment is None else np.asarray(scene.environment.radiance, np.float32)
+                lamps.append(
+                    {
+                        "ball": shape or None,
+                        "place": place.tolist(),
+                        "color": color.tolist(),
+                    }
+                )
+        radiance = (
+            None
+            if scene.environment is None
+            else np.asarray(scene.environment.radiance, np.float32)
+        )
         if "environment.padded" in values:
             radiance = values["environment.padded"][:, 1:-1].numpy()
         message: dict[str, object] = {
             "width": width,
             "height": height,
-            "camera": (camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist(),  # Blender's look along their own -z
+            # Blender's look along their own -z
+            "camera": (camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist(),
             "fov": math.radians(fov),
-            "shift": [shift[0] * width / max(width, height), -shift[1] * height / max(width, height)],
+            "shift": [
+                shift[0] * width / max(width, height),
+                -shift[1] * height / max(width, height),
+            ],
             "lamps": lamps,
             "environment": radiance is not None,
             "turn": math.pi / 2.0 - math.radians(scene.number("environment.rotation")),
@@ -186,14 +255,22 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return message, workbench.glb([_turn_for_blender(mesh) for mesh in meshes]), radiance
+        return (
+            message,
+            workbench.glb([_turn_for_blender(mesh) for mesh in meshes]),
+            radiance,
+        )
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Return a mesh turned so that Blender, for which the front of a glTF file is -y, has our axes."""
+    """Return a mesh turned so that Blender, for which the front of a glTF file is -y,
+    has our axes.
+    """
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
     mesh = shape.mesh
-    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+    turned = replace(
+        mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T
+    )
     return replace(shape, mesh=turned)
 
 
@@ -201,22 +278,43 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[assets.
     photograph = scene.photograph
     if photograph is not None:
         shown = photograph.base if reflectance is None else reflectance
-        return [assets.Shape("ground", photograph.mesh, color.linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
+        return [
+            assets.Shape(
+                "ground",
+                photograph.mesh,
+                color.linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(),
+                MATT,
+            )
+        ]
     half = np.float32(scene.number("ground.size") / 2.0)
     if half <= 0.0 or workbench.paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
-    faces, up = np.array([[0, 1, 2], [0, 2, 3]], np.uint32), np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    mesh = assets.Mesh(corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5))
-    return [assets.Shape("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
+    mesh = assets.Mesh(
+        corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5)
+    )
+    return [
+        assets.Shape(
+            "ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT
+        )
+    ]
 
 
 class _Process:
     """Blender with one configuration."""
 
-    def __init__(self, program: list[str], told: dict[str, object], meshes: bytes, radiance: np.ndarray | None) -> None:
+    def __init__(
+        self,
+        program: list[str],
+        told: dict[str, object],
+        meshes: bytes,
+        radiance: np.ndarray | None,
+    ) -> None:
         self._keeper = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
-        self._folder, self._count = Path(self._keeper.name), 0
+        self._folder = Path(self._keeper.name)
+        self._count = 0
         (self._folder / "scene.json").write_text(json.dumps(told), "utf-8")
         (self._folder / "scene.glb").write_bytes(meshes)
         (self._folder / "render.py").write_text(RENDER, "utf-8")
@@ -228,7 +326,12 @@ class _Process:
         with self._said.open("wb") as said:
             try:
                 self._process = subprocess.Popen(
-                    [*program, str(self._folder / "render.py"), *between, str(self._folder)],
+                    [
+                        *program,
+                        str(self._folder / "render.py"),
+                        *between,
+                        str(self._folder),
+                    ],
                     cwd=self._folder,
                     env=workbench.surroundings(str(self._folder)),
                     stdin=subprocess.PIPE,
@@ -236,13 +339,16 @@ class _Process:
                     stderr=said,
                 )
             except OSError as error:
-                raise BlenderError(f"Blender can't be started ({error.strerror}); check {program[0]}") from error
+                raise BlenderError(
+                    f"Blender can't be started ({error.strerror}); check {program[0]}"
+                ) from error
         weakref.finalize(self, _end, self._process, self._keeper)
 
     def picture(self, seed: int, spp: int) -> Tensor:
         """One picture with its own noise, (H, W, 3)."""
         self._count += 1
-        path, until = self._folder / f"{self._count}.exr", time.monotonic() + stored_files.scaled(LONGEST)
+        path = self._folder / f"{self._count}.exr"
+        until = time.monotonic() + stored_files.scaled(LONGEST)
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
@@ -254,7 +360,10 @@ class _Process:
                 words = workbench.last_line(self._said.read_text("utf-8", "replace"))
                 raise BlenderError(f"Blender stopped{words}")
             if time.monotonic() > until:
-                raise BlenderError(f"Blender had not rendered it after {stored_files.scaled(LONGEST)} seconds")
+                raise BlenderError(
+                    "Blender had not rendered it after "
+                    f"{stored_files.scaled(LONGEST)} seconds"
+                )
             time.sleep(PAUSE)
         with OpenEXR.File(str(path)) as picture:
             pixels = next(iter(picture.channels().values())).pixels
@@ -263,7 +372,9 @@ class _Process:
         return radiance
 
 
-def _end(process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]) -> None:
+def _end(
+    process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]
+) -> None:
     process.kill()
     process.wait()
     if process.stdin is not None:

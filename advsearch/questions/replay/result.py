@@ -22,15 +22,29 @@ from advsearch.extend import (
     wording,
 )
 
-WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
+WAYS = (
+    "samples",
+    "resolution",
+    "depth",
+    "integrator",
+    "sampler",
+    "denoiser",
+    "curve",
+    "jpeg",
+    "sensor",
+    "blender",
+)
 """What a replay may change beside the model."""
 REPLAY_TRIALS = 10
-"""Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of 10 begins at 69 %."""
+"""Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of
+10 begins at 69 %.
+"""
 
 
 class ReplayConfig(Config):
-    """Everything that decides what `replay` does: which run's adversarial scene is rendered again, and under what
-    conditions."""
+    """Everything that decides what `replay` does: which run's adversarial scene is
+    rendered again, and under what conditions.
+    """
 
     command: ClassVar[str] = "replay"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -38,10 +52,17 @@ class ReplayConfig(Config):
     )
 
     attack: str = setting(
-        ..., "replay", "the run whose adversarial scene is rendered again", "the name or the folder of a run of attack"
+        ...,
+        "replay",
+        "the run whose adversarial scene is rendered again",
+        "the name or the folder of a run of attack",
     )
     ways: str | None = setting(
-        None, "replay", "what is changed, separated by commas", f"some of {', '.join(WAYS)}", otherwise="all"
+        None,
+        "replay",
+        "what is changed, separated by commas",
+        f"some of {', '.join(WAYS)}",
+        otherwise="all",
     )
     model: str | None = setting(
         None, "replay", "other models that the scene is tried on, separated by commas", "models as `attack` takes them",
@@ -87,19 +108,27 @@ class ReplayRow(results.Fields):
     way: str = Field(description="what is changed; `as verified` where nothing is")
     condition: str = Field(description="to what")
     ending: str = Field(
-        description="`found` where the adversarial scene holds under it, as for an attack; or `not done`"
+        description="`found` where the adversarial scene holds under it, as for an "
+        "attack; or `not done`"
     )
     clean: results.ControlGroup | None = Field(
-        None, description="trials of the clean scene under it, and in how many it is right; absent if not done"
+        None,
+        description="trials of the clean scene under it, and in how many it is "
+        "right; absent if not done",
     )
     verified: results.VerifiedRate | None = Field(
-        None, description="trials of the adversarial scene, beside these; absent if not done"
+        None,
+        description="trials of the adversarial scene, beside these; absent if not done",
     )
-    reason: str = Field("", description="why it was not done, and what to do; absent if it was")
+    reason: str = Field(
+        "", description="why it was not done, and what to do; absent if it was"
+    )
 
 
 class ReplayResult(views.InNotebook, results.SceneResult):
-    """The adversarial scene of a run under other conditions than it was searched and verified under."""
+    """The adversarial scene of a run under other conditions than it was searched and
+    verified under.
+    """
 
     command: ClassVar[str] = "replay"
 
@@ -112,28 +141,57 @@ class ReplayResult(views.InNotebook, results.SceneResult):
     @property
     def brief(self) -> str:
         done = [row for row in self.table if row.ending != NOT_DONE]
-        return f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}" if done else ""
+        return (
+            (f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}")
+            if done
+            else ""
+        )
 
 
-HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "verdict")
+HEADS = (
+    "changed",
+    "to",
+    "clean right",
+    "95 % interval",
+    "success",
+    "95 % interval",
+    "verdict",
+)
 
 
 def shown(result: ReplayResult) -> ShownResult:
     note = (
-        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
-        "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
+        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, "
+        "with 95 % Clopper-Pearson "
+        "intervals. A success is what the search sought, where the clean scene is "
+        "right with the same seed under the "
         "same condition."
     )
     rows = []
     for row in result.table:
         told = ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
         if row.clean is not None and row.verified is not None:
-            verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold")
-            told = [*wording.rated_cells(row.clean), *wording.rated_cells(row.verified), verdict]
+            verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(
+                row.ending, "does not hold"
+            )
+            told = [
+                *wording.rated_cells(row.clean),
+                *wording.rated_cells(row.verified),
+                verdict,
+            ]
         rows.append([row.way, "" if row.way == row.condition else row.condition, *told])
     table = ResultPart("Under other conditions", heads=HEADS, rows=rows, note=note)
-    about = [f"{PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
-    return ShownResult(replay_text(result), [table], {"attack": result.answer, "model": result.model}, about)
+    about = [
+        f"{PurePath(result.answer).name} ({result.answered})",
+        result.object,
+        ", ".join(result.controls),
+    ]
+    return ShownResult(
+        replay_text(result),
+        [table],
+        {"attack": result.answer, "model": result.model},
+        about,
+    )
 
 
 def claims(result: ReplayResult) -> Iterator[views.Claim]:
@@ -151,7 +209,11 @@ def replay_text(result: ReplayResult) -> str:
     own = "was not rendered" if result.table[0].ending == NOT_DONE else own
     held = [row for row in changed if row.ending == "found"]
     worthless = [row for row in changed if row.ending == "already wrong"]
-    under = f"changed, it holds under {len(held)} of {len(changed)} conditions" if changed else "no change was rendered"
+    under = (
+        f"changed, it holds under {len(held)} of {len(changed)} conditions"
+        if changed
+        else "no change was rendered"
+    )
     text = f"As verified, the adversarial scene {own}; {under}."
     if worthless:
         names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)

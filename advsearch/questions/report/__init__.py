@@ -1,1 +1,3 @@
-"""What runs show, as evidence for a model card or a safety case; `advsearch report` writes it."""
+"""What runs show, as evidence for a model card or a safety case; `advsearch report`
+writes it.
+"""

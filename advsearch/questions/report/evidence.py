@@ -1,4 +1,6 @@
-"""Runs as evidence: their claims, what they were about, what varied, how it was measured, what is left out."""
+"""Runs as evidence: their claims, what they were about, what varied, how it was
+measured, what is left out.
+"""
 
 from __future__ import annotations
 
@@ -45,22 +47,34 @@ if TYPE_CHECKING:
     from advsearch.extend import workbench
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What an engineer reads of a run beside its claims: shares by condition, whether a criterion is met, how common
-# conditions are, the operational design domain in words, and what is not shown.
+# What an engineer reads of a run beside its claims: shares by condition, whether a
+# criterion is met, how common conditions are, the operational design domain in words,
+# and what is not shown.
 
 DOMAIN = {
     "place": ("environment", "background"),
     "light": ("light", "sky", "exposure", "shadow", "projector", "spot"),
     "weather": ("haze",),
-    "road users and things": ("object", "answer", "things", "pose", "body", "occlusion", "contents"),
+    "road users and things": (
+        "object",
+        "answer",
+        "things",
+        "pose",
+        "body",
+        "occlusion",
+        "contents",
+    ),
     "surfaces": ("texture", "material", "patch", "geometry", "ground"),
     "ways and speeds": ("path",),
     "camera and picture": ("camera", "lens", "sensor", "corruption"),
 }
-"""The parts of an operational design domain, and the axes and controls that each is about."""
+"""The parts of an operational design domain, and the axes and controls that each is
+about.
+"""
 OTHER = "other"  # the part of what belongs to none of them
 
-Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes are: weights by axis and value
+# how common the values of axes are: weights by axis and value
+Exposure = Mapping[str, Mapping[str, float]]
 
 
 def is_attack(result: results.Result) -> TypeGuard[workbench.AttackSummary]:
@@ -74,26 +88,43 @@ def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
 
 
 def nothing_claimed(why: str) -> views.Claim:
-    return views.Claim(kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None)
+    return views.Claim(
+        kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None
+    )
 
 
-def conditions_of(result: results.Result, photographs: Sequence[Any] | None = None) -> list[ConditionShare]:
-    """Return the share of right predictions by each value of each axis of a sweep; or that of its photographs which
-    agree with the rendering that they were aligned with: right in both or wrong in both."""
+def conditions_of(
+    result: results.Result, photographs: Sequence[Any] | None = None
+) -> list[ConditionShare]:
+    """Return the share of right predictions by each value of each axis of a sweep; or
+    that of its photographs which agree with the rendering that they were aligned with:
+    right in both or wrong in both.
+    """
     conditions = []
     for row in result.axes if is_sweep(result) else ():
-        right, total = row.correct, row.configurations
-        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)  # none of one draw
+        right = row.correct
+        total = row.configurations
+        # none of one draw
+        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)
         if photographs is not None:
             agree = [
                 bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])
                 for photo in photographs
-                if row.axis in photo.values and _has(photo.values[row.axis]["value"], row.value)
+                if row.axis in photo.values
+                and _has(photo.values[row.axis]["value"], row.value)
             ]
-            right, total = sum(agree), len(agree)
-            interval = statistics.intervals.clopper_pearson(right, total) if total else None
+            right = sum(agree)
+            total = len(agree)
+            interval = (
+                statistics.intervals.clopper_pearson(right, total) if total else None
+            )
         if total and interval is not None:
-            value = " to ".join(map(wording.number_text, row.value if isinstance(row.value, tuple) else (row.value,)))
+            value = " to ".join(
+                map(
+                    wording.number_text,
+                    row.value if isinstance(row.value, tuple) else (row.value,),
+                )
+            )
             unit = "" if row.unit == "1" else row.unit
             conditions.append(
                 ConditionShare(
@@ -116,33 +147,61 @@ def triggering_conditions(result: results.Result) -> list[str]:
 
 
 def met(criterion: float, interval: results.Interval) -> str:
-    """Return whether a share is surely at least as large as asked, surely not, or neither."""
-    return "met" if interval[0] >= criterion else "not met" if interval[1] < criterion else "open"
+    """Return whether a share is surely at least as large as asked, surely not, or
+    neither.
+    """
+    return (
+        "met"
+        if interval[0] >= criterion
+        else "not met"
+        if interval[1] < criterion
+        else "open"
+    )
 
 
 def chosen_axes(result: results.Result) -> list[str]:
-    """Return the axes of a sweep whose several values somebody chose: they are not drawn, so that a share over them is
-    one of these values."""
+    """Return the axes of a sweep whose several values somebody chose: they are not
+    drawn, so that a share over them is one of these values.
+    """
     counts = Counter[str]()
     if is_sweep(result):
         counts.update(row.axis for row in result.axes if row.axis not in result.drawn)
-    return [axis for axis, count in counts.items() if count > 1 and axis not in ("model", "answer")]
+    return [
+        axis
+        for axis, count in counts.items()
+        if count > 1 and axis not in ("model", "answer")
+    ]
 
 
 def criterion_lines(
-    claims: Sequence[views.Claim], conditions: Sequence[ConditionShare], criterion: float, chosen: Sequence[str] = ()
+    claims: Sequence[views.Claim],
+    conditions: Sequence[ConditionShare],
+    criterion: float,
+    chosen: Sequence[str] = (),
 ) -> list[str]:
-    """Return what a criterion, that so large a share is right, comes to. A share of failures has none.
+    """Return what a criterion, that so large a share is right, comes to. A share of
+    failures has none.
 
-    Where the values of axes are `chosen`, each condition is judged by itself: a share over all of them would change
-    with the choice. Without conditions, the share says that it is over these values.
+    Where the values of axes are `chosen`, each condition is judged by itself: a share
+    over all of them would change with the choice. Without conditions, the share says
+    that it is over these values.
     """
     lines = []
     if not (chosen and conditions):
-        over = f" Over the values of {', '.join(chosen)} that were chosen: others give another share." if chosen else ""
+        over = (
+            (
+                f" Over the values of {', '.join(chosen)} that were chosen: others "
+                "give "
+                "another share."
+            )
+            if chosen
+            else ""
+        )
         lines = [
-            f"At least {wording.percent(criterion)}: {met(criterion, extent.interval)} by {extent.count} of "
-            f"{extent.total} {extent.what}, 95 % interval {wording.interval_text(extent.interval)}.{over}"
+            f"At least {wording.percent(criterion)}: {met(criterion, extent.interval)} "
+            f"by {extent.count} of "
+            f"{extent.total} {extent.what}, 95 % interval "
+            f"{wording.interval_text(extent.interval)}.{over}"
             for extent in (claim.extent for claim in claims if claim.extent is not None)
             if "right" in extent.what or "held-out" in extent.what
         ]
@@ -151,35 +210,57 @@ def criterion_lines(
         named = ", ".join(chosen)
         counts = Counter(verdicts.values())
         lines.append(
-            f"At least {wording.percent(criterion)}, each condition by its own 95 % interval: met in {counts['met']}, "
-            f"not met in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over "
+            f"At least {wording.percent(criterion)}, each condition by its own 95 % "
+            f"interval: met in {counts['met']}, "
+            f"not met in {counts['not met']} and open in {counts['open']} of "
+            f"{len(verdicts)}. There is no verdict over "
             f"all: the values of {named} were chosen."
         )
     for verdict in ("not met", "open") if chosen else ("not met",):
-        if where := [condition for condition, told in verdicts.items() if told == verdict]:
+        if where := [
+            condition for condition, told in verdicts.items() if told == verdict
+        ]:
             lines.append(f"{verdict.capitalize()} where: {', '.join(where)}.")
     return lines
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
-    """Return what a YAML file says of how common values are, such as ``environment: {street: 0.8, street-wet: 0.2}``;
-    an InputError where it is missing, or says something else."""
+    """Return what a YAML file says of how common values are, such as ``environment:
+    {street: 0.8, street-wet: 0.2}``; an InputError where it is missing, or says
+    something else.
+    """
     exposure: dict[str, dict[str, float]] = {}
     for axis, weights in settings.read_yaml(path).items():
         if not isinstance(weights, Mapping) or not weights:
-            raise InputError(f"exposure: {path}: {axis}: expected values with a weight each, such as {{street: 0.8}}")
+            raise InputError(
+                f"exposure: {path}: {axis}: expected values with a weight "
+                f"each, such as {{street: 0.8}}"
+            )
         for value, weight in weights.items():
-            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0.0 <= weight <= 1e9:
-                raise InputError(f"exposure: {path}: {axis}: {value}: expected a number of at least 0, got {weight!r}")
-        exposure[str(axis)] = {str(value): float(weight) for value, weight in weights.items()}
+            if (
+                isinstance(weight, bool)
+                or not isinstance(weight, (int, float))
+                or not 0.0 <= weight <= 1e9
+            ):
+                raise InputError(
+                    f"exposure: {path}: {axis}: {value}: expected a "
+                    f"number of at least 0, got {weight!r}"
+                )
+        exposure[str(axis)] = {
+            str(value): float(weight) for value, weight in weights.items()
+        }
         if sum(exposure[str(axis)].values()) <= 0.0:
             raise InputError(f"exposure: {path}: {axis}: expected a weight over 0")
     return exposure
 
 
-def exposure_lines(result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure) -> list[str]:
-    """Return the share of right predictions where the values of an axis are as common as weights say: the weighted mean
-    of the shares, between those of the ends of intervals that hold together (Bonferroni)."""
+def exposure_lines(
+    result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure
+) -> list[str]:
+    """Return the share of right predictions where the values of an axis are as common
+    as weights say: the weighted mean of the shares, between those of the ends of
+    intervals that hold together (Bonferroni).
+    """
     lines = []
     independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
@@ -188,18 +269,29 @@ def exposure_lines(result: results.Result, conditions: Sequence[ConditionShare],
             continue
         for value in weights:
             if value not in rows:
-                raise errors.UnknownNameError(f"value of {axis} in the exposure", value, rows)
+                raise errors.UnknownNameError(
+                    f"value of {axis} in the exposure", value, rows
+                )
         total = sum(weights.values())
         if not independent:
-            lines.append(f"Weighted by {axis}: not told, as predictions share draws (frames of a drive do).")
+            lines.append(
+                f"Weighted by {axis}: not told, as predictions share draws "
+                "(frames of a drive do)."
+            )
             continue
         sure = 1.0 - 0.05 / len(weights)
         mean = low = high = 0.0
         for value, weight in weights.items():
-            row, part = rows[value], weight / total
+            row = rows[value]
+            part = weight / total
             ends = statistics.intervals.clopper_pearson(row.right, row.total, sure)
-            mean, low, high = mean + part * row.right / row.total, low + part * ends[0], high + part * ends[1]
-        shares = ", ".join(f"{value} {wording.percent(weight / total)}" for value, weight in weights.items())
+            mean = mean + part * row.right / row.total
+            low = low + part * ends[0]
+            high = high + part * ends[1]
+        shares = ", ".join(
+            f"{value} {wording.percent(weight / total)}"
+            for value, weight in weights.items()
+        )
         lines.append(
             f"Weighted by {axis} ({shares}): right in {wording.percent(mean)}, "
             f"95 % interval {wording.interval_text((low, high))}."
@@ -216,7 +308,9 @@ class Variation(Enum):
 
 
 class DomainPart(NamedTuple):
-    """What a part of an operational design domain was, in words, and whether that varied."""
+    """What a part of an operational design domain was, in words, and whether that
+    varied.
+    """
 
     variation: Variation
     description: str
@@ -227,12 +321,20 @@ class DomainPart(NamedTuple):
 
 
 def domain_of(
-    result: results.Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]
+    result: results.Result,
+    recorded: Sequence[RecordedSettings],
+    searched: Sequence[str],
 ) -> dict[str, DomainPart]:
-    """Return the parts of an operational design domain by name: within what each varied, or what it was."""
+    """Return the parts of an operational design domain by name: within what each
+    varied, or what it was.
+    """
     fixed = defaultdict[str, list[str]](list)
-    fixed["place"].append(str(getattr(result, "environment", "") or stated(recorded, "environment")))
-    things = filter(None, (str(getattr(result, "object", "") or ""), stated(recorded, "things")))
+    fixed["place"].append(
+        str(getattr(result, "environment", "") or stated(recorded, "environment"))
+    )
+    things = filter(
+        None, (str(getattr(result, "object", "") or ""), stated(recorded, "things"))
+    )
     fixed["road users and things"].append("; ".join(things))
     fixed["camera and picture"].append(stated(recorded, "camera"))
     values = dict.fromkeys(
@@ -248,8 +350,15 @@ def domain_of(
     for part in (*DOMAIN, OTHER):
         varied = [line for line in searched if part_of_domain(line) == part]
         varied = varied or [name for name in moving if part_of_domain(name) == part]
-        for drive in (getattr(result, "drives", None) or [])[:1] if part == "ways and speeds" else ():
-            varied.append(f"{drive.drives} drives of {drive.seconds:g} s, {drive.frames} frames each")
+        for drive in (
+            (getattr(result, "drives", None) or [])[:1]
+            if part == "ways and speeds"
+            else ()
+        ):
+            varied.append(
+                f"{drive.drives} drives of {drive.seconds:g} s, "
+                f"{drive.frames} frames each"
+            )
         was = "; ".join(filter(None, fixed[part]))
         if varied:
             domain[part] = DomainPart(Variation.VARIED, "; ".join(varied))
@@ -263,7 +372,9 @@ def domain_of(
 
 
 def part_of_domain(name: str) -> str:
-    """Return the part of a domain that an axis, a control or a parameter of a scene is about."""
+    """Return the part of a domain that an axis, a control or a parameter of a scene is
+    about.
+    """
     begins = re.match(r"\w+", name)
     for part, names in DOMAIN.items():
         if begins is not None and begins[0] in names:
@@ -271,53 +382,98 @@ def part_of_domain(name: str) -> str:
     return OTHER
 
 
-PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")  # of a run that say most of what it found, best first
+# of a run that say most of what it found, best first
+PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")
 
 RULES = (
-    "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
-    "`found`: fresh renders confirm a configuration that a search found; how many others there are is not known.",
-    "`not found`: a search of so many renders found none; another policy or more renders may find one.",
-    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson's; where predictions "
-    "share a draw, as frames of a drive do, one over draws, by bets) and holds for the distribution that was drawn "
+    "Each claim is about the run's own model, object, environment, label and settings, "
+    "and about nothing else.",
+    "`found`: fresh renders confirm a configuration that a search found; how many "
+    "others there are is not known.",
+    "`not found`: a search of so many renders found none; another policy or more "
+    "renders may find one.",
+    "`measured`: a share of what was counted; its interval has 95 % confidence "
+    "(Clopper-Pearson's; where predictions "
+    "share a draw, as frames of a drive do, one over draws, by bets) and holds for the "
+    "distribution that was drawn "
     "from.",
     "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
-    "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
+    "Renderings are not photographs: a claim is about reality only as far as "
+    "photographs were compared.",
 )
 
-QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
+QUICK = (
+    "Made by a quick recipe: few and small pictures, to see what comes out; no result."
+)
 
 
 def claims_of(result: results.Result) -> list[views.Claim]:
     if result.goes_on:
-        state = "is running" if getattr(result, "ending", "") == results.RUNNING else "is not finished"
-        return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
+        state = (
+            "is running"
+            if getattr(result, "ending", "") == results.RUNNING
+            else "is not finished"
+        )
+        return [
+            nothing_claimed(
+                f"the run {state}"
+                + (f"; so far: {result.brief}" if result.brief else "")
+            )
+        ]
     if claims := workbench.get_experiment(result.command).claims:
-        return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
-    return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
+        return list(claims(result)) or [
+            nothing_claimed("nothing in this run came to its end")
+        ]
+    return [
+        nothing_claimed(
+            f"the command {result.command} does not measure how often a model is right"
+        )
+    ]
 
 
 def photo_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement (`advsearch.photo_agreement`); none where it is empty."""
+    """Return the claim of a table of agreement (`advsearch.photo_agreement`); none
+    where it is empty.
+    """
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
-    extent = results.Extent.from_count("photographs that agree", agreeing, photos.photos, photos.interval)
-    text = f"Photographs and renderings agree (both right, or both wrong) in {wording.share_text(extent)}."
+    extent = results.Extent.from_count(
+        "photographs that agree", agreeing, photos.photos, photos.interval
+    )
+    text = (
+        "Photographs and renderings agree (both right, or both wrong) in "
+        f"{wording.share_text(extent)}."
+    )
     return [
-        views.Claim(kind="measured", statement=f"{text} The interval takes photographs as independent.", extent=extent)
+        views.Claim(
+            kind="measured",
+            statement=f"{text} The interval takes photographs as independent.",
+            extent=extent,
+        )
     ]
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
-    """Return what has to be known of runs together, from their models and the digests of these files, a text a run."""
-    warnings, names = [], sorted(set(models))
+    """Return what has to be known of runs together, from their models and the digests
+    of these files, a text a run.
+    """
+    warnings = []
+    names = sorted(set(models))
     if len(names) > 1:
         different = f"The runs are of different models: {', '.join(names)}."
         warnings.append(f"{different} A claim about one is none about another.")
     for name in names:
-        known = {text for model, text in zip(models, digests, strict=True) if model == name and text}
+        known = {
+            text
+            for model, text in zip(models, digests, strict=True)
+            if model == name and text
+        }
         if len(known) > 1:
-            warnings.append(f"{name}: its file was not the same in all runs, so that they are of {len(known)} models.")
+            warnings.append(
+                f"{name}: its file was not the same in all runs, so that "
+                f"they are of {len(known)} models."
+            )
     return warnings
 
 
@@ -325,7 +481,9 @@ NOT_NOTED = "not noted"
 NO_MAP = "none"  # the environment of a scene that has lights of its own
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
-NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights were given."
+NOT_WEIGHTED = (
+    "Nothing is said of how common the conditions are: no weights were given."
+)
 
 
 def evidence_of(
@@ -335,17 +493,28 @@ def evidence_of(
     recorded: Sequence[RecordedSettings],
     made: Mapping[str, str],
 ) -> EvidenceRun:
-    """Return a run with what a reader needs to judge its claims: the settings that it recorded, its own first, and
-    versions and digests as it noted them."""
+    """Return a run with what a reader needs to judge its claims: the settings that it
+    recorded, its own first, and versions and digests as it noted them.
+    """
     settings = recorded[0].values if recorded else {}
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
-    right = values.get("label_set") or stated(recorded, "label", "the object's own label")
+    right = values.get("label_set") or stated(
+        recorded, "label", "the object's own label"
+    )
     lit_by = str(values.get("environment") or "")
-    moving = {name.partition(":")[0] for which in ("over", "controls") for name in values.get(which) or ()}
+    moving = {
+        name.partition(":")[0]
+        for which in ("over", "controls")
+        for name in values.get(which) or ()
+    }
     if lit_by and {"environment", "sky"} & moving:
         attacked = is_attack(result)
-        lit_by = f"varied, see below; the clean scene has {lit_by}" if attacked else f"{lit_by}, varied"
+        lit_by = (
+            f"varied, see below; the clean scene has {lit_by}"
+            if attacked
+            else f"{lit_by}, varied"
+        )
     about = {
         "Object": str(objects or ""),
         "Environment": lit_by,
@@ -358,9 +527,13 @@ def evidence_of(
         "Counts as right": ", ".join(right) if isinstance(right, list) else right,
         "Sought": str(values.get("goal") or ""),
     }
-    renders, seconds = values.get("renders"), values.get("seconds") or {}
+    renders = values.get("renders")
+    seconds = values.get("seconds") or {}
     if isinstance(renders, Mapping):
-        renders = ", ".join(f"{number} {name}" for name, number in renders.items() if number) or "none"
+        renders = (
+            ", ".join(f"{number} {name}" for name, number in renders.items() if number)
+            or "none"
+        )
     return EvidenceRun(
         run=name, command=result.command, ending=str(values.get("ending") or "done"), claims=list(claims),
         about={key: text for key, text in about.items() if text}, searched=searched_lines(result, settings),
@@ -377,14 +550,23 @@ def evidence_of(
 def searched_lines(result: results.Result, settings: Mapping[str, object]) -> list[str]:
     lines = []
     if is_attack(result):
-        lines.append(workbench.get_experiment(result.command).view(result).facts["changed"])
+        lines.append(
+            workbench.get_experiment(result.command).view(result).facts["changed"]
+        )
         lines += [
             f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
             for name, found in (result.configuration or {}).items()
             if found.low is not None and found.high is not None
         ]
-        lines += [f"{' and '.join(result.over)}, drawn anew for every picture"] if result.over else []
-        lines += [f"{name}: {_span(varied)}, by chance" for name, varied in result.conditions.items()]
+        lines += (
+            [f"{' and '.join(result.over)}, drawn anew for every picture"]
+            if result.over
+            else []
+        )
+        lines += [
+            f"{name}: {_span(varied)}, by chance"
+            for name, varied in result.conditions.items()
+        ]
     elif is_sweep(result):
         axes = dict[tuple[str, str], list[Any]]()
         for row in result.axes:
@@ -393,9 +575,15 @@ def searched_lines(result: results.Result, settings: Mapping[str, object]) -> li
         for (axis, unit), values in axes.items():
             text = ", ".join(map(wording.number_text, values))
             if all(isinstance(value, tuple) for value in values):  # parts of one range
-                text = f"{min(low for low, _ in values):.4g} to {max(high for _, high in values):.4g}"
+                text = (
+                    f"{min(low for low, _ in values):.4g} to "
+                    f"{max(high for _, high in values):.4g}"
+                )
             lines.append(f"{axis}: {text} {unit}".rstrip())
-        lines += [f"{name}: {_span(varied)}, drawn by chance" for name, varied in result.drawn.items()]
+        lines += [
+            f"{name}: {_span(varied)}, drawn by chance"
+            for name, varied in result.drawn.items()
+        ]
     controls = settings.get("controls") or {}
     for control in getattr(result, "controls", ()):
         given = controls.get(control) if isinstance(controls, Mapping) else None
@@ -412,11 +600,16 @@ def searched_lines(result: results.Result, settings: Mapping[str, object]) -> li
 def _span(varied: results.VariedValue) -> str:
     if varied.low is None or varied.high is None:
         return " or ".join(varied.names or ["something"])
-    return f"{varied.low:.4g} to {varied.high:.4g} {'' if varied.unit == '1' else varied.unit}".rstrip()
+    return (
+        f"{varied.low:.4g} to {varied.high:.4g} "
+        f"{'' if varied.unit == '1' else varied.unit}"
+    ).rstrip()
 
 
 def _measured(
-    result: results.Result, settings: Mapping[str, object], recorded: Sequence[RecordedSettings]
+    result: results.Result,
+    settings: Mapping[str, object],
+    recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
     tasks = [one.task for one in recorded if one.is_of_scene]
     trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
@@ -430,34 +623,57 @@ def _measured(
         trials: settings.get("trials"),
         "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
-    named = {name: str(value) for name, value in facts.items() if value not in (None, "")}
+    named = {
+        name: str(value) for name, value in facts.items() if value not in (None, "")
+    }
     if is_attack(result) and result.verified is not None:
-        rated, control = result.verified, result.clean.control
+        rated = result.verified
+        control = result.clean.control
         counting = f"{rated.trials} renders with fresh seeds"
         if result.over and control is not None and control.trials > rated.trials:
-            counting += f" that count, those of {control.trials} in which the clean scene is right"
+            counting += (
+                f" that count, those of {control.trials} in which the clean "
+                "scene is right"
+            )
         named["Verification"] = f"{counting}, {rated.spp} samples a pixel"
     formation = getattr(result, "image_formation", None)
     gains = getattr(result, "gains", None)
-    return {**named, "Pictures": wording.formation_text(formation, gains)} if formation else named
+    return (
+        {**named, "Pictures": wording.formation_text(formation, gains)}
+        if formation
+        else named
+    )
 
 
 def _excluded(result: results.Result, claims: Sequence[views.Claim]) -> list[str]:
-    lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
+    lines = [
+        "Nothing varied but what stands under What varied, and the noise of the "
+        "renders."
+    ]
     if is_attack(result):
         lines += workbench.get_experiment(result.command).view(result).cautions
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
-            lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
+            lines.append(
+                f"Not finite: {bad.objectives} objectives, "
+                f"{bad.gradient_elements} numbers of gradients."
+            )
         lines += [
-            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} {moved.unit} in place of "
+            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} "
+            f"{moved.unit} in place of "
             f"{wording.number_text(moved.scene)}: the control leaves that out."
             for moved in result.clean.moved
         ]
     if is_sweep(result) and result.not_finite:
-        lines.append(f"{result.not_finite} predictions were not numbers; they count as not right.")
+        lines.append(
+            f"{result.not_finite} predictions were not numbers; they count as "
+            "not right."
+        )
     if is_sweep(result) and result.looked_at < result.planned:
-        lines.append(f"Only {result.looked_at} of {result.planned} planned configurations were looked at.")
+        lines.append(
+            f"Only {result.looked_at} of {result.planned} planned "
+            "configurations were looked at."
+        )
     if all(claim.kind == "nothing claimed" for claim in claims):
         lines.append(NO_CLAIM)
     return lines + list(getattr(result, "warnings", ()))
@@ -467,35 +683,61 @@ MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
 
 
 def collected(
-    runs: list[str], *, criterion: float | None = None, exposure: Exposure | None = None, by: str = ""
+    runs: list[str],
+    *,
+    criterion: float | None = None,
+    exposure: Exposure | None = None,
+    by: str = "",
 ) -> tuple[Evidence, dict[str, bytes]]:
-    """Return runs, by their names or folders, as evidence, with the pictures that it names; `criterion` is the share of
-    right predictions that is asked for, `exposure` how common the values of axes are, and `by` who answers for it."""
-    told, pictures, folders = list[EvidenceRun](), dict[str, bytes](), dict[Path, Path]()
-    models, digests = list[str](), list[str]()
+    """Return runs, by their names or folders, as evidence, with the pictures that it
+    names; `criterion` is the share of right predictions that is asked for, `exposure`
+    how common the values of axes are, and `by` who answers for it.
+    """
+    told = list[EvidenceRun]()
+    pictures = dict[str, bytes]()
+    folders = dict[Path, Path]()
+    models = list[str]()
+    digests = list[str]()
     for folder in map(directory.find_run, runs):
-        parts = [part for part in sorted((folder / directory.PARTS).glob("*")) if directory.is_run(part)]
-        of_recipe = parts and own_settings(folder).get("command") == "recipe"  # the runs that it consists of
+        parts = [
+            part
+            for part in sorted((folder / directory.PARTS).glob("*"))
+            if directory.is_run(part)
+        ]
+        # the runs that it consists of
+        of_recipe = parts and own_settings(folder).get("command") == "recipe"
         folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
     for number, folder in enumerate(folders.values(), 1):
         files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
         files = [file for file in files if file.is_file() and not file.is_symlink()][:3]
         own = {
-            f"pictures/{number}-{file.name}": stored_files.read_bytes(file, "a picture", MOST_OF_PICTURE)
+            f"pictures/{number}-{file.name}": stored_files.read_bytes(
+                file, "a picture", MOST_OF_PICTURE
+            )
             for file in files
         }
         pictures |= own
-        run, begun = _run(folder, criterion, exposure or {}), ""
+        run = _run(folder, criterion, exposure or {})
+        begun = ""
         with suppress(OSError):  # when its settings were written
-            written = datetime.fromtimestamp((folder / directory.CONFIG).stat().st_mtime, timezone.utc)
+            written = datetime.fromtimestamp(
+                (folder / directory.CONFIG).stat().st_mtime, timezone.utc
+            )
             begun = f"{written:%Y-%m-%d %H:%M} UTC"
         told.append(run.model_copy(update={"pictures": list(own), "begun": begun}))
         if model := run.about.get("Model"):
             of_model = model, model.rpartition("@")[2]
             models.append(model)
-            digests.append(" ".join(text for name, text in run.made_with.items() if name in of_model))
+            digests.append(
+                " ".join(
+                    text for name, text in run.made_with.items() if name in of_model
+                )
+            )
     unused = set(exposure or {}) - {row.axis for run in told for row in run.conditions}
-    warnings = [*warnings_over(models, digests), *(f"exposure: no run has the axis {axis}." for axis in sorted(unused))]
+    warnings = [
+        *warnings_over(models, digests),
+        *(f"exposure: no run has the axis {axis}." for axis in sorted(unused)),
+    ]
     evidence = Evidence(
         runs=told, warnings=warnings, rules=list(RULES), version=__version__, by=by, criterion=criterion,
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
@@ -507,16 +749,22 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     """One run; of one that has no summary, that it claims nothing."""
     settings = own_settings(folder)
     if not (folder / directory.summary.NAME).is_file():
-        facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}
+        facts = {
+            "Object": str(settings.get("object") or ""),
+            "Model": str(settings.get("model") or ""),
+        }
         return EvidenceRun(
             run=directory.typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
-            claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
+            claims=[nothing_claimed("the run has no result yet: it is still working, "
+                                    "or was stopped")],
             about={key: text for key, text in facts.items() if text}, searched=[], measured={}, excluded=[NO_CLAIM],
             cost={}, made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
             settings=RecordedSettings("", settings).as_text(),
             command_line=f"advsearch run {folder / directory.CONFIG}",
         )  # fmt: skip
-    result, photographs, rows = read_result(folder), list[views.Claim](), list[Any]()
+    result = read_result(folder)
+    photographs = list[views.Claim]()
+    rows = list[Any]()
     if (folder / directory.PHOTOGRAPHS).is_dir():
         from advsearch.extend import workbench  # it brings torch, which takes a second
 
@@ -534,29 +782,49 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
         made.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
     run = evidence_of(directory.typed_name(folder), result, claims, recorded, made)
     outer = own_settings(folder.resolve().parent.parent)
-    few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
+    few = (
+        [QUICK]
+        if outer.get("command") == "recipe" and outer.get("quick") is True
+        else []
+    )
     basis = []  # the sweeps whose rows it reads: it is about what varied there
     for path in sweeps:
         with suppress(errors.AdvsearchError):
             basis.append((read_result(path), own_settings(path)))
-    searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
+    searched = list(
+        dict.fromkeys(line for one in basis for line in searched_lines(*one))
+    )
     if (noted_parts := noted_settings(folder, result)) is not None:
         searched = _searched_by_claims(noted_parts.get(CLAIM))
     searched = searched or run.searched
     domain = domain_of(basis[0][0] if basis else result, recorded, searched)
-    chosen = list(dict.fromkeys(axis for one in (result, *(swept for swept, _ in basis)) for axis in chosen_axes(one)))
+    chosen = list(
+        dict.fromkeys(
+            axis
+            for one in (result, *(swept for swept, _ in basis))
+            for axis in chosen_axes(one)
+        )
+    )
     conditions = conditions_of(result)
     weighted = exposure_lines(result, conditions, exposure)
     compared = sum(claim.extent.total for claim in photographs if claim.extent)
-    photographed = f"Only {compared} photographs were" if compared else "No photograph was"
-    not_shown = [f"{photographed} compared with renderings: all else is about renderings."]
-    if still := [name for name, part in domain.items() if part.variation is Variation.FIXED]:
+    photographed = (
+        f"Only {compared} photographs were" if compared else "No photograph was"
+    )
+    not_shown = [
+        f"{photographed} compared with renderings: all else is about renderings."
+    ]
+    if still := [
+        name for name, part in domain.items() if part.variation is Variation.FIXED
+    ]:
         not_shown.append(f"Nothing is said of other values of: {', '.join(still)}.")
     not_shown.append(WEIGHTED if weighted else NOT_WEIGHTED)
     more = {
         "searched": searched,
         "excluded": [*few, *run.excluded],
-        "criterion": [] if criterion is None else criterion_lines(claims, conditions, criterion, chosen),
+        "criterion": []
+        if criterion is None
+        else criterion_lines(claims, conditions, criterion, chosen),
         "triggering": triggering_conditions(result),
         "exposure": weighted,
         "conditions": conditions,
@@ -568,7 +836,9 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
 
 
 def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[str]:
-    """Return what varied in the claims of a suite, by the settings of each; None for settings that can't be read."""
+    """Return what varied in the claims of a suite, by the settings of each; None for
+    settings that can't be read.
+    """
     if claims is None:
         return ["as the claims of its suite say, which cannot be read any more"]
     lines = defaultdict[str, list[str]](list)
@@ -577,7 +847,11 @@ def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[
         if not isinstance(controls, Mapping):
             controls = dict.fromkeys(str(controls).split(","))
         for control, given in controls.items():
-            text = json.dumps(given, ensure_ascii=False) if given else "everything it searches by default"
+            text = (
+                json.dumps(given, ensure_ascii=False)
+                if given
+                else "everything it searches by default"
+            )
             lines[f"{control}: {text}"].append(name)
         if claim_settings.get("environment"):
             lines[f"environment: {claim_settings['environment']}"].append(name)

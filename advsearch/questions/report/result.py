@@ -1,4 +1,6 @@
-"""What `report --evidence` writes: claims of runs with what a reader needs to judge them, as a page and Markdown."""
+"""What `report --evidence` writes: claims of runs with what a reader needs to judge
+them, as a page and Markdown.
+"""
 
 from __future__ import annotations
 
@@ -29,28 +31,53 @@ class EvidenceRun(results.Fields):
     command: str
     ending: str
     claims: list[views.Claim]
-    begun: str = Field("", description="when the run was begun, UTC; empty where that is not known")
-    criterion: list[str] = Field([], description="what the criterion comes to; absent without one")
-    triggering: list[str] = Field([], description="rules under which the model is wrong more often; absent without")
-    exposure: list[str] = Field([], description="shares weighted by how common conditions are; absent without weights")
-    conditions: list[ConditionShare] = Field([], description="by each value of each axis; absent without")
+    begun: str = Field(
+        "", description="when the run was begun, UTC; empty where that is not known"
+    )
+    criterion: list[str] = Field(
+        [], description="what the criterion comes to; absent without one"
+    )
+    triggering: list[str] = Field(
+        [],
+        description="rules under which the model is wrong more often; absent without",
+    )
+    exposure: list[str] = Field(
+        [],
+        description="shares weighted by how common "
+        "conditions are; absent without weights",
+    )
+    conditions: list[ConditionShare] = Field(
+        [], description="by each value of each axis; absent without"
+    )
     photographs: list[ConditionShare] = Field(
-        [], description="`right`: how many of the photographs agree with the rendering that they were aligned with, by "
+        [], description="`right`: how many of the photographs agree with the rendering "
+                        "that they were aligned with, by "
         "each value of each axis; absent without"
     )  # fmt: skip
-    domain: dict[str, str] = Field({}, description="the operational design domain in words, by its parts")
+    domain: dict[str, str] = Field(
+        {}, description="the operational design domain in words, by its parts"
+    )
     not_shown: list[str] = Field([], description="what a reader must not take from it")
     pictures: list[str] = Field([], description="files beside this one")
-    about: dict[str, str] = Field(description="object, environment, model, task and what counts as right")
+    about: dict[str, str] = Field(
+        description="object, environment, model, task and what counts as right"
+    )
     searched: list[str] = Field(description="what could change, and how far")
-    measured: dict[str, str] = Field(description="policy, seed, samples and the like, by name")
+    measured: dict[str, str] = Field(
+        description="policy, seed, samples and the like, by name"
+    )
     settings: dict[str, str] = Field(
-        {}, description="every setting that the run recorded and that says something, by its name; of claims, "
+        {}, description="every setting that the run recorded and that says something, "
+                        "by its name; of claims, "
         "counterexamples and the runs that it read with their names before it"
     )  # fmt: skip
-    excluded: list[str] = Field(description="what was not searched, was rejected, or went wrong")
+    excluded: list[str] = Field(
+        description="what was not searched, was rejected, or went wrong"
+    )
     cost: dict[str, str] = Field(description="renders and time")
-    made_with: dict[str, str] = Field(description="versions, and SHA-256 of files; as the run noted them")
+    made_with: dict[str, str] = Field(
+        description="versions, and SHA-256 of files; as the run noted them"
+    )
     command_line: str = Field(description="what repeats it")
 
 
@@ -60,12 +87,16 @@ class Evidence(results.Result):
     command: ClassVar[str] = "report"
 
     runs: list[EvidenceRun]
-    warnings: list[str] = Field(description="what has to be known of all of them together")
+    warnings: list[str] = Field(
+        description="what has to be known of all of them together"
+    )
     rules: list[str] = Field(description="how the claims are to be read")
     version: str = Field(description="of advsearch, that wrote this")
     written: str = Field("", description="when, UTC")
     by: str = Field("", description="who, as given; absent otherwise")
-    criterion: float | None = results.optional("share of right predictions that was asked for; absent otherwise")
+    criterion: float | None = results.optional(
+        "share of right predictions that was asked for; absent otherwise"
+    )
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
@@ -75,7 +106,12 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
     ):
         if conditions:
             rows = [
-                [row.condition, str(row.right), str(row.total), wording.interval_text(row.interval)]
+                [
+                    row.condition,
+                    str(row.right),
+                    str(row.total),
+                    wording.interval_text(row.interval),
+                ]
                 for row in conditions
             ]
             yield title, (first, verb, "of", "95 % interval"), rows
@@ -83,26 +119,52 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
 
 def markdown(evidence: Evidence) -> str:
     def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-        return [*(f"| {' | '.join(map(_plain, row))} |" for row in (heads, ["---"] * len(heads), *rows)), ""]
+        return [
+            *(
+                f"| {' | '.join(map(_plain, row))} |"
+                for row in (heads, ["---"] * len(heads), *rows)
+            ),
+            "",
+        ]
 
-    lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings), *[""] * bool(evidence.warnings)]
+    lines = [
+        "# Evidence",
+        "",
+        *(f"> {text}" for text in evidence.warnings),
+        *[""] * bool(evidence.warnings),
+    ]
     for run in evidence.runs:
         lines += [f"## {_plain(run.run)}", ""]
-        lines += [*(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims), ""]
+        lines += [
+            *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims),
+            "",
+        ]
         for _, heads, rows in tables_of(run):
             lines += table(heads, rows)
-        lines += [f"![{name}]({name})" for name in run.pictures] + [""] * bool(run.pictures)
+        lines += [f"![{name}]({name})" for name in run.pictures] + [""] * bool(
+            run.pictures
+        )
         for title, facts in sections(run).items():
             lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
         if run.command_line:
-            lines += ["To repeat it:", "", "```sh", run.command_line.replace("```", "` ` `"), "```", ""]
+            lines += [
+                "To repeat it:",
+                "",
+                "```sh",
+                run.command_line.replace("```", "` ` `"),
+                "```",
+                "",
+            ]
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
     return "\n".join([*lines, _signed(evidence)]) + "\n"
 
 
 def _signed(evidence: Evidence) -> str:
     by = f" by {_plain(evidence.by)}" if evidence.by else ""
-    return f"Written{by}, {evidence.written or 'at a time that is not noted'}, with advsearch {evidence.version}."
+    return (
+        f"Written{by}, {evidence.written or 'at a time that is not noted'}, with "
+        f"advsearch {evidence.version}."
+    )
 
 
 def sections(run: EvidenceRun) -> dict[str, list[str]]:
@@ -133,35 +195,63 @@ def _plain(text: str) -> str:
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
 
-def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = None) -> str:
+def evidence_page(
+    evidence: Evidence, pictures: Mapping[str, bytes] | None = None
+) -> str:
     claims = [claim for run in evidence.runs for claim in run.claims]
     carried = sum(claim.kind != "nothing claimed" for claim in claims)
     said = (
-        f"What {wording.count(len(evidence.runs), 'run')} show{'s' * (len(evidence.runs) == 1)}, and no more than that."
+        f"What {wording.count(len(evidence.runs), 'run')} "
+        f"show{'s' * (len(evidence.runs) == 1)}, and no more than that."
     )
     main = markup.element(
         "main", *(_run_html(run, pictures or {}) for run in evidence.runs), markup.element("h2", "How to read this"),
         markup.element("ul", *(markup.element("li", text.replace("`", "")) for text in evidence.rules)),
         markup.element("p", _signed(evidence), class_="soft"),
     )  # fmt: skip
-    header = markup.heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
-    return markup.document("evidence", header, main, footer="evidence. This page needs no other file.")
+    header = markup.heading(
+        f"evidence; {carried} of {len(claims)} statements carry a claim",
+        said,
+        evidence.warnings,
+    )
+    return markup.document(
+        "evidence", header, main, footer="evidence. This page needs no other file."
+    )
 
 
 def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     rows = []
     for claim in run.claims:
         extent = claim.extent
-        counted = [f"{extent.count} of {extent.total}", wording.interval_text(extent.interval)] if extent else ["", ""]
+        counted = (
+            [
+                f"{extent.count} of {extent.total}",
+                wording.interval_text(extent.interval),
+            ]
+            if extent
+            else ["", ""]
+        )
         rows.append([claim.kind, claim.statement, *counted])
-    parts = [markup.element("h2", f"{run.run} ({run.command})"), markup.study_table(CLAIM_HEADS, rows)]
+    parts = [
+        markup.element("h2", f"{run.run} ({run.command})"),
+        markup.study_table(CLAIM_HEADS, rows),
+    ]
     if run.pictures:
-        data = {name: markup.data_url(pictures[name], "image/png") for name in run.pictures if name in pictures}
-        images = (markup.element("figure", markup.element("img", src=url, alt=name)) for name, url in data.items())
+        data = {
+            name: markup.data_url(pictures[name], "image/png")
+            for name in run.pictures
+            if name in pictures
+        }
+        images = (
+            markup.element("figure", markup.element("img", src=url, alt=name))
+            for name, url in data.items()
+        )
         parts.append(markup.element("div", *images, class_="pictures"))
     for title, heads, cells in tables_of(run):
         summary = markup.element("summary", f"{title} by condition, {len(cells)} rows")
-        parts.append(markup.element("details", summary, markup.study_table(heads, cells)))
+        parts.append(
+            markup.element("details", summary, markup.study_table(heads, cells))
+        )
     facts = [
         markup.element(
             "tr",
@@ -172,8 +262,16 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     ]
     table = markup.element("table", markup.element("tbody", *facts), class_="facts")
     parts.append(
-        markup.element("details", markup.element("summary", "On what, how, and what is left out"), table, open="")
+        markup.element(
+            "details",
+            markup.element("summary", "On what, how, and what is left out"),
+            table,
+            open="",
+        )
     )
     if run.command_line:
-        parts += [markup.element("h2", "Do it again"), markup.element("pre", run.command_line, class_="wrap")]
+        parts += [
+            markup.element("h2", "Do it again"),
+            markup.element("pre", run.command_line, class_="wrap"),
+        ]
     return markup.join_html(*parts)

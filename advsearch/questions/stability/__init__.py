@@ -13,11 +13,15 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
     "stability --seconds 120 --run extremes",
     "resume extremes",
     help_suffix=". Exit status 3 if one falls short",
-    exit_status=lambda result: errors.FELL_SHORT if any(row.status != "ok" for row in result.rows) else 0,
+    exit_status=lambda result: (
+        errors.FELL_SHORT if any(row.status != "ok" for row in result.rows) else 0
+    ),
     view=shown,
 )
 def stability(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
+    """Try stiff and extreme scenes, and say whether each of them holds
+    (docs/stability.md).
+    """
     from advsearch.questions.stability.scenes import run_cases  # imports torch
 
     return run_cases(context)

@@ -1,4 +1,6 @@
-"""What `stability` needs to know, its result, and what a case is; the cases are in the files beside this one."""
+"""What `stability` needs to know, its result, and what a case is; the cases are in the
+files beside this one.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ from advsearch.extend import (
 
 
 class StabilityConfig(Config):
-    """Everything that decides what `stability` does: which cases it tries, for how long, and where that is kept."""
+    """Everything that decides what `stability` does: which cases it tries, for how
+    long, and where that is kept.
+    """
 
     command: ClassVar[str] = "stability"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
@@ -36,14 +40,25 @@ class StabilityConfig(Config):
     )
 
     case: str | None = setting(
-        None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", repeats=True
+        None,
+        "check",
+        "cases to try, separated by commas",
+        "names of cases",
+        otherwise="all",
+        repeats=True,
     )
     group: str | None = setting(
-        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", repeats=True
+        None,
+        "check",
+        "groups of cases to try, separated by commas",
+        "names of groups",
+        otherwise="all",
+        repeats=True,
     )
     seconds: float | None = setting(
         None, "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        "time after which no measurement is begun any more; `advsearch resume` goes on "
+        "for as long again",
         otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )  # fmt: skip
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
@@ -61,11 +76,14 @@ class StabilityConfig(Config):
         return () if self.group is None else settings.split_names(self.group)
 
 
-OK, FELL_SHORT = "ok", "fell short"
+OK = "ok"
+FELL_SHORT = "fell short"
 
 
 class Check(results.Fields):
-    """One number that decides, and the range that it has to be in, both ends included; null where there is no end."""
+    """One number that decides, and the range that it has to be in, both ends included;
+    null where there is no end.
+    """
 
     what: str
     value: results.JsonFloat
@@ -75,15 +93,29 @@ class Check(results.Fields):
 
     def __str__(self) -> str:
         ends = [
-            f"{sign} {end:.4g}" for sign, end in (("at least", self.least), ("at most", self.most)) if end is not None
+            f"{sign} {end:.4g}"
+            for sign, end in (("at least", self.least), ("at most", self.most))
+            if end is not None
         ]
-        wanted = f"exactly {self.most:.4g}" if len(ends) == 2 and self.least == self.most else " and ".join(ends)
-        return f"{self.what}: {self.value:.4g}" + (f" (expected {wanted})" if wanted else "")
+        wanted = (
+            f"exactly {self.most:.4g}"
+            if len(ends) == 2 and self.least == self.most
+            else " and ".join(ends)
+        )
+        return f"{self.what}: {self.value:.4g}" + (
+            f" (expected {wanted})" if wanted else ""
+        )
 
 
-def check(what: str, value: float, least: float | None = None, most: float | None = None) -> Check:
+def check(
+    what: str, value: float, least: float | None = None, most: float | None = None
+) -> Check:
     """Return the check of a number; NaN is in no range."""
-    ok = value == value and (least is None or least <= value) and (most is None or value <= most)
+    ok = (
+        value == value
+        and (least is None or least <= value)
+        and (most is None or value <= most)
+    )
     return Check(what=what, value=value, least=least, most=most, ok=ok)
 
 
@@ -99,13 +131,19 @@ class CaseRow(results.Fields):
     holds: str = Field(description="what must hold")
     status: str = Field(description="`ok` or `fell short`")
     decides: str = Field(description="the number that decides")
-    finite: bool = Field(description="every picture and gradient was finite, and none had to be made so")
+    finite: bool = Field(
+        description="every picture and gradient was finite, and none had to be made so"
+    )
     relative_error: results.JsonFloat | None = Field(
         description="of a gradient against its reference; null where there is none"
     )
-    ending: str = Field(description="of the case's search; `refused` where its input was")
+    ending: str = Field(
+        description="of the case's search; `refused` where its input was"
+    )
     checks: list[Check]
-    measured: dict[str, results.JsonFloat] = Field(description="further numbers, such as condition numbers and biases")
+    measured: dict[str, results.JsonFloat] = Field(
+        description="further numbers, such as condition numbers and biases"
+    )
     seconds: float = Field(description="what the case took")
 
 
@@ -133,7 +171,9 @@ COLUMNS: Mapping[str, views.Column] = {
     "case": "{0.case}",
     "status": "{0.status}",
     "finite": lambda row: "yes" if row.finite else "NO",
-    "error": lambda row: "" if row.relative_error is None else f"{100.0 * row.relative_error:.2g} %",
+    "error": lambda row: (
+        "" if row.relative_error is None else f"{100.0 * row.relative_error:.2g} %"
+    ),
     "ending": lambda row: textwrap.shorten(row.ending, 30, placeholder=" ..."),
     "seconds": "{0.seconds:.1f}",
 }
@@ -153,7 +193,13 @@ def shown(result: StabilityResult) -> ShownResult:
         [
             ResultPart.table(result.rows, COLUMNS, title="Cases"),
             ResultPart("Condition numbers", rows=numbers),
-            ResultPart("Short", [f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in short]),
+            ResultPart(
+                "Short",
+                [
+                    f"{row.case} fell short: {row.decides}; expected: {row.holds}"
+                    for row in short
+                ],
+            ),
             ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
@@ -161,9 +207,11 @@ def shown(result: StabilityResult) -> ShownResult:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
-    made so; the error of a gradient (or of what the case is about), None where there is none; how the case's search
-    ended, "refused" where the input was, or empty; and further numbers that are worth printing."""
+    """What a case found: the numbers that decide, and whether every picture and
+    gradient was finite, and none had to be made so; the error of a gradient (or of what
+    the case is about), None where there is none; how the case's search ended, "refused"
+    where the input was, or empty; and further numbers that are worth printing.
+    """
 
     checks: Sequence[Check]
     finite: bool = True
@@ -177,8 +225,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """One extreme: its unique name, the group that it belongs to, and what must hold, in a sentence. A `slow` one takes
-    more than about a second on two quiet cores, so that the tests run it seldom."""
+    """One extreme: its unique name, the group that it belongs to, and what must hold,
+    in a sentence. A `slow` one takes more than about a second on two quiet cores, so
+    that the tests run it seldom.
+    """
 
     name: str
     group: str
@@ -187,21 +237,29 @@ class Case:
     find: Callable[[], Outcome]
 
     def run(self) -> CaseRow:
-        """Run it. An exception is a finding like any other: the case falls short, and the exception says why."""
+        """Run it. An exception is a finding like any other: the case falls short, and
+        the exception says why.
+        """
         begun = time.perf_counter()
         try:
             outcome = self.find()
         except InputError as error:
-            outcome = Outcome([check(f"refused: {error}", 1.0, 0.0, 0.0)], ending="refused")
+            outcome = Outcome(
+                [check(f"refused: {error}", 1.0, 0.0, 0.0)], ending="refused"
+            )
         except Exception as error:
             what = f"raised {type(error).__name__}: {error}"
-            outcome = Outcome([check(what, 1.0, 0.0, 0.0)], finite=False, ending="raised")
+            outcome = Outcome(
+                [check(what, 1.0, 0.0, 0.0)], finite=False, ending="raised"
+            )
         failed = [number for number in outcome.checks if not number.ok]
         decides = "".join(map(str, failed[:1] or outcome.checks[-1:]))
         more = {
             "case": self.name,
             "status": OK if outcome.finite and not failed else FELL_SHORT,
-            "decides": decides if failed or outcome.finite else "NaN or infinite values",
+            "decides": decides
+            if failed or outcome.finite
+            else "NaN or infinite values",
             "seconds": time.perf_counter() - begun,
         }
         return CaseRow.of({**vars(self), **vars(outcome), **more})
@@ -210,8 +268,12 @@ class Case:
 CASES: list[Case] = []  # every case, in the order in which they run
 
 
-def case(group: str, name: str, *, slow: bool = False) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
-    """Make a function a case; the first sentence of its docstring says what must hold."""
+def case(
+    group: str, name: str, *, slow: bool = False
+) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+    """Make a function a case; the first sentence of its docstring says what must
+    hold.
+    """
 
     def added(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
         sentence = " ".join((find.__doc__ or "").partition("\n\n")[0].split())
@@ -221,7 +283,13 @@ def case(group: str, name: str, *, slow: bool = False) -> Callable[[Callable[[],
     return added
 
 
-def cases(group: str, find: Callable[..., Outcome], table: Iterable[tuple[str, str, dict[str, Any]]]) -> None:
+def cases(
+    group: str,
+    find: Callable[..., Outcome],
+    table: Iterable[tuple[str, str, dict[str, Any]]],
+) -> None:
     for name, holds, data in table:
         arguments = {key: value for key, value in data.items() if key != "slow"}
-        CASES.append(Case(name, group, holds, bool(data.get("slow")), partial(find, **arguments)))
+        CASES.append(
+            Case(name, group, holds, bool(data.get("slow")), partial(find, **arguments))
+        )

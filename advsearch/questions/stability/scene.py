@@ -1,4 +1,6 @@
-"""Small scenes for cases of the stability suite: a picture, its gradient beside differences, and a short search."""
+"""Small scenes for cases of the stability suite: a picture, its gradient beside
+differences, and a short search.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +16,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Policy, SceneDescription, assets, gradients, policies, results, workbench
+from advsearch.extend import (
+    Policy,
+    SceneDescription,
+    assets,
+    gradients,
+    policies,
+    results,
+    workbench,
+)
 from advsearch.questions.stability.result import Outcome, check, holds
 
 SIZE = 24  # side of the images in pixels
 SPP = 8  # samples a pixel of a picture and of a working gradient
 REFERENCE_SPP = 64  # samples a pixel of a reference render
-ERROR = 0.1  # relative error that the mean of a gradient may have beyond what its noise explains
-DOUBT = 0.4  # the noise of a comparison, as a share of the derivative, from which it decides nothing
+# relative error that the mean of a gradient may have beyond what its noise explains
+ERROR = 0.1
+# the noise of a comparison, as a share of the derivative, from which it decides nothing
+DOUBT = 0.4
 SHARPNESS = 20.0  # logits per unit of the linear loss that the searched model returns
-SAME_PICTURE = 2e-3  # mean difference of two pictures that should be one: an 8-bit level is 4e-3
+# mean difference of two pictures that should be one: an 8-bit level is 4e-3
+SAME_PICTURE = 2e-3
 ControlSettings = Mapping[str, Mapping[str, object]]
 Thing = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
 """What a scene shows; a function makes it when the case runs."""
@@ -34,16 +47,21 @@ def make_renderer(
     environment: str | Path | assets.EnvironmentAsset | None = None, settings: Mapping[str, float] | None = None,
     plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}), denoise: str = "none",
 ) -> gradients.Renderer:  # fmt: skip
-    """Return `render(u, seed, spp)` of a small image: as `Scene.renderer`, with further shapes in Mitsuba's words.
+    """Return `render(u, seed, spp)` of a small image: as `Scene.renderer`, with further
+    shapes in Mitsuba's words.
 
     Its differences are taken over a pixel: the losses of these cases are smooth.
     """
     shape = thing() if callable(thing) else thing
-    scene = workbench.load_scene(shape, environment or make_plain_environment(), settings=settings)
+    scene = workbench.load_scene(
+        shape, environment or make_plain_environment(), settings=settings
+    )
     description = scene.description
     for name, plugin in plugins.items():
         description = description.with_part(workbench.PluginPart(name, plugin))
-    renderer = replace(scene, description=description).renderer(controls, resolution=SIZE, denoise=denoise)
+    renderer = replace(scene, description=description).renderer(
+        controls, resolution=SIZE, denoise=denoise
+    )
     renderer.plan = renderer.plan.at_a_pixel()
     return renderer
 
@@ -53,10 +71,18 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky brighter on one side and above, (16, 32, 3), so that turning it changes something."""
+    """Return a sky brighter on one side and above, (16, 32, 3), so that turning it
+    changes something.
+    """
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
-    light = 0.4 * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
-    return assets.EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
+    light = 0.4 * (
+        1.0
+        + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
+        + 0.8 * np.cos(rows * (np.pi / 16.0))
+    )
+    return assets.EnvironmentAsset(
+        "plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32)
+    )
 
 
 def make_grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
@@ -66,13 +92,21 @@ def make_grey_map(value: float, texel: float | None = None) -> assets.Environmen
     return assets.EnvironmentAsset("made", radiance)
 
 
-def make_mesh(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> assets.Mesh:
+def make_mesh(
+    vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
+) -> assets.Mesh:
     """Return a mesh with UVs from x and z, whose normals face +x."""
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     uvs = ((points - low) / np.maximum(high - low, 1e-12))[:, 1:]
-    return assets.Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
+    return assets.Mesh(
+        points,
+        np.asarray(faces, np.uint32),
+        facing.astype(np.float32),
+        uvs.astype(np.float32),
+    )
 
 
 def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
@@ -93,7 +127,9 @@ def make_checkered_mug() -> assets.ObjectAsset:
 
 
 def make_dark_mug() -> assets.ObjectAsset:
-    """Return the mug in black: what moves in the picture is its outline and nothing else, so little noise."""
+    """Return the mug in black: what moves in the picture is its outline and nothing
+    else, so little noise.
+    """
     return paint_mug(np.full((4, 4), 0.02))
 
 
@@ -106,15 +142,15 @@ def check_scene(
     mean: Bounds | None = None, gradient: Bounds | None = None, ending: str = "",
     beside: Mapping[str, object] | None = None, apart: Bounds = (None, SAME_PICTURE), **scene: object,
 ) -> Outcome:  # fmt: skip
-    """Render a scene, differentiate it, compare the gradient with differences, which costs most of the time, and search
-    from there.
+    """Render a scene, differentiate it, compare the gradient with differences, which
+    costs most of the time, and search from there.
 
     Args:
         u: the configuration, or numbers of it in place of those of the start.
-        mean, gradient, ending: what the image's mean, the largest entry of the gradient and the search's ending have
-            to be.
-        beside: the arguments of `make_renderer` for another scene, and `apart` the mean difference that its image may
-            have.
+        mean, gradient, ending: what the image's mean, the largest entry of the gradient
+            and the search's ending have to be.
+        beside: the arguments of `make_renderer` for another scene, and `apart` the mean
+            difference that its image may have.
         scene: further arguments of `make_renderer`.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
@@ -124,40 +160,82 @@ def check_scene(
     loss = gradients.smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, 0, spp)
     _, slope = renderer.gradient(loss, start, 0, spp)
-    rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats) if compare else []
+    rows = (
+        compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
+        if compare
+        else []
+    )
     result = search_scene(renderer, loss, start, spp, evaluations)
     checks = [
-        holds("the picture is in [0, 1]", float(image.min()) >= 0.0 and float(image.max()) <= 1.0),
+        holds(
+            "the picture is in [0, 1]",
+            float(image.min()) >= 0.0 and float(image.max()) <= 1.0,
+        ),
         check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
-        check("objectives that were NaN or infinite", float(result.non_finite_objectives), 0.0, 0.0),
+        check(
+            "objectives that were NaN or infinite",
+            float(result.non_finite_objectives),
+            0.0,
+            0.0,
+        ),
     ]
     relative_error = None
     if rows:
         worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
         unsure = max(rows, key=lambda row: row.doubt or 0.0)
-        checks.append(check(f"noise of the comparison, {unsure.name}", unsure.doubt or 0.0, most=DOUBT))
-        checks.append(check(f"gradient error beyond the noise, {worst.name}", worst.excess, most=ERROR))
+        checks.append(
+            check(
+                f"noise of the comparison, {unsure.name}",
+                unsure.doubt or 0.0,
+                most=DOUBT,
+            )
+        )
+        checks.append(
+            check(
+                f"gradient error beyond the noise, {worst.name}",
+                worst.excess,
+                most=ERROR,
+            )
+        )
         relative_error = worst.bias
-    measured = {"mean": float(image.mean()), "largest gradient": float(slope.abs().max())}
+    measured = {
+        "mean": float(image.mean()),
+        "largest gradient": float(slope.abs().max()),
+    }
     if mean is not None:
         checks.append(check("mean of the picture", measured["mean"], *mean))
     if gradient is not None:
-        checks.append(check("largest gradient", measured["largest gradient"], *gradient))
+        checks.append(
+            check("largest gradient", measured["largest gradient"], *gradient)
+        )
     if ending:
         checks.append(holds(f"the ending is {ending!r}", result.ending.value == ending))
     if beside is not None:
         other = make_renderer(**{"controls": controls, **beside})  # type: ignore[arg-type]
-        difference = mean_difference(render_image(renderer, start), render_image(other, other.start))
-        checks.append(check("mean difference from the picture beside it", difference, *apart))
-    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all()) and renderer.non_finite == 0
+        difference = mean_difference(
+            render_image(renderer, start), render_image(other, other.start)
+        )
+        checks.append(
+            check("mean difference from the picture beside it", difference, *apart)
+        )
+    is_finite = (
+        bool(torch.isfinite(image).all())
+        and bool(torch.isfinite(slope).all())
+        and renderer.non_finite == 0
+    )
     return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
 
 
 def search_scene(
-    renderer: gradients.Renderer, loss: gradients.Loss, start: Tensor, spp: int, evaluations: int
+    renderer: gradients.Renderer,
+    loss: gradients.Loss,
+    start: Tensor,
+    spp: int,
+    evaluations: int,
 ) -> workbench.SearchResult:
-    """Search from a configuration with the margin of a linear model of two classes: its logits are 0, and so many times
-    the rise of the loss over the start, less 1."""
+    """Search from a configuration with the margin of a linear model of two classes: its
+    logits are 0, and so many times the rise of the loss over the start, less 1.
+    """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
 
@@ -165,10 +243,14 @@ def search_scene(
         return SHARPNESS * (loss(image) - loss_at_start) - 1.0
 
     steps = evaluations * (1 + gradient_cost) + 1
-    return run_search(renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1)
+    return run_search(
+        renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1
+    )
 
 
-def render_image(renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
+def render_image(
+    renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16
+) -> Tensor:
     with torch.no_grad():
         return renderer(u, seed, spp)
 
@@ -178,15 +260,28 @@ def mean_difference(image: Tensor, other: Tensor) -> float:
 
 
 def compare_gradient(
-    renderer: gradients.Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
+    renderer: gradients.Renderer,
+    u: Tensor,
+    *,
+    spp: int = SPP,
+    seeds: tuple[int, int] = (3, 12),
+    repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw image."""
+    """Compare the plan's own gradient with common-random-number differences, of a
+    linear loss of the raw image.
+    """
     formation = renderer.formation
-    bench = gradients.Bench(renderer, gradients.smooth_loss(formation.resolution), u, seed=1, spp=spp)
-    renderer.formation = replace(formation, transfer="linear")  # of this renderer, which counts what is not finite
+    bench = gradients.Bench(
+        renderer, gradients.smooth_loss(formation.resolution), u, seed=1, spp=spp
+    )
+    # of this renderer, which counts what is not finite
+    renderer.formation = replace(formation, transfer="linear")
     try:
         rows = gradients.measure_derivatives(
-            bench, reference_spp=REFERENCE_SPP, seeds_of_reference=seeds, repeats=(repeats, repeats)
+            bench,
+            reference_spp=REFERENCE_SPP,
+            seeds_of_reference=seeds,
+            repeats=(repeats, repeats),
         )
         return list(rows)
     finally:
@@ -194,18 +289,27 @@ def compare_gradient(
 
 
 def measure_inward_slope(
-    renderer: gradients.Renderer, gradient: Tensor, factor: Tensor | float, seeds: int, spp: int
+    renderer: gradients.Renderer,
+    gradient: Tensor,
+    factor: Tensor | float,
+    seeds: int,
+    spp: int,
 ) -> tuple[float, float]:
-    """Return the derivative of the smooth linear loss of the raw image as numbers go inwards from the start that raise
-    it so, where `factor` is 1: by a gradient (d,), and by one-sided differences of second order, since there is no
-    other side at a bound."""
-    linear, u, step = renderer.like(transfer="linear"), renderer.start, 0.04
+    """Return the derivative of the smooth linear loss of the raw image as numbers go
+    inwards from the start that raise it so, where `factor` is 1: by a gradient (d,),
+    and by one-sided differences of second order, since there is no other side at a
+    bound.
+    """
+    linear = renderer.like(transfer="linear")
+    u = renderer.start
+    step = 0.04
     loss = gradients.smooth_loss(linear.formation.resolution)
     direction = torch.where(u > 0.5, -1.0, 1.0) * (gradient * (0.5 - u) > 0.0) * factor
     slopes = []
     for seed in range(seeds):
         here, near, far = (
-            float(loss(render_image(linear, u + count * step * direction, seed, spp))) for count in range(3)
+            float(loss(render_image(linear, u + count * step * direction, seed, spp)))
+            for count in range(3)
         )
         slopes.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
@@ -216,15 +320,24 @@ def evaluate(
 ) -> policies.Evaluation:
     """Evaluate a configuration by a loss of the image; over 0 is a success."""
     spp *= query.samples
-    non_finite_before, renders_before = renderer.non_finite, renderer.renders
+    non_finite_before = renderer.non_finite
+    renders_before = renderer.renders
     gradient = None
     if query.gradient:
-        value, gradient = renderer.gradient(loss, query.u, query.number, spp, free=query.gradient == "free")
+        value, gradient = renderer.gradient(
+            loss, query.u, query.number, spp, free=query.gradient == "free"
+        )
     else:
         value = loss(render_image(renderer, query.u, query.number, spp))
     objective = float(value)
     cost = (renderer.renders - renders_before) * query.samples
-    return policies.Evaluation(objective, gradient, objective > 0.0, renderer.non_finite - non_finite_before, cost)
+    return policies.Evaluation(
+        objective,
+        gradient,
+        objective > 0.0,
+        renderer.non_finite - non_finite_before,
+        cost,
+    )
 
 
 def run_search(
@@ -235,11 +348,25 @@ def run_search(
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")
     options = {"candidates": 0, **options}
-    return workbench.search(evaluate_all, make_domain(renderer, start), policy, steps=steps, seed=0, **options)
+    return workbench.search(
+        evaluate_all,
+        make_domain(renderer, start),
+        policy,
+        steps=steps,
+        seed=0,
+        **options,
+    )
 
 
-def make_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> policies.Domain:
+def make_domain(
+    renderer: gradients.Renderer, start: Tensor | None = None
+) -> policies.Domain:
     """Return where a search may look, from a configuration or the renderer's start."""
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start
-    return workbench.domain_of(space.controls, start, gradient_cost=renderer.plan.renders, partial_gradients=True)
+    return workbench.domain_of(
+        space.controls,
+        start,
+        gradient_cost=renderer.plan.renders,
+        partial_gradients=True,
+    )

@@ -14,7 +14,15 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.extend import InputError, RunContext, assets, errors, geometry, gradients, workbench
+from advsearch.extend import (
+    InputError,
+    RunContext,
+    assets,
+    errors,
+    geometry,
+    gradients,
+    workbench,
+)
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -60,7 +68,11 @@ DARKNESS = make_grey_map(0.0)
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
     controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
-    return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
+    return {
+        "controls": controls,
+        "u": {0: float(high > 0.0)},
+        "slow": control == "environment",
+    }
 
 
 FINITE = "Picture and gradient are finite."
@@ -70,12 +82,15 @@ BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolutio
 TURNED = {"environment": {"rotation": [0.0, 360.0]}}
 
 cases("radiometric", check_scene, [
-    ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and gradients are right.",
+    ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and "
+                          "gradients are right.",
      {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True}),
-    ("hdri-texel-100000-denoised", "It is finite after the denoiser too, and the rotation has a gradient.",
+    ("hdri-texel-100000-denoised", "It is finite after the denoiser too, and the "
+                                   "rotation has a gradient.",
      {"controls": TURNED, "environment": FLASH, "denoise": "oidn", "u": [0.31], "compare": False,
       "gradient": (1e-12, None), "slow": True}),
-    ("black-environment", "The picture is black, the gradient zero, and the search ends as stalled.",
+    ("black-environment", "The picture is black, the gradient zero, and the search "
+                          "ends as stalled.",
      {"controls": TEXTURE, "environment": DARKNESS, "compare": False, "evaluations": PLATEAU_STEPS,
       "mean": (0.0, 0.0), "gradient": (0.0, 0.0), "ending": "stalled"}),
     ("lamp-in-the-dark", "A lamp lights a scene that has no other light.",
@@ -88,7 +103,9 @@ cases("radiometric", check_scene, [
 
 
 def refuse_texel(value: float, as_file: bool) -> Outcome:
-    """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
+    """A texel that is no light, in a file or in an array, has to be refused in a
+    sentence.
+    """
     radiance = make_grey_map(0.3).radiance.copy()
     radiance[4, 10] = value
     try:
@@ -99,11 +116,16 @@ def refuse_texel(value: float, as_file: bool) -> Outcome:
                     picture.write(str(path))
                 workbench.load_scene("mug", path)
         else:
-            renderer = make_renderer(TEXTURE, environment=assets.EnvironmentAsset("made", radiance))
+            renderer = make_renderer(
+                TEXTURE, environment=assets.EnvironmentAsset("made", radiance)
+            )
             render_image(renderer, renderer.start, 0, 1)
     except InputError as error:
         counted = "texels" in str(error) and "\n" not in str(error)
-        return Outcome([holds("refused in a sentence that counts the texels", counted)], ending="refused")
+        return Outcome(
+            [holds("refused in a sentence that counts the texels", counted)],
+            ending="refused",
+        )
     return Outcome([holds("refused", False)], ending="rendered all the same")
 
 
@@ -115,55 +137,86 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
 
 
 def leave_plateau(low: float, high: float) -> Outcome:
-    """Start where the picture is white and nothing has a gradient; the way out is an exposure further down.
+    """Start where the picture is white and nothing has a gradient; the way out is an
+    exposure further down.
 
     Args:
-        low, high: stops that are searched. Up to about 4 something in the picture is not white.
+        low, high: stops that are searched. Up to about 4 something in the picture is
+            not white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
-    start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
+    start = torch.ones_like(renderer.start)
+    checks = []
+    endings = []
+    flat = 0
     loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
-        result = run_search(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
+        result = run_search(
+            renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy
+        )
         flat += sum(record.gradient_norm == 0.0 for record in result.history)
-        checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
+        checks.append(
+            holds(
+                f"{policy.name} finds a picture that is not white",
+                result.best_objective > 0.0,
+            )
+        )
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluate(renderer, loss, 2, workbench.Query(start, 0, gradient=True)).gradient
+    slope = evaluate(
+        renderer, loss, 2, workbench.Query(start, 0, gradient=True)
+    ).gradient
     assert slope is not None
     at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
     measured = {"evaluations without a gradient": float(flat)}
     return Outcome([at_first, *checks], ending=", ".join(endings), measured=measured)
 
 
-AWAY = f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations"
+AWAY = (
+    "From a white picture without a gradient every policy gets away within "
+    f"{PLATEAU_STEPS} evaluations"
+)
 cases("radiometric", leave_plateau, [
     ("saturated-plateau", f"{AWAY}.", {"low": -10.0, "high": 10.0}),
     ("saturated-plateau-narrow-way-out", f"{AWAY}; the way out is a tenth of the range.", {"low": 1.0, "high": 10.0}),
 ])  # fmt: skip
 
 
-# ---- surfaces -------------------------------------------------------------------------------------------------------
+# ---- surfaces
+# -------------------------------------------------------------------------------------------------------
 
 
 def make_glass_ball() -> dict[str, dict[str, object]]:
-    """Return a ball of clear glass before the mug, by name, in Mitsuba's words; nothing of it varies."""
+    """Return a ball of clear glass before the mug, by name, in Mitsuba's words; nothing
+    of it varies.
+    """
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
     material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-    return {"glass": {"type": "sphere", "center": center, "radius": 0.3, "bsdf": material}}
+    return {
+        "glass": {"type": "sphere", "center": center, "radius": 0.3, "bsdf": material}
+    }
 
 
-def material_case(parameters: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
+def material_case(
+    parameters: tuple[str, ...], slow: bool = True, **values: float
+) -> dict[str, object]:
     settings = {f"material.{name}": value for name, value in values.items()}
-    return {"controls": {"material": {name: [0.0, 1.0] for name in parameters}}, "settings": settings, "slow": slow}
+    return {
+        "controls": {"material": {name: [0.0, 1.0] for name in parameters}},
+        "settings": settings,
+        "slow": slow,
+    }
 
 
 cases("materials", check_scene, [
-    ("roughness-0", "Finite, and the gradient by the roughness is right, at the polished end.",
+    ("roughness-0", "Finite, and the gradient by the roughness is right, at the "
+                    "polished end.",
      material_case(("roughness",), slow=False, roughness=0.0)),
-    ("roughness-1", "Finite, and the gradient by the roughness is right, at the matt end.",
+    ("roughness-1", "Finite, and the gradient by the roughness is right, at the matt "
+                    "end.",
      material_case(("roughness",), roughness=1.0, metallic=1.0)),
-    ("metallic-1", "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
+    ("metallic-1", "Finite, and the gradient has the right sign and size at a metallic "
+                   "of exactly 1.",
      material_case(("metallic",), metallic=1.0)),
     ("perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.",
      material_case(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
@@ -173,39 +226,62 @@ cases("materials", check_scene, [
 @case("materials", "clear-glass", slow=True)
 def look_through_glass() -> Outcome:
     """A texel behind clear glass has the right gradient, and nothing is NaN."""
-    controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
-    return check_scene(controls, plugins=make_glass_ball(), beside={}, apart=(0.01, None))
+    controls: ControlSettings = {
+        "texture": {"resolution": 8},
+        "environment": {"exposure": [-1.0, 1.0]},
+    }
+    return check_scene(
+        controls, plugins=make_glass_ball(), beside={}, apart=(0.01, None)
+    )
 
 
 @case("materials", "texels-0-and-1")
 def texels_at_the_ends() -> Outcome:
-    """Texels at the ends of the range have a gradient, and the search moves them inwards only."""
+    """Texels at the ends of the range have a gradient, and the search moves them
+    inwards only.
+    """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    raw, start = renderer.like(transfer="linear"), renderer.start
+    raw = renderer.like(transfer="linear")
+    start = renderer.start
     loss = gradients.smooth_loss(raw.formation.resolution)
-    slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
+    slope = torch.stack(
+        [raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]
+    ).mean(dim=0)
     gradient, wanted = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
     best = run_search(renderer, loss, 3).best_u
     return check_scene(controls, make_checkered_mug, compare=False).also(
-        check("gradient error along a direction that points inwards", error, most=ERROR),
-        check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
-        check("largest texel of the adversarial configuration", float(best.max()), most=1.0),
+        check(
+            "gradient error along a direction that points inwards", error, most=ERROR
+        ),
+        check(
+            "smallest texel of the adversarial configuration",
+            float(best.min()),
+            least=0.0,
+        ),
+        check(
+            "largest texel of the adversarial configuration",
+            float(best.max()),
+            most=1.0,
+        ),
         check("texels that the search moved", float((best != start).sum()), least=1.0),
         holds("the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}),
         relative_error=error,
     )
 
 
-# ---- light that is thrown --------------------------------------------------------------------------------------------
+# ---- light that is thrown
+# --------------------------------------------------------------------------------------------
 
 SIDE = 8  # texels along the picture of a projector
 WHOLE = [1.0] * (3 * SIDE**2)
 ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
 
 
-def projector_case(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
+def projector_case(
+    u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float
+) -> dict[str, object]:
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
@@ -222,7 +298,8 @@ cases("light", check_scene, [
      {**projector_case(), "settings": {"material.metallic": 1.0, "material.roughness": 0.0}}),
     ("projector-0-lumens", "Without light the gradient is zero.",
      {**projector_case(lumens=0.0), "gradient": (0.0, 0.0)}),
-    ("projector-1e6-lumens", "The picture is white for the most part, and all is finite.",
+    ("projector-1e6-lumens", "The picture is white for the most part, and all is "
+                             "finite.",
      {**projector_case(lumens=1e6), "gradient": (None, None), "mean": (0.7, None)}),
     ("spot-smallest", "Picture and gradient of a laser's spot are finite.",
      {"controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}}, "u": [0.0, 1.0], "compare": False,
@@ -237,32 +314,62 @@ def project_through_glass() -> Outcome:
     return check_scene(**along, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 
-# ---- meshes, places and views ---------------------------------------------------------------------------------------
+# ---- meshes, places and views
+# ---------------------------------------------------------------------------------------
 
-QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]  # a square that faces +x
+# a square that faces +x
+QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
 HALVES = [[0, 1, 2], [0, 2, 3]]
 SQUARE = make_checkered_object(make_mesh(QUAD, HALVES))
 LINE = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
-DEGENERATE = make_checkered_object(make_mesh(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]))
+DEGENERATE = make_checkered_object(
+    make_mesh(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]])
+)
 TWICE = make_checkered_object(make_mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]]))
 THIN = [[0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]]
 SLIVER = make_checkered_object(make_mesh(QUAD + THIN, [*HALVES, [4, 5, 6]]))
-TRIANGLE = make_checkered_object(make_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
+TRIANGLE = make_checkered_object(
+    make_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]])
+)
 FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
 PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
 SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
-BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark object has an outline and nothing else
+# settings without the ground, so that a dark object has an outline and nothing else
+BARE = {"ground.size": 0.0}
 
 
-def mesh_case(thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None) -> dict[str, object]:
+def mesh_case(
+    thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None
+) -> dict[str, object]:
     like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
-    return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
+    return {
+        "controls": PAINTED,
+        "thing": thing,
+        "settings": FRONT,
+        "slow": True,
+        **like,
+    }
 
 
 def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
-    """A box as a file gives it, in some unit and at some distance from the file's origin."""
-    points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]) * scale + shift
-    corners = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
+    """A box as a file gives it, in some unit and at some distance from the file's
+    origin.
+    """
+    points = (
+        np.array(
+            [[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]
+        )
+        * scale
+        + shift
+    )
+    corners = [
+        [0, 4, 6, 2],
+        [1, 3, 7, 5],
+        [0, 1, 5, 4],
+        [2, 6, 7, 3],
+        [0, 2, 3, 1],
+        [4, 5, 7, 6],
+    ]
     lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
     faces = [part for a, b, c, d in corners for part in ((a, b, c), (a, c, d))]
     lines += ["f " + " ".join(str(1 + corner) for corner in face) for face in faces]
@@ -274,7 +381,12 @@ def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
 
 def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
     thing = partial(import_box, scale, shift)
-    return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": import_box}}
+    return {
+        "controls": SHIFT,
+        "thing": thing,
+        "compare": False,
+        "beside": {"thing": import_box},
+    }
 
 
 def outline_case(controls: ControlSettings) -> dict[str, object]:
@@ -283,9 +395,11 @@ def outline_case(controls: ControlSettings) -> dict[str, object]:
 
 AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
 cases("geometry", check_scene, [
-    ("degenerate-triangles", "Faces without area change neither the picture nor the gradient.",
+    ("degenerate-triangles", "Faces without area change neither the picture nor the "
+                             "gradient.",
      mesh_case(DEGENERATE, SQUARE)),
-    ("sliver-triangles", "A triangle a million times as long as wide leaves everything finite and right.",
+    ("sliver-triangles", "A triangle a million times as long as wide leaves everything "
+                         "finite and right.",
      mesh_case(SLIVER)),
     ("coincident-faces", "Two faces in one place look like one.", mesh_case(TWICE, SQUARE)),
     ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
@@ -293,9 +407,11 @@ cases("geometry", check_scene, [
     ("scale-100", FINITE, {"controls": {"pose": {"scale": [50.0, 100.0]}}, "u": [1.0], "compare": False}),
     ("file-in-units-of-0.01", "A file in other units gives the same picture.", file_case(0.01)),
     ("file-in-units-of-100", "A file in other units gives the same picture.", file_case(100.0)),
-    ("file-10000-sizes-off", "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
+    ("file-10000-sizes-off", "A mesh that its file puts 10,000 sizes from the origin "
+                             "gives the same picture.",
      file_case(shift=1e4)),
-    ("translation-10000", "The picture is that of the scene without the object, and the gradient is zero.",
+    ("translation-10000", "The picture is that of the scene without the object, and "
+                          "the gradient is zero.",
      {"controls": {"pose": {"y": [9e3, 1e4]}}, "u": [1.0], "gradient": (None, 1e-6), "beside": AWAY_FROM_IT}),
     ("grazing-view", "Looking along the ground, the gradient by the elevation is right.",
      outline_case({"camera": {"elevation": [-10.0, 10.0]}})),
@@ -311,10 +427,20 @@ cases("geometry", check_scene, [
 @case("geometry", "million-triangles", slow=True)
 def million() -> Outcome:
     """Finite, right, and like the coarse mesh of the same shape."""
-    fine, rough = (assets.normalised(workbench.sphere(*counts)) for counts in ((501, 1000), (64, 128)))
-    coarse, renderer = (make_renderer(SHIFT, make_checkered_object(made)) for made in (rough, fine))
-    _, slope = renderer.gradient(gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
-    apart = mean_difference(render_image(renderer, renderer.start, 0, 64), render_image(coarse, coarse.start, 0, 64))
+    fine, rough = (
+        assets.normalised(workbench.sphere(*counts))
+        for counts in ((501, 1000), (64, 128))
+    )
+    coarse, renderer = (
+        make_renderer(SHIFT, make_checkered_object(made)) for made in (rough, fine)
+    )
+    _, slope = renderer.gradient(
+        gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP
+    )
+    apart = mean_difference(
+        render_image(renderer, renderer.start, 0, 64),
+        render_image(coarse, coarse.start, 0, 64),
+    )
     return check_scene(TEXTURE, make_checkered_object(fine), evaluations=2).also(
         check("triangles", float(len(fine.faces)), least=1e6),
         holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
@@ -324,24 +450,47 @@ def million() -> Outcome:
 
 @case("geometry", "gimbal-angles", slow=True)
 def gimbal() -> Outcome:
-    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are right."""
-    angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
+    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
+    right.
+    """
+    angles = {
+        "pose": {
+            "yaw": [-90.0, 90.0],
+            "pitch": [45.0, 135.0],
+            "roll": [-90.0, 90.0],
+            "on_ground": "no",
+        }
+    }
     locked = make_renderer(angles, make_dark_mug, settings=BARE)
     # yaw 36 is roll -36 here
-    yaw, roll = (render_image(locked, torch.tensor(u)) for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3]))
+    yaw, roll = (
+        render_image(locked, torch.tensor(u))
+        for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3])
+    )
     rotation = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
     free = make_renderer(rotation, make_dark_mug, settings=BARE)
-    worst = max(row.excess for row in compare_gradient(free, free.start + 0.1, seeds=(3, 5)))
-    return check_scene(angles, make_dark_mug, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP).also(
-        check("mean difference of yaw 36 and roll -36", mean_difference(yaw, roll), most=SAME_PICTURE),
+    worst = max(
+        row.excess for row in compare_gradient(free, free.start + 0.1, seeds=(3, 5))
+    )
+    return check_scene(
+        angles, make_dark_mug, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP
+    ).also(
+        check(
+            "mean difference of yaw 36 and roll -36",
+            mean_difference(yaw, roll),
+            most=SAME_PICTURE,
+        ),
         check("gradient error of the rotation vector", worst, most=ERROR),
     )
 
 
 def full_turn(controls: ControlSettings) -> Outcome:
-    """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
+    """0 and 360 degrees are one place: one picture, one gradient, and a step across the
+    seam goes on.
+    """
     renderer = make_renderer(controls)
-    zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)
+    zero = torch.zeros_like(renderer.start)
+    one = torch.ones_like(renderer.start)
     loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
     apart = mean_difference(render_image(renderer, zero), render_image(renderer, one))
@@ -349,24 +498,43 @@ def full_turn(controls: ControlSettings) -> Outcome:
     size = float(slopes[0].abs().max())
     return check_scene(controls, u=[0.0], compare=False).also(
         check("mean difference of the pictures", apart, most=SAME_PICTURE),
-        check("difference of the gradients", float((slopes[0] - slopes[1]).abs().max()) / size, most=0.05),
+        check(
+            "difference of the gradients",
+            float((slopes[0] - slopes[1]).abs().max()) / size,
+            most=0.05,
+        ),
         check("where a step of 0.01 past the end goes", wrapped, 0.0099, 0.0101),
     )
 
 
-TURN = "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam."
-for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "rotation")):
+TURN = (
+    "0 and 360 degrees give one picture and one gradient, and a step goes on "
+    "across "
+    "the seam."
+)
+for control, name in (
+    ("pose", "yaw"),
+    ("camera", "azimuth"),
+    ("environment", "rotation"),
+):
     controls: ControlSettings = {control: {name: [0.0, 360.0]}}
-    cases("geometry", full_turn, [(f"full-turn-{control}-{name}", TURN, {"controls": controls})])
+    cases(
+        "geometry",
+        full_turn,
+        [(f"full-turn-{control}-{name}", TURN, {"controls": controls})],
+    )
 
 
-# ---- `stability`: stiff and extreme scenes, and whether each of them holds ------------------------------------------
+# ---- `stability`: stiff and extreme scenes, and whether each of them holds
+# ------------------------------------------
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
+    """Run cases of the suite one after the other, until they are done, the time is up
+    or there is an interrupt.
 
-    A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
+    A case that is done is stored at once: a run that was stopped goes on with the case
+    that it was at.
     """
     cases = chosen(context.config.cases, context.config.groups)
     measurements = context.open_measurements(context.config.seconds)
@@ -384,7 +552,11 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
             progress.advance(1)
 
     def make_result(rows: list[CaseRow]) -> StabilityResult:
-        return context.result(StabilityResult, rows=rows, not_run=[planned.name for planned in cases[len(rows) :]])
+        return context.result(
+            StabilityResult,
+            rows=rows,
+            not_run=[planned.name for planned in cases[len(rows) :]],
+        )
 
     return measurements.collect(measure_rows(), make_result)
 
@@ -394,30 +566,47 @@ def sentences() -> dict[str, str]:
 
 
 def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
-    """Return the cases of these names and groups; all where neither is given, an UnknownNameError where one is
-    unknown."""
+    """Return the cases of these names and groups; all where neither is given, an
+    UnknownNameError where one is unknown.
+    """
     for kind, wanted in (("name", names), ("group", groups)):
         known = dict.fromkeys(getattr(each, kind) for each in CASES)
         for name in wanted:
             if name not in known:
-                raise errors.UnknownNameError("case" if kind == "name" else kind, name, known)
-    return [case for case in CASES if not (names or groups) or case.name in names or case.group in groups]
+                raise errors.UnknownNameError(
+                    "case" if kind == "name" else kind, name, known
+                )
+    return [
+        case
+        for case in CASES
+        if not (names or groups) or case.name in names or case.group in groups
+    ]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Cases of controls whose scales differ by a million, and of noise.
 #
-# A search works in the unit box, so a control's unit cannot reach it. What can is how strongly the objective depends on
-# each number there: its curvatures, whose ratio (the condition number) is printed.
+# A search works in the unit box, so a control's unit cannot reach it. What can is how
+# strongly the objective depends on each number there: its curvatures, whose ratio (the
+# condition number) is printed.
 
 RATIO = 1e6
 
 
-def hessian(value: Callable[[Tensor], float], u: Tensor, directions: Tensor, steps: Sequence[float]) -> Tensor:
-    """Estimate the second derivatives (k, k), float64, of an objective at u (d,) along directions (k, d), by
-    differences of k half-widths."""
-    moves = [step * direction for step, direction in zip(steps, directions, strict=True)]
-    here, second = value(u), torch.zeros(len(moves), len(moves), dtype=torch.float64)
+def hessian(
+    value: Callable[[Tensor], float],
+    u: Tensor,
+    directions: Tensor,
+    steps: Sequence[float],
+) -> Tensor:
+    """Estimate the second derivatives (k, k), float64, of an objective at u (d,) along
+    directions (k, d), by differences of k half-widths.
+    """
+    moves = [
+        step * direction for step, direction in zip(steps, directions, strict=True)
+    ]
+    here = value(u)
+    second = torch.zeros(len(moves), len(moves), dtype=torch.float64)
     for i, move in enumerate(moves):
         second[i, i] = (value(u + move) - 2.0 * here + value(u - move)) / steps[i] ** 2
         for j, other in enumerate(moves[:i]):
@@ -428,7 +617,9 @@ def hessian(value: Callable[[Tensor], float], u: Tensor, directions: Tensor, ste
 
 
 def condition_number(second: Tensor) -> float:
-    """Return the largest over the smallest absolute eigenvalue of a symmetric matrix (k, k); infinite if that is 0."""
+    """Return the largest over the smallest absolute eigenvalue of a symmetric matrix
+    (k, k); infinite if that is 0.
+    """
     sizes = torch.linalg.eigvalsh(second.double()).abs()
     return float(sizes.max() / sizes.min()) if float(sizes.min()) > 0.0 else math.inf
 
@@ -441,7 +632,10 @@ def wide_range() -> Outcome:
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
         renderer = make_renderer(controls)
         loss = gradients.smooth_loss(renderer.formation.resolution)
-        each = [float(renderer.gradient(loss, renderer.start, seed, 32)[1][0]) for seed in range(6)]
+        each = [
+            float(renderer.gradient(loss, renderer.start, seed, 32)[1][0])
+            for seed in range(6)
+        ]
         slopes.append(statistics.fmean(each) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
     off = check("error of the derivative per object size", error, most=0.2)
@@ -450,20 +644,28 @@ def wide_range() -> Outcome:
 
 @case("stiff", "light-rotation-texel", slow=True)
 def light_rotation_texel() -> Outcome:
-    """All three move, the condition number is printed, and the objective's unit does not matter."""
+    """All three move, the condition number is printed, and the objective's unit does
+    not matter.
+    """
     controls: ControlSettings = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
         "pose": {"yaw": [0.0, 360.0]},
         "texture": {"resolution": 2},
     }
     renderer = make_renderer(controls)
-    u, loss = renderer.start.clone(), gradients.smooth_loss(renderer.formation.resolution)
+    u = renderer.start.clone()
+    loss = gradients.smooth_loss(renderer.formation.resolution)
     u[0], u[1] = 0.5, 0.1
     directions = torch.zeros(3, len(u))
     directions[0, 0] = directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    second = hessian(lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))), u, directions, steps)
+    second = hessian(
+        lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))),
+        u,
+        directions,
+        steps,
+    )
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
@@ -473,19 +675,34 @@ def light_rotation_texel() -> Outcome:
         result = run_search(renderer, scaled, 18, spp=8, start=u, on_step=note)
     path, again = map(torch.stack, paths)
     moved = (path - path[0]).abs().amax(dim=0)
-    names = {"condition number in u": second, "condition number in watts, degrees and sRGB": units @ second @ units}
+    names = {
+        "condition number in u": second,
+        "condition number in watts, degrees and sRGB": units @ second @ units,
+    }
     return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
         *(
             check(f"how far {what} moved", float(distance), least=0.05)
-            for what, distance in (("the power", moved[0]), ("the rotation", moved[1]), ("the texels", moved[2:].max()))
+            for what, distance in (
+                ("the power", moved[0]),
+                ("the rotation", moved[1]),
+                ("the texels", moved[2:].max()),
+            )
         ),
-        check("distance from the path of the objective x 1e6", float((path - again).abs().max()), most=1e-3),
+        check(
+            "distance from the path of the objective x 1e6",
+            float((path - again).abs().max()),
+            most=1e-3,
+        ),
         ending=result.ending.value,
         measured={name: condition_number(matrix) for name, matrix in names.items()},
     )
 
 
-MIXED = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}, "pose": {"y": [-0.3, 0.3]}}
+MIXED = {
+    "texture": {"resolution": 8},
+    "environment": {"exposure": [-1.0, 1.0]},
+    "pose": {"y": [-0.3, 0.3]},
+}
 cases("noise", check_scene, [
     ("one-sample-a-pixel", "Finite; the mean of 48 gradients is right.",
      {"controls": MIXED, "spp": 1, "repeats": 48, "slow": True}),
@@ -496,17 +713,25 @@ cases("noise", check_scene, [
 
 @case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
 def heavy_render(count: int = 24) -> Outcome:
-    """The plan takes differences of the loss for what moves a mesh, which have no heavy tail.
+    """The plan takes differences of the loss for what moves a mesh, which have no heavy
+    tail.
 
-    Of so many Gaussian numbers fewer than one lot in 1,000 has one farther from the median than 12 median distances.
+    Of so many Gaussian numbers fewer than one lot in 1,000 has one farther from the
+    median than 12 median distances.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = make_renderer(controls).like(transfer="linear")
     renderer.plan = renderer.plan.at_a_pixel()
     loss = gradients.smooth_loss(renderer.formation.resolution)
-    slopes = torch.stack([renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]).double()
+    slopes = torch.stack(
+        [renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]
+    ).double()
     away = (slopes - slopes.median()).abs()
     return check_scene(controls, compare=False, spp=4).also(
-        check("farthest over the median distance", float(away.max() / away.median()), most=12.0),
+        check(
+            "farthest over the median distance",
+            float(away.max() / away.median()),
+            most=12.0,
+        ),
         holds("the plan takes secant", renderer.plan.groups[0].estimator == "secant"),
     )

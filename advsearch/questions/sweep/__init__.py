@@ -1,4 +1,6 @@
-"""Measure how often the model is right over a grid or a random sample of configurations."""
+"""Measure how often the model is right over a grid or a random sample of
+configurations.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from advsearch.questions.sweep.summary import SweepSummary
 
 @experiment(
     "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
-    "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
+    "sweep --object mug,bowl --environment studio,noon --grid "
+    "camera.azimuth=0,90,180,270",
     "sweep --object mug --control pose,camera --samples 1000",
     "sweep --object mug --control pose --samples 200 --surface",
     "sweep --adversarial-of mug-texture-001 --control camera,environment --samples 200",
@@ -26,4 +29,6 @@ def sweep(asked: RunContext[SweepConfig]) -> SweepSummary:
     """Measure how often the model is right."""
     from advsearch.questions.sweep.carry_out import sweep_from_config  # imports torch
 
-    return sweep_from_config(asked.config, progress=asked.progress, resumed=asked.resumed).summary
+    return sweep_from_config(
+        asked.config, progress=asked.progress, resumed=asked.resumed
+    ).summary

@@ -1,4 +1,6 @@
-"""Sweeps. Here: what one is asked for, found and loaded: scenes, models, controls and axes."""
+"""Sweeps. Here: what one is asked for, found and loaded: scenes, models, controls and
+axes.
+"""
 
 from __future__ import annotations
 
@@ -46,9 +48,10 @@ SAMPLES = 100  # draws where there is no grid and nothing is said
 
 @dataclass(frozen=True)
 class NamedScene:
-    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as the scene is without it;
-    `beside_clean` is what the place is called beside the same one without the adversarial scene of a run, empty where
-    there is no such."""
+    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as
+    the scene is without it; `beside_clean` is what the place is called beside the same
+    one without the adversarial scene of a run, empty where there is no such.
+    """
 
     object: str
     environment: str
@@ -65,8 +68,10 @@ class NamedScene:
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that was asked for, found and loaded: `controls` are drawn by chance; `aovs` are layers of ground
-    truth that are kept of every picture of the first model (`scene.formation.AOVS`)."""
+    """Everything that was asked for, found and loaded: `controls` are drawn by chance;
+    `aovs` are layers of ground truth that are kept of every picture of the first model
+    (`scene.formation.AOVS`).
+    """
 
     config: SweepConfig
     places: tuple[NamedScene, ...]
@@ -78,11 +83,15 @@ class Job:
     warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     tracker: Tracker = ConstantVelocity
-    _bound: dict[int, dict[tuple[int, int], Points]] = field(default_factory=dict, init=False, repr=False)
+    _bound: dict[int, dict[tuple[int, int], Points]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @property
     def samples(self) -> int:
-        return self.config.samples or (SAMPLES if self.controls and not self.axes else 1)
+        return self.config.samples or (
+            SAMPLES if self.controls and not self.axes else 1
+        )
 
     @cached_property
     def spp(self) -> int:
@@ -92,12 +101,16 @@ class Job:
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         """(height, width) of the pictures for each model."""
-        return tuple(self.config.resolution or model.input_size for model in self.models)
+        return tuple(
+            self.config.resolution or model.input_size for model in self.models
+        )
 
     @cached_property
     def first_of_size(self) -> tuple[bool, ...]:
         """Of each model, whether no model before it is shown the same pictures."""
-        return tuple(size not in self.sizes[:model] for model, size in enumerate(self.sizes))
+        return tuple(
+            size not in self.sizes[:model] for model, size in enumerate(self.sizes)
+        )
 
     @cached_property
     def per_scene(self) -> int:
@@ -109,31 +122,52 @@ class Job:
         return Seeds(self.config.seed, KIND)
 
     def bound(self, scene: int) -> dict[tuple[int, int], Points]:
-        """The configurations of a scene for each size of picture; those of the last scene are held."""
+        """The configurations of a scene for each size of picture; those of the last
+        scene are held.
+        """
         if scene not in self._bound:
             self._bound.clear()
-            place, sizes = self.places[scene], dict.fromkeys(self.sizes)
-            self._bound[scene] = {size: self.points(self.space(place, size)) for size in sizes}
+            place = self.places[scene]
+            sizes = dict.fromkeys(self.sizes)
+            self._bound[scene] = {
+                size: self.points(self.space(place, size)) for size in sizes
+            }
         return self._bound[scene]
 
     def queries(self, numbers: range) -> list[Sent]:
-        """Ask all models about the pictures with these numbers, all of one scene, whose number is the name."""
+        """Ask all models about the pictures with these numbers, all of one scene, whose
+        number is the name.
+        """
         scene = numbers.start // self.per_scene
-        place, before, keep = self.places[scene], scene * self.per_scene, self.config.keep_pictures != "none"
+        place = self.places[scene]
+        before = scene * self.per_scene
+        keep = self.config.keep_pictures != "none"
         held = {control.name for control in place.held}
         queries: dict[int, Query] = {}
         for size, points in self.bound(scene).items():
             u = points.configurations(numbers.start - before, len(numbers), before)
             described = points.values(u, numbers.start - before)
-            for number, configuration, values in zip(numbers, u, described, strict=True):
-                names, lit_by = place.names, points.space.lit_by(values)
+            for number, configuration, values in zip(
+                numbers, u, described, strict=True
+            ):
+                names = place.names
+                lit_by = points.space.lit_by(values)
                 if lit_by is not None:
                     names["environment"] = lit_by
                 seed = self.seeds(points.noise(number))
-                for model in (model for model, own in enumerate(self.sizes) if own == size):
+                for model in (
+                    model for model, own in enumerate(self.sizes) if own == size
+                ):
                     names["model"] = self.models[model].name
-                    told: dict[str, Value] = {name: {"value": text, "unit": ""} for name, text in names.items()}
-                    told |= {name: value for name, value in values.items() if name.partition(".")[0] not in held}
+                    told: dict[str, Value] = {
+                        name: {"value": text, "unit": ""}
+                        for name, text in names.items()
+                    }
+                    told |= {
+                        name: value
+                        for name, value in values.items()
+                        if name.partition(".")[0] not in held
+                    }
                     step = number * len(self.models) + model
                     queries[step] = Query(
                         configuration.clone(), seed, KIND, step, spp=self.spp, drawn=False, values=told, sought=False,
@@ -149,173 +183,318 @@ class Job:
             return Space((), None)
         space = make_space(controls, description)
         if place.held:
-            start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
+            start = torch.cat(
+                [bound.start for bound in space.controls[: len(place.held)]]
+            )
             if place.u is not None and len(place.u) != len(start):
                 raise InputError(
-                    f"adversarial_of: the adversarial configuration of {place.beside_clean} has {len(place.u)} "
-                    f"numbers, and {place.object} takes {len(start)}: it is another object, or it has changed since; "
+                    "adversarial_of: the adversarial configuration of "
+                    f"{place.beside_clean} has {len(place.u)} "
+                    f"numbers, and {place.object} takes {len(start)}: it is another "
+                    "object, or it has changed since; "
                     "do the run again"
                 )
             space = space.holding(start if place.u is None else place.u)
         for group in space.groups:
             if group.setting in place.scene.description.given - {ENVIRONMENT}:
                 raise InputError(
-                    f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes "
+                    f"`controls` {group.control}: draws {group.parameter} by chance, "
+                    f"and `set` {group.setting} fixes "
                     "it; leave it out of one of the two"
                 )
         return space
 
     def points(self, space: Space) -> Points:
-        """The configurations of a space; those with an adversarial scene have the draws of those without it."""
+        """The configurations of a space; those with an adversarial scene have the draws
+        of those without it.
+        """
         scenes = len(self.places) // 2 if self.places[0].beside_clean else 0
-        domain, config = domain_of(space.controls), self.config
-        return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, len(self.places))
+        domain = domain_of(space.controls)
+        config = self.config
+        return Points(
+            space,
+            domain,
+            self.axes,
+            self.samples,
+            config.sampler,
+            config.seed,
+            scenes,
+            len(self.places),
+        )
 
     def facts(self, place: NamedScene, values: Mapping[str, Value]) -> Facts:
-        description, config = place.scene.description, self.config
-        return facts_about(description, place.object, config.label, lambda: values, judge=config.judge)
+        description = place.scene.description
+        config = self.config
+        return facts_about(
+            description, place.object, config.label, lambda: values, judge=config.judge
+        )
 
 
-def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
+def check_scenes(
+    places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+) -> None:
     given = {name for place in places for name in place.scene.description.given}
-    drawn, choosing = {control.name: control for control in controls}, list[str]()
+    drawn = {control.name: control for control in controls}
+    choosing = list[str]()
     for axis in axes:
         settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
-        setting = (drawn.get(axis.instance) or make_control(axis.instance, settings)).setting(axis.parameter)
+        setting = (
+            drawn.get(axis.instance) or make_control(axis.instance, settings)
+        ).setting(axis.parameter)
         if setting == ENVIRONMENT:
             choosing.append(f"`grid` {axis.name}")
         elif setting in given:
-            raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
+            raise InputError(
+                f"`grid` {axis.name}: `set` fixes it already; leave it "
+                "out of one of the two"
+            )
     environments = list(dict.fromkeys(place.environment for place in places))
     choosing += [
         f"`controls` {control.name}"
         for control in controls
         for parameter in control.parameters
-        if control.setting(parameter) == ENVIRONMENT and parameter.name in control.settings()
+        if control.setting(parameter) == ENVIRONMENT
+        and parameter.name in control.settings()
     ]
     if len(environments) > 1 and choosing:
         raise InputError(
-            f"`environment={','.join(environments)}` and {choosing[0]} both choose what lights the scene; name all of "
+            f"`environment={','.join(environments)}` and {choosing[0]} both choose "
+            "what lights the scene; name all of "
             "them in one of the two, and leave the other out"
         )
 
 
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
-    """Bind every scene once, so that what is wrong is said before anything is rendered. Returns the points of the first
-    scene, and what the table shows of the draws: shares of the range where scenes, or pictures of different shapes,
-    have different ones."""
+    """Bind every scene once, so that what is wrong is said before anything is rendered.
+    Returns the points of the first scene, and what the table shows of the draws: shares
+    of the range where scenes, or pictures of different shapes, have different ones.
+    """
     bound = []
     for scene, place in enumerate(job.places):
         bound += [(place, points) for points in job.bound(scene).values()]
         for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(task, model, place.scene, job.facts(place, {}), job.config.image_settings)
+            check_truth(
+                task,
+                model,
+                place.scene,
+                job.facts(place, {}),
+                job.config.image_settings,
+            )
     first = bound[0][1]
     for place, points in bound:
         if points.drawn_numbers != first.drawn_numbers:
             raise InputError(
-                f"`object` {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
+                f"`object` {place.object}: its controls draw other numbers than those "
+                f"of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
     drawn = []
     for versions in zip(*(points.drawn for _, points in bound), strict=True):
         same = all(one.parts == versions[0].parts for one in versions)
-        shares = tuple([k / first.parts, (k + 1) / first.parts] for k in range(first.parts))
-        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=shares, settled=False))
+        shares = tuple(
+            [k / first.parts, (k + 1) / first.parts] for k in range(first.parts)
+        )
+        drawn.append(
+            versions[0]
+            if same
+            else replace(versions[0], unit="of its range", parts=shares, settled=False)
+        )
     return first, tuple(drawn)
 
 
 class SweptScene:
-    """One scene, ready to be rendered and shown to the models: a `Problem` for each of them. Points, renderers and what
-    predicts pictures are there for each size of picture, on which what a control frames may depend."""
+    """One scene, ready to be rendered and shown to the models: a `Problem` for each of
+    them. Points, renderers and what predicts pictures are there for each size of
+    picture, on which what a control frames may depend.
+    """
 
     def __init__(self, job: Job, number: int) -> None:
-        place, config = job.places[number], job.config
+        place = job.places[number]
+        config = job.config
         self.number, self.job, self.points = number, job, job.bound(number)
         self._without: dict[tuple[int, int], Renderer] = {}
         self.renderers = {size: self._renderer(size) for size in self.points}
-        facts = partial(facts_about, place.scene.description, place.object, config.label, judge=config.judge)
-        spp, seed = job.spp, config.seed
+        facts = partial(
+            facts_about,
+            place.scene.description,
+            place.object,
+            config.label,
+            judge=config.judge,
+        )
+        spp = job.spp
+        seed = config.seed
         self.problems = tuple(
             Problem(
-                self.renderers[size], self.points[size].space, model, task, facts, None, spp, seed, metrics=job.metrics
+                self.renderers[size],
+                self.points[size].space,
+                model,
+                task,
+                facts,
+                None,
+                spp,
+                seed,
+                metrics=job.metrics,
             )
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
-        seed, self.predicted = seeds.stream(seed, "sweep light", number), dict[tuple[int, int], PredictedSweep]()
+        seed = seeds.stream(seed, "sweep light", number)
+        self.predicted = dict[tuple[int, int], PredictedSweep]()
         for size, points in self.points.items():
-            problem, before = self.problems[job.sizes.index(size)], number * points.count
-            self.predicted[size] = PredictedSweep(problem, points, job.axes, seed, config.specialise, before)
+            problem = self.problems[job.sizes.index(size)]
+            before = number * points.count
+            self.predicted[size] = PredictedSweep(
+                problem, points, job.axes, seed, config.specialise, before
+            )
 
     @property
     def not_finite(self) -> int:
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(one.not_finite for one in self.predicted.values())
 
-    def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
-        """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
-        once. Nothing is prepared for these."""
-        begun, before, job = time.perf_counter(), self.not_finite, self.job
+    def evaluate_all(
+        self, queries: Sequence[Query], prepared: Prepared | None = None
+    ) -> list[Evaluation]:
+        """Answer queries of neighbouring rows: a picture is made once for each size,
+        and a model sees all of its own at once. Nothing is prepared for these.
+        """
+        begun = time.perf_counter()
+        before = self.not_finite
+        job = self.job
         models = len(job.models)
         made = {size: self._made(size, queries) for size in self.points}
         said: dict[int, Judgement] = {}
-        for model, (size, problem) in enumerate(zip(job.sizes, self.problems, strict=True)):
+        for model, (size, problem) in enumerate(
+            zip(job.sizes, self.problems, strict=True)
+        ):
             mine = [query for query in queries if query.number % models == model]
             if mine:
-                shown = torch.stack([made[size][query.number // models].picture for query in mine])
-                judged = problem.judge_several(shown, [query.u for query in mine], [query.values for query in mine])
+                shown = torch.stack(
+                    [made[size][query.number // models].picture for query in mine]
+                )
+                judged = problem.judge_several(
+                    shown, [query.u for query in mine], [query.values for query in mine]
+                )
                 judged = self._with_claims(problem, size, mine, shown, judged)
-                said |= {query.number: judgement for query, judgement in zip(mine, judged, strict=True)}
-        wrong = {number // models for number, judgement in said.items() if not judgement.right}
-        seconds, evaluations = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
+                said |= {
+                    query.number: judgement
+                    for query, judgement in zip(mine, judged, strict=True)
+                }
+        wrong = {
+            number // models
+            for number, judgement in said.items()
+            if not judgement.right
+        }
+        seconds = (time.perf_counter() - begun) / len(queries)
+        evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, models)
             picture = made[job.sizes[model]][number]
             cost = picture.traced * job.first_of_size[model]
-            evaluation = Evaluation.of(said[query.number], cost=cost, predicted=picture.predicted, seconds=seconds)
-            if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
-                evaluation = replace(evaluation, small=thumbnails.thumbnail(picture.picture))
+            evaluation = Evaluation.of(
+                said[query.number],
+                cost=cost,
+                predicted=picture.predicted,
+                seconds=seconds,
+            )
+            if (
+                model == 0
+                and query.keep
+                and (job.config.keep_pictures == "all" or number in wrong)
+            ):
+                evaluation = replace(
+                    evaluation, small=thumbnails.thumbnail(picture.picture)
+                )
             if model == 0 and job.aovs:
                 surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
-                layers = {name: layer.numpy() for name, layer in surfaces.layers(job.aovs, OBJECT).items()}
-                evaluation = replace(evaluation, layers=(layers, surfaces.notes(job.aovs)))
+                layers = {
+                    name: layer.numpy()
+                    for name, layer in surfaces.layers(job.aovs, OBJECT).items()
+                }
+                evaluation = replace(
+                    evaluation, layers=(layers, surfaces.notes(job.aovs))
+                )
             evaluations.append(evaluation)
         so_far = [one.summary() for one in self.predicted.values()]
-        return [*evaluations[:-1], replace(evaluations[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
+        return [
+            *evaluations[:-1],
+            replace(
+                evaluations[-1],
+                light=so_far,
+                non_finite=max(0, self.not_finite - before),
+            ),
+        ]
 
     def _with_claims(
-        self, problem: Problem, size: tuple[int, int], mine: Sequence[Query], shown: Tensor, judged: list[Judgement]
+        self,
+        problem: Problem,
+        size: tuple[int, int],
+        mine: Sequence[Query],
+        shown: Tensor,
+        judged: list[Judgement],
     ) -> list[Judgement]:
-        """Return judgements of pictures (n, H, W, 3) with a number for each claim about changed ones: 1 where it is as
-        claimed. What is true stays what it was before the change."""
-        wholes, listed = [query.u for query in mine], [query.values for query in mine]
+        """Return judgements of pictures (n, H, W, 3) with a number for each claim about
+        changed ones: 1 where it is as claimed. What is true stays what it was before
+        the change.
+        """
+        wholes = [query.u for query in mine]
+        listed = [query.values for query in mine]
         for claim, when in self.job.config.claims:
             if when == AWAY:  # rendered with the same noise
-                # by a renderer of its own: a scene in which something was far away has other last bits
-                renderer = self._without[size] if size in self._without else self._renderer(size)
+                # by a renderer of its own: a scene in which something was far away has
+                # other last bits
+                renderer = (
+                    self._without[size]
+                    if size in self._without
+                    else self._renderer(size)
+                )
                 self._without[size], renderer.scene.assembly.away = renderer, True
                 with torch.no_grad():
-                    rendered = [renderer(query.u, query.seed, query.spp) for query in mine]
+                    rendered = [
+                        renderer(query.u, query.seed, query.spp) for query in mine
+                    ]
                 pictures = torch.stack(list(map(to_8_bit, rendered)))
             else:
-                pictures = torch.stack([changed(picture, when, problem.model.cameras) for picture in shown])
+                pictures = torch.stack(
+                    [changed(picture, when, problem.model.cameras) for picture in shown]
+                )
             after = problem.judge_several(pictures, wholes, listed)
             for k, (before, now) in enumerate(zip(judged, after, strict=True)):
                 held = float(as_claimed(claim, before.prediction, now.prediction))
-                judged[k] = replace(before, metrics={**(before.metrics or {}), f"{claim} {when}": held})
+                judged[k] = replace(
+                    before, metrics={**(before.metrics or {}), f"{claim} {when}": held}
+                )
         return judged
 
     def _renderer(self, size: tuple[int, int]) -> Renderer:
-        config, space = self.job.config, self.points[size].space
+        config = self.job.config
+        space = self.points[size].space
         description = framed(self.job.places[self.number].scene.description, size)
-        return make_renderer(description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler)
+        return make_renderer(
+            description,
+            space,
+            size,
+            config.denoise,
+            config.seed,
+            sampler=config.pixel_sampler,
+        )
 
-    def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
+    def _made(
+        self, size: tuple[int, int], queries: Sequence[Query]
+    ) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
-        models, before = len(self.job.models), self.number * self.points[size].count
-        shown = [query for query in queries if self.job.sizes[query.number % models] == size]
+        models = len(self.job.models)
+        before = self.number * self.points[size].count
+        shown = [
+            query for query in queries if self.job.sizes[query.number % models] == size
+        ]
         with torch.no_grad():
-            made = self.predicted[size].pictures({query.number // models - before: query for query in shown})
-        return {before + number: replace(swept, picture=to_8_bit(swept.picture)) for number, swept in made.items()}
+            made = self.predicted[size].pictures(
+                {query.number // models - before: query for query in shown}
+            )
+        return {
+            before + number: replace(swept, picture=to_8_bit(swept.picture))
+            for number, swept in made.items()
+        }
 
     def picture(self, query: Query) -> Tensor:
         """Return the picture (H, W, 3) that the first model is asked about."""
@@ -338,7 +517,9 @@ class OpenScenes:
         return self.scene
 
     def named(self, name: str) -> SweptScene:
-        """The same by its number as text: see `advsearch.engine.journal.worker_call`."""
+        """The same by its number as text: see
+        `advsearch.engine.journal.worker_call`.
+        """
         return self.open(int(name))
 
     def asked(self, number: int) -> tuple[SweptScene, list[Query]]:
@@ -356,26 +537,40 @@ class OpenScenes:
         return thumbnails.thumbnail(self.picture(number))
 
     def find_features(self) -> Features:
-        """Find what reads the features that the first model decides by. Raises InputError: the task has none."""
+        """Find what reads the features that the first model decides by. Raises
+        InputError: the task has none.
+        """
         if self.job.tasks[0].varies:
-            raise InputError(f"task {self.job.config.task_name}: features are read of classifiers")
+            raise InputError(
+                f"task {self.job.config.task_name}: features are read of classifiers"
+            )
         return features_of(self.job.models[0])
 
 
 def check_worst(
-    problem: Problem, config: SweepConfig, u: Tensor, run: RunDirectory | None, stages: Stages
+    problem: Problem,
+    config: SweepConfig,
+    u: Tensor,
+    run: RunDirectory | None,
+    stages: Stages,
 ) -> WorstVerified | None:
-    """Render a configuration again, and say how often the model is wrong; None without trials. Those that the run has
-    stored already are not made again."""
+    """Render a configuration again, and say how often the model is wrong; None without
+    trials. Those that the run has stored already are not made again.
+    """
     if config.trials == 0:
         return None
     ladder = ladder_of(config.verify_spp, config.pixel_sampler)
     verifier = Verifier(Journal(run, Shared(problem)), ladder, stages, sought=False)
     verifier.choose_spp({"worst": u})
     verifier.begin("checking the worst configuration with fresh renders", config.trials)
-    spp, count = verifier.findings.spp, verifier.findings.sample_count
-    tried = run_trials(verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials)
+    spp = verifier.findings.spp
+    count = verifier.findings.sample_count
+    tried = run_trials(
+        verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
+    )
     wrong = [trial for trial in tried if trial.success]
     rate = rate_of(Trials(len(wrong), len(tried), spp), tried, wrong)
     settled = len(verifier.ladder) == 1 or (count is not None and count.converged)
-    return WorstVerified(**vars(rate), converged=settled, renders=verifier.findings.verification_renders)
+    return WorstVerified(
+        **vars(rate), converged=settled, renders=verifier.findings.verification_renders
+    )

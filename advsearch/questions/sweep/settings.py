@@ -12,7 +12,14 @@ from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, Sce
 from advsearch.files import MESHES, either
 from advsearch.options import BY_KEY
 from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
-from advsearch.settings import Clash, each_once, number_or_text, setting, setting_as_in, split_names
+from advsearch.settings import (
+    Clash,
+    each_once,
+    number_or_text,
+    setting,
+    setting_as_in,
+    split_names,
+)
 
 if TYPE_CHECKING:
     from advsearch.controls import Control, Parameter
@@ -22,7 +29,9 @@ BLIND = {
     "covered": "the camera is covered (one even colour, the picture's mean)",
     "away": "the object is taken away",
 }
-"""Changes with which nothing is left to see of the object: a model that looks at it says something else."""
+"""Changes with which nothing is left to see of the object: a model that looks at it
+says something else.
+"""
 
 HARMLESS = {
     "exposure": "the exposure is a third of a stop higher",
@@ -34,38 +43,52 @@ Grid = dict[str, object]  # values, or numbers of them, by the parameters of the
 
 
 class SweepConfig(SceneConfig):
-    """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
+    """Everything that decides what `sweep` does: the average case over a grid, over
+    random draws, or both.
+    """
 
     command: ClassVar[str] = "sweep"
     blind_changes: ClassVar[Mapping[str, str]] = BLIND
     harmless_changes: ClassVar[Mapping[str, str]] = HARMLESS
-    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster", "log")
+    free: ClassVar[tuple[str, ...]] = (
+        *SceneConfig.free,
+        "surface",
+        "workers",
+        "cluster",
+        "log",
+    )
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
             "sampler", lambda one: not one.controls,
-            "is how `controls` are drawn, and none are; add `controls`, or leave `sampler` out",
+            "is how `controls` are drawn, and none are; add `controls`, or leave "
+            "`sampler` out",
         ),
-        Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or leave `fps` out"),
+        Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or "
+                                                   "leave `fps` out"),
         Clash(
-            "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` is 0; leave one of the two out"
+            "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` "
+                                                       "is 0; leave one of the two out"
         ),
     )
 
     object: str = setting_as_in(
-        SceneConfig, "object", description="the object that the model should recognise; several, separated by commas",
+        SceneConfig, "object", description="the object that the model should "
+                                           "recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
         SceneConfig, "environment",
-        description="the environment map that lights the scene; several, separated by commas",
+        description="the environment map that lights the scene; several, separated by "
+                    "commas",
         expects="names of environments or .hdr or .exr files",
     )
     model: str = setting_as_in(
         SceneConfig, "model",
-        description="the network under test; several, separated by commas, are shown the same pictures",
+        description="the network under test; several, separated by commas, are shown "
+                    "the same pictures",
     )
     grid: Grid = setting(
         dict, "sweep", "one axis of the grid; may be repeated",
@@ -73,12 +96,14 @@ class SweepConfig(SceneConfig):
     )
     controls: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict, group="sweep",
-        description="controls that are drawn at random at each grid point, separated by commas", min_length=None,
+        description="controls that are drawn at random at each grid point, separated "
+                    "by commas", min_length=None,
     )
 
     adversarial_of: str | None = setting(
         None, "sweep",
-        "sweep the adversarial scene of this attack beside the clean scene, under the same draws; scene and model "
+        "sweep the adversarial scene of this attack beside the clean scene, under the "
+        "same draws; scene and model "
         "come from that run, and so does what its --over drew if nothing else varies",
         "the name or the folder of a run", metavar="RUN", otherwise="none", min_length=1,
     )
@@ -94,7 +119,8 @@ class SweepConfig(SceneConfig):
     )
     path: str | None = setting_as_in(
         AttackConfig, "path", group="sweep",
-        description="sweep the frames of a drive, in which camera or object travel along this path",
+        description="sweep the frames of a drive, in which camera or object travel "
+                    "along this path",
         otherwise="no path",
     )
     shutter: float | None = setting_as_in(AttackConfig, "shutter", group="sweep")
@@ -110,27 +136,33 @@ class SweepConfig(SceneConfig):
     )
     aov: str | None = setting_as_in(
         RenderConfig, "aov", group="sweep",
-        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for every "
+        description="write ground truth of each pixel, names separated by commas, as "
+                    "layers of an EXR, for every "
         "configuration",
     )
     must_change: str | None = setting(
-        None, "sweep", "show each picture also black, covered (one even colour) or with the object taken away, and "
+        None, "sweep", "show each picture also black, covered (one even colour) or "
+                       "with the object taken away, and "
         "count how often the model says something else, as it must",
         f"names among {', '.join(BLIND)}, separated by commas", otherwise="none",
     )
     must_not_change: str | None = setting(
-        None, "sweep", "show each picture also with a third of a stop more exposure, a shift by one pixel or as a JPEG "
+        None, "sweep", "show each picture also with a third of a stop more exposure, a "
+                       "shift by one pixel or as a JPEG "
         "file, and count how often the model says the same, as it must",
         f"names among {', '.join(HARMLESS)}, separated by commas", otherwise="none",
     )
     surface: bool = setting(
-        False, "sweep", "map which parts of the object's surface, when visible, go with wrong predictions"
+        False, "sweep", "map which parts of the object's surface, when visible, go "
+                        "with wrong predictions"
     )
     spp: int | None = setting_as_in(
-        SceneConfig, "spp", group="sweep", description="samples per pixel of each picture", expects="", ge=1, le=65536
+        SceneConfig, "spp", group="sweep", description="samples per pixel of each "
+                                                       "picture", expects="", ge=1, le=65536
     )
     trials: int = setting(
-        20, "verification", "fresh renders that verify the worst configuration; 0 for none",
+        20, "verification", "fresh renders that verify the worst configuration; 0 for "
+                            "none",
         f"0, or a whole number from {FEWEST_TRIALS} to 100000", unit="renders", ge=0, le=100_000,
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these trials")
@@ -139,7 +171,8 @@ class SweepConfig(SceneConfig):
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
     workers: int | None = setting_as_in(
         AttackConfig, "workers",
-        description="worker processes that share the sweep, each with one thread unless `threads` says more",
+        description="worker processes that share the sweep, each with one thread "
+                    "unless `threads` says more",
     )
     # fmt: on
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
@@ -148,9 +181,19 @@ class SweepConfig(SceneConfig):
 
     @property
     def claims(self) -> tuple[tuple[str, str], ...]:
-        """What is claimed of changed pictures: ``("must_change", "black")`` and so on."""
-        claimed = {"must_change": self.must_change, "must_not_change": self.must_not_change}
-        return tuple((claim, when) for claim, names in claimed.items() if names for when in split_names(names))
+        """What is claimed of changed pictures: ``("must_change", "black")`` and so
+        on.
+        """
+        claimed = {
+            "must_change": self.must_change,
+            "must_not_change": self.must_not_change,
+        }
+        return tuple(
+            (claim, when)
+            for claim, names in claimed.items()
+            if names
+            for when in split_names(names)
+        )
 
     @field_validator("must_change", "must_not_change")
     @classmethod
@@ -169,7 +212,9 @@ class SweepConfig(SceneConfig):
         return split_names(self.lit_by)
 
     def find_control_type(self, instance: str) -> type[Control] | None:
-        """Return the class of a control by its instance's name; None where no control has it."""
+        """Return the class of a control by its instance's name; None where no control
+        has it.
+        """
         from advsearch.controls import CONTROLS  # imports torch
 
         kind = str(self.controls.get(instance, {}).get("kind", instance))
@@ -178,7 +223,9 @@ class SweepConfig(SceneConfig):
         return CONTROLS.get(kind)
 
     def declared_parameters(self, instance: str) -> dict[str, Parameter] | None:
-        """Return the parameters that a control declares, by name; None where the scene declares them."""
+        """Return the parameters that a control declares, by name; None where the scene
+        declares them.
+        """
         control_type = self.find_control_type(instance)
         if control_type is None or control_type.kind == BY_KEY:
             return None
@@ -187,12 +234,29 @@ class SweepConfig(SceneConfig):
 
     @classmethod
     def of_attack(cls, file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings that a sweep of an attack's adversarial scene takes from the `run.yaml` of the attack,
-        where it says nothing else. Unless what was `typed` says what varies, that is what the attack was over."""
+        """Return the settings that a sweep of an attack's adversarial scene takes from
+        the `run.yaml` of the attack, where it says nothing else. Unless what was
+        `typed` says what varies, that is what the attack was over.
+        """
         attacked = AttackConfig.from_yaml(file)
-        apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
-        kept = {name: value for name, value in cls.shared(attacked).items() if name not in apart}
-        return kept if typed.get("grid") or typed.get("controls") else {**kept, "controls": attacked.over}
+        apart = (
+            "controls",
+            "texture_resolution",
+            "spp",
+            "seed",
+            "threads",
+            "deterministic",
+        )
+        kept = {
+            name: value
+            for name, value in cls.shared(attacked).items()
+            if name not in apart
+        }
+        return (
+            kept
+            if typed.get("grid") or typed.get("controls")
+            else {**kept, "controls": attacked.over}
+        )
 
     @field_validator("adversarial_of", mode="before")
     @classmethod
@@ -209,7 +273,9 @@ class SweepConfig(SceneConfig):
     @field_validator("grid", mode="before")
     @classmethod
     def _grid_of_values(cls, value: Any) -> Any:
-        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``; FIRST:LAST:COUNT stays text."""
+        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``;
+        FIRST:LAST:COUNT stays text.
+        """
         if not isinstance(value, Mapping):
             return value
         axes: dict[str, Any] = {}
@@ -224,8 +290,13 @@ class SweepConfig(SceneConfig):
                 listed = [part.strip() for part in text.split(",") if part.strip()]
             listed = listed.tolist() if hasattr(listed, "tolist") else listed
             listed = listed if isinstance(listed, (range, tuple, list)) else [listed]
-            values = [entry.item() if hasattr(entry, "item") else entry for entry in listed]
-            if not values or any(entry is None or isinstance(entry, (bool, list, Mapping)) for entry in values):
+            values = [
+                entry.item() if hasattr(entry, "item") else entry for entry in listed
+            ]
+            if not values or any(
+                entry is None or isinstance(entry, (bool, list, Mapping))
+                for entry in values
+            ):
                 raise ValueError("not values")
             axes[str(name)] = [number_or_text(entry) for entry in values]
         return axes

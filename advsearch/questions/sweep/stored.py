@@ -35,14 +35,20 @@ class StoredSweep:
 
     @classmethod
     def read(cls, folder: Path) -> StoredSweep:
-        """Read settings and result of a sweep. Raises FileFormatError: the run is one of another experiment."""
+        """Read settings and result of a sweep. Raises FileFormatError: the run is one
+        of another experiment.
+        """
         summary = read_result(folder)
         if not isinstance(summary, SweepSummary):
-            raise FileFormatError(f"{folder}: expected the run of a sweep, got one of {summary.command}; sweep first")
+            raise FileFormatError(
+                f"{folder}: expected the run of a sweep, got one of "
+                f"{summary.command}; sweep first"
+            )
         return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary)
 
     def read_rows(self) -> pd.DataFrame:
-        """Read the rows, by ascending `step`. Raises FileFormatError: they cannot be read.
+        """Read the rows, by ascending `step`. Raises FileFormatError: they cannot be
+        read.
 
         `runs.tables.read_sweep` describes the columns and the attributes of the frame.
         """
@@ -59,5 +65,7 @@ class StoredSweep:
         return scenes_of(self.config)
 
     def find_thumbnail(self, number: int) -> Path | None:
-        """Return the file of the stored thumbnail of an image; None where there is none."""
+        """Return the file of the stored thumbnail of an image; None where there is
+        none.
+        """
         return thumbnails.kept_file(self.folder, number)

@@ -1,4 +1,6 @@
-"""Test claims about a model, each found held, failed or undecided: a gate at every change."""
+"""Test claims about a model, each found held, failed or undecided: a gate at every
+change.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import InputError, PositionalArgument, RunContext, experiment, writing
+from advsearch.extend import (
+    InputError,
+    PositionalArgument,
+    RunContext,
+    experiment,
+    writing,
+)
 from advsearch.questions.test import result as results
 from advsearch.questions.test.recorded import noted_settings
 from advsearch.questions.test.result import SuiteResult
 from advsearch.questions.test.settings import SuiteConfig, suite_of
 
 FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.markdown}
-"""Settings that name a file for other programs, and what writes its text from the result."""
+"""Settings that name a file for other programs, and what writes its text from the
+result.
+"""
 
 
 @experiment(
@@ -30,8 +40,11 @@ FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.m
     claims=results.claims,
     noted_settings=noted_settings,
 )
-def test(context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = None) -> SuiteResult:
-    """Try the claims of a suite, counterexamples first, and write the files for other programs (docs/testing.md).
+def test(
+    context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = None
+) -> SuiteResult:
+    """Try the claims of a suite, counterexamples first, and write the files for other
+    programs (docs/testing.md).
 
     Args:
         suite: a YAML file.
@@ -42,8 +55,13 @@ def test(context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = Non
     files = {name: Path(file) for name in FORMATS if (file := getattr(config, name))}
     for name, path in files.items():
         if path.is_dir() or not path.absolute().parent.is_dir():
-            raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")
-    result = try_suite(context, None if suite is None else suite_of(suite, config.suite))
+            raise InputError(
+                f"{name}: expected a file in a folder that is there, got "
+                f"{path}; make the folder first"
+            )
+    result = try_suite(
+        context, None if suite is None else suite_of(suite, config.suite)
+    )
     for name, path in files.items():
         writing.write_text(path, FORMATS[name](result), durable=False)
     return result

@@ -1,4 +1,6 @@
-"""What `test` needs to know: its settings, the suite that a YAML file describes, and what a claim's picture needs."""
+"""What `test` needs to know: its settings, the suite that a YAML file describes, and
+what a claim's picture needs.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ powers = settings.powers
 
 
 class SuiteConfig(Config):
-    """Everything that decides what `test` does: which suite, which of its claims, and on what model."""
+    """Everything that decides what `test` does: which suite, which of its claims, and
+    on what model.
+    """
 
     # fmt: off
     command: ClassVar[str] = "test"
@@ -40,23 +44,29 @@ class SuiteConfig(Config):
         settings.Clash("update", lambda config: config.add is not None,
               "renews what claims are expected to say; first `add`, then it"),
         settings.Clash("only", lambda config: config.add is not None,
-              "names claims, and `add` tries the new counterexample alone; leave one of the two out"),
+              "names claims, and `add` tries the new counterexample alone; leave one "
+              "of the two out"),
     )
 
     suite: str = setting(..., "test", "the claims", "a YAML file")
     only: str | None = setting(
-        None, "test", "claims or counterexamples that are tried, separated by commas; counterexamples: all of these",
+        None, "test", "claims or counterexamples that are tried, separated by commas; "
+                      "counterexamples: all of these",
         "names in the suite", otherwise="all",
     )
     add: str | None = setting(
-        None, "test", "keep the adversarial scene of this run as a counterexample beside the suite, and try it",
+        None, "test", "keep the adversarial scene of this run as a counterexample "
+                      "beside the suite, and try it",
         "the name or the folder of a run of attack", otherwise="nothing is added", power=powers.beside_suite,
     )
     update: bool = setting(
-        False, "test", "expect from now on what the claims say today, and show what changes", power=powers.beside_suite
+        False, "test", "expect from now on what the claims say today, and show what "
+                       "changes", power=powers.beside_suite
     )
-    all: bool = setting(False, "test", "go on with the other claims where a counterexample fails")
-    fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of the suite's")
+    all: bool = setting(False, "test", "go on with the other claims where a "
+                                       "counterexample fails")
+    fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of "
+                                         "the suite's")
     seconds: float | None = setting(
         None, "test", "begin nothing more after this time; what is left is undecided",
         otherwise="what the suite says, or no limit", unit="seconds", gt=0.0, le=1e9,
@@ -76,14 +86,17 @@ class SuiteConfig(Config):
     threads: int | None = setting_as_in(SceneConfig, "threads")
     deterministic: bool = setting_as_in(SceneConfig, "deterministic")
     workers: int | None = setting_as_in(
-        AttackConfig, "workers", description="worker processes that share the pictures of each claim"
+        AttackConfig, "workers", description="worker processes that share the pictures "
+                                             "of each claim"
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/SUITE-test-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
     # fmt: on
 
-    _named = settings.texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
+    _named = settings.texts(
+        "suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"]
+    )
     _different = settings.each_once("only")
 
     @property
@@ -102,25 +115,41 @@ class DrawnConfig(SceneConfig):
     without: ClassVar[tuple[str, ...]] = ("spp",)
 
     verify_spp: int = setting_as_in(
-        AttackConfig, "verify_spp", default=16, description="samples per pixel of each picture", otherwise=""
+        AttackConfig,
+        "verify_spp",
+        default=16,
+        description="samples per pixel of each picture",
+        otherwise="",
     )
 
 
-OWN = (*settings.PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
+OWN = (
+    *settings.PLACE,
+    "seed",
+    "threads",
+    "deterministic",
+    "workers",
+    "cluster",
+    "seconds",
+)
 """Settings that the suite or its command says for all claims."""
 
-PICTURES, MOST = 400, 1_000_000  # pictures that a claim may take, and the most that it may ask for
-COUNTEREXAMPLES = "counterexamples"  # what stands for all of them, and no claim is called
+PICTURES = 400  # pictures that a claim may take, and the most that it may ask for
+MOST = 1_000_000
+# what stands for all of them, and no claim is called
+COUNTEREXAMPLES = "counterexamples"
 Settings = dict[str, object]
 
 EXPECTED = {
     "claim": "right, not_broken, no_worse, must_change or must_not_change",
-    "claims": "names with a claim each, such as `right-around: {claim: right, at_least: 0.9}`",
+    "claims": "names with a claim each, such as `right-around: {claim: right, "
+    "at_least: 0.9}`",
     "at_least": "a share over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
     "pictures": f"a whole number from 1 to {MOST}",
     "when": (
-        f"{', '.join(SweepConfig.blind_changes)} of must_change, and {', '.join(SweepConfig.harmless_changes)} of "
+        f"{', '.join(SweepConfig.blind_changes)} of must_change, and "
+        f"{', '.join(SweepConfig.harmless_changes)} of "
         "must_not_change"
     ),
     "than": "another model, by its name or its file",
@@ -153,7 +182,9 @@ class _Claim(_FromYaml):
 
 
 class _PicturesClaim(_Claim):
-    """Pictures decide it that are drawn, at most so many, from what the controls span."""
+    """Pictures decide it that are drawn, at most so many, from what the controls
+    span.
+    """
 
     kind: ClassVar[type[SceneConfig]] = DrawnConfig
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
@@ -168,7 +199,11 @@ class ShareClaim(_PicturesClaim):
     @classmethod
     def _per_cent(cls, value: Any) -> Any:
         """Accept ``95 %``."""
-        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value) if isinstance(value, str) else None
+        found = (
+            re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value)
+            if isinstance(value, str)
+            else None
+        )
         return value if found is None else float(found[1]) / 100.0
 
 
@@ -179,29 +214,37 @@ class RightClaim(ShareClaim):
 
 
 class MustChangeClaim(ShareClaim):
-    """The model says something else where there is nothing left to see: a model that does not is not looking. `when` is
-    what is done to the picture, a name of `SweepConfig.blind_changes`."""
+    """The model says something else where there is nothing left to see: a model that
+    does not is not looking. `when` is what is done to the picture, a name of
+    `SweepConfig.blind_changes`.
+    """
 
     claim: Literal["must_change"]
     when: Literal["black", "covered", "away"]
 
 
 class MustNotChangeClaim(ShareClaim):
-    """The model says the same where a change means nothing; `when` is a name of `SweepConfig.harmless_changes`."""
+    """The model says the same where a change means nothing; `when` is a name of
+    `SweepConfig.harmless_changes`.
+    """
 
     claim: Literal["must_not_change"]
     when: Literal["exposure", "shift", "jpeg"]
 
 
 class NotBrokenClaim(_Claim):
-    """No search finds a configuration within a budget that the model gets wrong; its settings are those of `attack`."""
+    """No search finds a configuration within a budget that the model gets wrong; its
+    settings are those of `attack`.
+    """
 
     kind: ClassVar[type[SceneConfig]] = AttackConfig
     claim: Literal["not_broken"]
 
 
 class NoWorseClaim(_PicturesClaim):
-    """The model is right at most so many percentage points less often than another one, on the same pictures."""
+    """The model is right at most so many percentage points less often than another one,
+    on the same pictures.
+    """
 
     claim: Literal["no_worse"]
     than: Annotated[str, Field(min_length=1)]
@@ -210,15 +253,19 @@ class NoWorseClaim(_PicturesClaim):
 
 ChangeClaim = MustChangeClaim | MustNotChangeClaim
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | ChangeClaim
-"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
+"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames
+of a drive would stand here.
+"""
 
 KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
 
 class Suite(_FromYaml):
-    """What the file of a suite says: settings of all claims, as for `attack`, in whose place come those of a claim; the
-    root of all random numbers; `confidence` of each claim that is decided by drawn pictures; seconds after which
-    nothing more is begun, None for no limit; and the claims by name."""
+    """What the file of a suite says: settings of all claims, as for `attack`, in whose
+    place come those of a claim; the root of all random numbers; `confidence` of each
+    claim that is decided by drawn pictures; seconds after which nothing more is begun,
+    None for no limit; and the claims by name.
+    """
 
     title: Annotated[str, Field(min_length=1, max_length=200)] = "Claims about a model"
     settings: Settings = Field(default_factory=dict)
@@ -226,27 +273,43 @@ class Suite(_FromYaml):
     confidence: Annotated[float, Field(ge=0.5, le=0.9999)] = 0.95
     seconds: Annotated[float, Field(gt=0.0, le=1e9)] | None = None
     claims: Annotated[
-        dict[str, Annotated[AnyClaim, Field(discriminator="claim")]], Field(min_length=1, max_length=1000)
+        dict[str, Annotated[AnyClaim, Field(discriminator="claim")]],
+        Field(min_length=1, max_length=1000),
     ]
 
     @field_validator("claims")
     @classmethod
     def _names(cls, value: dict[str, AnyClaim]) -> dict[str, AnyClaim]:
         for name in value:
-            if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name) or name == COUNTEREXAMPLES:
-                raise ValueError(f"expected names of small letters, digits and hyphens, got {settings.shown(name)}")
+            if (
+                not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name)
+                or name == COUNTEREXAMPLES
+            ):
+                raise ValueError(
+                    "expected names of small letters, digits and "
+                    f"hyphens, got {settings.shown(name)}"
+                )
         return value
 
     def config_of(self, name: str, **changes: object) -> SceneConfig:
-        """Return what a claim's pictures are made with; settings that the command says for all claims go over its own,
-        None says nothing. An InputError where one is unknown, impossible, or the suite's own."""
+        """Return what a claim's pictures are made with; settings that the command says
+        for all claims go over its own, None says nothing. An InputError where one is
+        unknown, impossible, or the suite's own.
+        """
         claim = self.claims[name]
-        for where, given in (("settings", self.settings), (f"claims.{name}.settings", claim.settings)):
+        for where, given in (
+            ("settings", self.settings),
+            (f"claims.{name}.settings", claim.settings),
+        ):
             if own := [known for known in given if known in OWN]:
-                raise InputError(f"{where}: {own[0]} is said for the whole suite; leave it out there")
+                raise InputError(
+                    f"{where}: {own[0]} is said for the whole suite; leave it out there"
+                )
         changed = {key: value for key, value in changes.items() if value is not None}
         try:
-            return claim.kind(**{**self.settings, **claim.settings, "seed": self.seed, **changed})
+            return claim.kind(
+                **{**self.settings, **claim.settings, "seed": self.seed, **changed}
+            )
         except InputError as error:
             raise InputError(f"claims.{name}: {error}") from None
 
@@ -256,13 +319,23 @@ def read_suite(path: str | Path) -> Suite:
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
-    """Return the suite that a mapping describes, as it stands in the file `where`; a FileFormatError says in one
-    sentence what is missing, unknown, or of another kind."""
+    """Return the suite that a mapping describes, as it stands in the file `where`; a
+    FileFormatError says in one sentence what is missing, unknown, or of another kind.
+    """
     try:
-        return Suite(**{name: value for name, value in data.items() if name not in ("schema", "command")})
+        return Suite(
+            **{
+                name: value
+                for name, value in data.items()
+                if name not in ("schema", "command")
+            }
+        )
     except ValidationError as error:
         details = error.errors(include_url=False)
-        first = next((each for each in details if each["type"] == "extra_forbidden"), details[0])  # a slip in a name
+        # a slip in a name
+        first = next(
+            (each for each in details if each["type"] == "extra_forbidden"), details[0]
+        )
         raise errors.FileFormatError(f"{where}: {_told(first)}") from None
 
 
@@ -271,17 +344,28 @@ def _told(error: Any) -> str:
     place = [str(part) for part in error["loc"] if part not in KINDS]
     got = settings.shown(error["input"])
     if place[-1] == "[key]":  # a name that is a number
-        return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
+        return (
+            f"{place[0]}: expected names of small letters, digits and hyphens, got "
+            f"{got}; put it in quotes"
+        )
     if kind.startswith("union_tag"):
         place.append("claim")
-        got = "nothing" if kind == "union_tag_not_found" else settings.shown(error["ctx"]["tag"])
-    where, name = ".".join(place), place[-1]
+        got = (
+            "nothing"
+            if kind == "union_tag_not_found"
+            else settings.shown(error["ctx"]["tag"])
+        )
+    where = ".".join(place)
+    name = place[-1]
     if kind == "extra_forbidden":
         if name in EXPECTED:
             return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
         near = difflib.get_close_matches(name, sorted(EXPECTED), 1)
         guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
-        return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"
+        return (
+            f"{where}: there is no such name in a suite, or in a claim of this "
+            f"kind; {guess}"
+        )
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
     got = {"missing": "nothing", "too_short": "none"}.get(kind, got)

@@ -1,1 +1,3 @@
-"""Objects and environments from files: meshes, their surfaces and textures, radiance maps."""
+"""Objects and environments from files: meshes, their surfaces and textures, radiance
+maps.
+"""

@@ -1,5 +1,6 @@
-"""What every importer asks of a file before it is parsed: its kind by ending and beginning, and its size; and what is
-said of it."""
+"""What every importer asks of a file before it is parsed: its kind by ending and
+beginning, and its size; and what is said of it.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +23,27 @@ from advsearch.trust import stored_files
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Files of objects and cameras that are not read: what they are, and the program and command that convert them.
+# Files of objects and cameras that are not read: what they are, and the program and
+# command that convert them.
 
 BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
 SPLATS = (
-    "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py writes fuse_post.ply), name that"
+    "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py "
+    "writes fuse_post.ply), name that"
 )
 POINTS = (
-    "has no surface; make one (in Python open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), name its .ply"
+    "has no surface; make one (in Python "
+    "open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), name its .ply"
 )
 UNPACK = "unpack it, and name the mesh in it"
 ELSEWHERE = "open it in that program and export glTF (.glb)"
-ASSIMP = "make an .obj of it, with assimp (Open Asset Import Library): assimp export {file} {obj}"
+ASSIMP = (
+    "make an .obj of it, with assimp (Open Asset Import Library): assimp export "
+    "{file} {obj}"
+)
 SAID = {
     "a COLLADA model": (ASSIMP, (".dae", ".zae")),
     "a 3MF model": (ASSIMP, (".3mf",)),
@@ -49,7 +56,10 @@ SAID = {
         (".step", ".stp", ".iges", ".igs", ".brep"),
     ),
     "a building (IFC)": ("make glTF of it: IfcConvert {file} {glb}", (".ifc",)),
-    "a tile of 3D Tiles": ("take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}", (".b3dm",)),
+    "a tile of 3D Tiles": (
+        "take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}",
+        (".b3dm",),
+    ),
     "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz", ".sog")),
     "a cloud of points": (POINTS, (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts")),
     "an archive": (UNPACK, (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz")),
@@ -57,39 +67,69 @@ SAID = {
     "a file of 3ds Max's": (ELSEWHERE, (".max",)),
     "a file of Cinema 4D's": (ELSEWHERE, (".c4d",)),
     "a file of SketchUp's": (ELSEWHERE, (".skp",)),
-    "NumPy's arrays": ("write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')", (".npz", ".npy")),
+    "NumPy's arrays": (
+        "write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')",
+        (".npz", ".npy"),
+    ),
     "a picture": (
         "an object is a mesh; `environment` takes .hdr and .exr",
         (".png", ".jpg", ".jpeg", ".webp", ".hdr", ".exr"),
     ),
 }
 CAMERAS = {
-    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
+    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter "
+    "--input_path FOLDER --output_path "
     "FOLDER --output_type TXT, and give cameras.txt",
-    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
+    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, "
+    "camera_matrix and "
     "distortion_coefficients (numpy.ndarray.tolist)",
 }
-CAMERAS |= {".npy": CAMERAS[".npz"], ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code")}
+CAMERAS |= {
+    ".npy": CAMERAS[".npz"],
+    ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
+}
 """What files of cameras are that are not read, and what to do."""
 
 
 def advice(path: Path) -> str | None:
-    """Return what a file is by its ending, and what to do with it; None where that is not known.
+    """Return what a file is by its ending, and what to do with it; None where that is
+    not known.
 
-    The rest of a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b ..."``.
+    The rest of a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b
+    ..."``.
     """
-    ending, name = path.suffix.lower(), path.name
+    ending = path.suffix.lower()
+    name = path.name
     for what, (operator, endings) in BLENDER_READS.items():
         if ending in endings:
-            steps = f"bpy.ops.wm.read_factory_settings(use_empty=True); {operator}(filepath={json.dumps(name)})"
+            steps = (
+                "bpy.ops.wm.read_factory_settings(use_empty=True); "
+                f"{operator}(filepath={json.dumps(name)})"
+            )
             script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
-            return f"{what}: make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
+            return (
+                f"{what}: make glTF of it, with Blender: blender -b --python-expr "
+                f"{shlex.quote(script)}"
+            )
     if ending == ".bin":
-        beside = sorted(other.name for other in path.parent.glob("*.gltf"))[:1] if path.parent.is_dir() else []
-        return f"a buffer, as a .gltf file has beside it: name that file{f', {beside[0]}' if beside else ''}"
+        beside = (
+            sorted(other.name for other in path.parent.glob("*.gltf"))[:1]
+            if path.parent.is_dir()
+            else []
+        )
+        return (
+            "a buffer, as a .gltf file has beside it: name that "
+            f"file{f', {beside[0]}' if beside else ''}"
+        )
     names = {kind: shlex.quote(f"{path.stem}.{kind}") for kind in ("obj", "stl", "glb")}
     said = ((what, said) for what, (said, endings) in SAID.items() if ending in endings)
-    return next((f"{what}: {how.format(file=shlex.quote(name), **names)}" for what, how in said), None)
+    return next(
+        (
+            f"{what}: {how.format(file=shlex.quote(name), **names)}"
+            for what, how in said
+        ),
+        None,
+    )
 
 
 _LONGEST_NAME = 100
@@ -120,46 +160,81 @@ _KINDS = (
 
 
 def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
-    """Return the content of a file that holds an ``"object"``, an ``"environment"`` or the like, with one of these
-    endings, lower case with dot. Raises FileFormatError: another ending, or a file that is missing, not an ordinary
-    file, unreadable, empty or larger than `LARGEST_FILE`."""
+    """Return the content of a file that holds an ``"object"``, an ``"environment"`` or
+    the like, with one of these endings, lower case with dot. Raises FileFormatError:
+    another ending, or a file that is missing, not an ordinary file, unreadable, empty
+    or larger than `LARGEST_FILE`.
+    """
     try:
         if path.is_dir():
-            raise FileFormatError(f"{path}: expected a file with an {what}, got a directory; name a file inside it")
+            raise FileFormatError(
+                f"{path}: expected a file with an {what}, got a "
+                "directory; name a file inside it"
+            )
         if path.suffix.lower() not in suffixes:
             file, _, part = str(path).rpartition("#")
             if part and Path(file).suffix.lower() in suffixes:
-                raise FileFormatError(f"{file}: has no parts by name, got #{shown(part, quoted=False)}; leave it out")
-            known = None if what == "environment" else advice(Path(file) if file else path)
+                raise FileFormatError(
+                    f"{file}: has no parts by name, got "
+                    f"#{shown(part, quoted=False)}; leave it out"
+                )
+            known = (
+                None if what == "environment" else advice(Path(file) if file else path)
+            )
             if known is not None:
                 raise FileFormatError(f"{path}: {known} (read are {either(suffixes)})")
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
             raise FileFormatError(
-                f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; convert it to one of these"
+                f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; "
+                "convert it to one of these"
             )
         data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
-        hint = "" if path.parent.is_dir() else f" The folder {path.parent} does not exist either."
+        hint = (
+            ""
+            if path.parent.is_dir()
+            else (f" The folder {path.parent} does not exist either.")
+        )
         with suppress(OSError):
-            beside = {file.name.lower(): file.name for file in path.parent.iterdir() if file.suffix.lower() in suffixes}
-            near = difflib.get_close_matches(path.name.lower(), sorted(beside), n=3, cutoff=0.5)
-            hint = f" Did you mean {' or '.join(repr(beside[name]) for name in near)}?" if near else ""
-        raise FileFormatError(f"{path}: no such {what} file.{hint} Check the path") from error
+            beside = {
+                file.name.lower(): file.name
+                for file in path.parent.iterdir()
+                if file.suffix.lower() in suffixes
+            }
+            near = difflib.get_close_matches(
+                path.name.lower(), sorted(beside), n=3, cutoff=0.5
+            )
+            hint = (
+                f" Did you mean {' or '.join(repr(beside[name]) for name in near)}?"
+                if near
+                else ""
+            )
+        raise FileFormatError(
+            f"{path}: no such {what} file.{hint} Check the path"
+        ) from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise FileFormatError(f"{path}: the {what} file cannot be read ({reason}); check its permissions") from error
+        raise FileFormatError(
+            f"{path}: the {what} file cannot be read ({reason}); check its permissions"
+        ) from error
     if not data:
-        raise FileFormatError(f"{path}: the {what} file is empty; export or download it again")
+        raise FileFormatError(
+            f"{path}: the {what} file is empty; export or download it again"
+        )
     return data
 
 
 def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
     """Return the error for a file whose content is not what its name says."""
-    return FileFormatError(f"{path}: expected {expected}, got {got}; export or download the file again")
+    return FileFormatError(
+        f"{path}: expected {expected}, got {got}; export or download the file again"
+    )
 
 
 def find_kind(data: bytes) -> str | None:
-    """Return the kind of file that `data` begins like, in words that fit after "got"; None for an unknown one."""
+    """Return the kind of file that `data` begins like, in words that fit after "got";
+    None for an unknown one.
+    """
     return next((kind for magic, kind in _KINDS if data.startswith(magic)), None)
 
 
@@ -171,7 +246,9 @@ def looks_like(data: bytes) -> str:
 
 
 def text_of(data: bytes) -> str:
-    """Decode text that is UTF-8 or, failing that, Latin-1; a byte order mark is dropped."""
+    """Decode text that is UTF-8 or, failing that, Latin-1; a byte order mark is
+    dropped.
+    """
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -179,7 +256,9 @@ def text_of(data: bytes) -> str:
 
 
 def numbers_in(data: bytes, kind: type) -> npt.NDArray[np.generic]:
-    """Return the numbers in a text with blanks between them, up to the first word that is none."""
+    """Return the numbers in a text with blanks between them, up to the first word that
+    is none.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -197,15 +276,18 @@ def is_number(word: str) -> bool:
 
 
 def shown(name: str, *, quoted: bool = True, longest: int = _LONGEST_NAME) -> str:
-    """Return a name out of a file as a message shows it: control characters spelled out, cut to half of what is the
-    longest."""
+    """Return a name out of a file as a message shows it: control characters spelled
+    out, cut to half of what is the longest.
+    """
     kept = name if len(name) <= longest else name[: longest // 2]
     text = repr(kept) if quoted else repr(kept)[1:-1]
     return text if kept == name else f"{text}... ({len(name):,} characters)"
 
 
 def safe_name(path: Path) -> str:
-    """Return the file's name without ending, with everything but letters, digits, '.', '_' and '-' made a '-'."""
+    """Return the file's name without ending, with everything but letters, digits, '.',
+    '_' and '-' made a '-'.
+    """
     return re.sub(r"[^A-Za-z0-9._-]", "-", path.stem).strip(".-") or "imported"
 
 
@@ -234,7 +316,9 @@ def clean(name: str) -> str:
 
 
 LARGEST_FACES = 2_000_000
-"""Triangles that a mesh may have, before `scaled`; each takes over 1 KB of memory to import."""
+"""Triangles that a mesh may have, before `scaled`; each takes over 1 KB of memory to
+import.
+"""
 MOST_CORNERS = 10_000  # corners that one face may have
 
 
@@ -244,7 +328,8 @@ def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
 
 
 class Notes:
-    """What is said about a file, each sentence once; what the file has that was not taken; and errors about it.
+    """What is said about a file, each sentence once; what the file has that was not
+    taken; and errors about it.
 
         notes = Notes("chair.ply")
         notes.say("the alpha of 'wood.png' is left out")
@@ -252,22 +337,30 @@ class Notes:
         notes.take("property", "x")
         list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
-    A thing that a file has is a kind (a word of the format: ``"property"``, ``"keyword"``) and its name in the file.
+    A thing that a file has is a kind (a word of the format: ``"property"``,
+    ``"keyword"``) and its name in the file.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path, self.source = path, path.name if isinstance(path, Path) else path
-        self._said: dict[str, None] = {}  # quick, since a file may give cause for 100,000 warnings
+        # quick, since a file may give cause for 100,000 warnings
+        self._said: dict[str, None] = {}
         self._has: Counter[tuple[str, str]] = Counter()
         self._taken: set[tuple[str, str]] = set()
 
     def say(self, clause: str) -> None:
-        """Warn, once; a clause that begins with a blank goes on after the file's name."""
-        self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = None
+        """Warn, once; a clause that begins with a blank goes on after the file's
+        name.
+        """
+        self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = (
+            None
+        )
 
     def damaged(self, expected: str, got: str | bytes) -> FileFormatError:
         """Return the error of `damaged`; of content, what it looks like."""
-        return damaged(self.path, expected, got if isinstance(got, str) else looks_like(got))
+        return damaged(
+            self.path, expected, got if isinstance(got, str) else looks_like(got)
+        )
 
     def check_most(self, count: int, limit: int, expected: str) -> None:
         """See `check_most`."""
@@ -281,7 +374,9 @@ class Notes:
         self._has[kind, name] += 1
 
     def take(self, kind: str, name: str) -> None:
-        """Note that this is used; that the file need not have it makes readers short."""
+        """Note that this is used; that the file need not have it makes readers
+        short.
+        """
         self._taken.add((kind, name))
 
     def __iter__(self) -> Iterator[str]:
@@ -294,6 +389,8 @@ class Notes:
 
 
 def last_line(said: str) -> str:
-    """Return the last line of what Blender has said, for a message; empty if there is none."""
+    """Return the last line of what Blender has said, for a message; empty if there is
+    none.
+    """
     lines = [line for line in said.splitlines() if line.strip()]
     return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""

@@ -1,4 +1,6 @@
-"""The entries of a glTF header, as far as they are read; field names are the format's (glTF 2.0, section 5)."""
+"""The entries of a glTF header, as far as they are read; field names are the format's
+(glTF 2.0, section 5).
+"""
 
 from __future__ import annotations
 
@@ -6,33 +8,71 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, FailFast, Field, JsonValue
+from pydantic import (
+    AliasPath,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    FailFast,
+    Field,
+    JsonValue,
+)
 
-GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
+# what the glTF is made by; what it leaves out is in the extras of its asset
+GENERATOR = "advsearch, of OpenUSD"
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
-"""A list of which only the first wrong entry is reported; a million reports take gigabytes."""
+"""A list of which only the first wrong entry is reported; a million reports take
+gigabytes.
+"""
 Unread = Annotated[JsonValue, Field(exclude=True)]
 """What is never read, and named in a warning of its own, or makes no difference."""
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
-_ELEMENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_ELEMENTS = {
+    "SCALAR": 1,
+    "VEC2": 2,
+    "VEC3": 3,
+    "VEC4": 4,
+    "MAT2": 4,
+    "MAT3": 9,
+    "MAT4": 16,
+}
 
 
 REFERENCES = {
-    **dict.fromkeys(("attributes", "indices", "targets", "input", "output", "inverseBindMatrices"), "accessors"),
+    **dict.fromkeys(
+        ("attributes", "indices", "targets", "input", "output", "inverseBindMatrices"),
+        "accessors",
+    ),
     **dict.fromkeys(("children", "joints", "node", "nodes"), "nodes"),
     **dict.fromkeys(("source", "webp"), "images"),
-    **{"buffer": "buffers", "bufferView": "bufferViews", "camera": "cameras", "index": "textures", "lamp": "lights"},
-    **{"material": "materials", "mesh": "meshes", "sampler": "samplers", "scene": "scenes", "skin": "skins"},
+    **{
+        "buffer": "buffers",
+        "bufferView": "bufferViews",
+        "camera": "cameras",
+        "index": "textures",
+        "lamp": "lights",
+    },
+    **{
+        "material": "materials",
+        "mesh": "meshes",
+        "sampler": "samplers",
+        "scene": "scenes",
+        "skin": "skins",
+    },
 }
 """What of the header the numbers in a field refer to."""
 
 
 class Entry(BaseModel):
-    """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`, to be named as left out."""
+    """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`,
+    to be named as left out.
+    """
 
-    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(
+        strict=True, extra="allow", allow_inf_nan=False, frozen=True
+    )
     extensions: Unread = None  # as they are in the file
 
     def entries(self) -> Iterator[Entry]:
@@ -48,7 +88,9 @@ class Entry(BaseModel):
 
     @classmethod
     def read_of_extensions(cls) -> dict[str, set[str]]:
-        """Return the keys that are read of extensions, by their names; none where an extension is an entry itself."""
+        """Return the keys that are read of extensions, by their names; none where an
+        extension is an entry itself.
+        """
         read: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
             if isinstance(info.validation_alias, AliasPath):
@@ -67,7 +109,9 @@ class Entry(BaseModel):
 
 
 def _extension(*path: str, default: Any = None) -> Any:
-    """A field that an extension of the entry holds; those that are not understood are named by `gltf_left_out`."""
+    """A field that an extension of the entry holds; those that are not understood are
+    named by `gltf_left_out`.
+    """
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
 
@@ -126,14 +170,17 @@ class Primitive(Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: List[dict[str, Index]] = []  # morph targets: how far each attribute goes where their weight is 1
+    # morph targets: how far each attribute goes where their weight is 1
+    targets: List[dict[str, Index]] = []
 
 
 class MeshEntry(Entry):
     primitives: List[Primitive]
     name: str | None = None
     weights: List[float] = []  # of its morph targets, where a node says none of its own
-    extras: Unread = None  # `targetNames` in it are what they are called: not of the format, but exporters write them
+    # `targetNames` in it are what they are called: not of the format, but exporters
+    # write them
+    extras: Unread = None
 
 
 class Node(Entry):
@@ -141,7 +188,8 @@ class Node(Entry):
     mesh: Index | None = None
     camera: Index | None = None
     skin: Index | None = None
-    lamp: Index | None = _extension("KHR_lights_punctual", "light")  # number of the light that the node carries
+    # number of the light that the node carries
+    lamp: Index | None = _extension("KHR_lights_punctual", "light")
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
@@ -151,7 +199,9 @@ class Node(Entry):
 
 
 class Skin(Entry):
-    """The nodes that move a mesh, and the accessor of the matrices from the mesh to each of them."""
+    """The nodes that move a mesh, and the accessor of the matrices from the mesh to
+    each of them.
+    """
 
     joints: Annotated[list[Index], FailFast(), Field(min_length=1)]
     inverseBindMatrices: Index | None = None
@@ -206,17 +256,23 @@ class CameraEntry(Entry):
 
 
 class Cone(Entry):
-    """Of a spot light: angles from its axis in radians, up to which it shines fully and beyond which not at all."""
+    """Of a spot light: angles from its axis in radians, up to which it shines fully and
+    beyond which not at all.
+    """
 
     innerConeAngle: Annotated[float, Field(ge=0.0)] = 0.0
     outerConeAngle: Annotated[float, Field(gt=0.0, lt=1.571)] = math.pi / 4.0
 
 
 class LightEntry(Entry):
-    """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
+    """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in
+    lux.
+    """
 
     type: Literal["point", "spot", "directional"]
-    color: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
+    color: Annotated[
+        list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)
+    ] = [1.0, 1.0, 1.0]
     intensity: Annotated[float, Field(ge=0.0)] = 1.0
     spot: Cone = Cone()
     range: Annotated[float, Field(gt=0.0)] | None = None
@@ -228,7 +284,9 @@ Map = Annotated[int, Field(ge=0, lt=256)]
 
 
 class TextureTransform(Entry):
-    """KHR_texture_transform: scaled, then turned counter-clockwise in radians, then moved."""
+    """KHR_texture_transform: scaled, then turned counter-clockwise in radians, then
+    moved.
+    """
 
     offset: Pair = [0.0, 0.0]
     rotation: float = 0.0
@@ -239,9 +297,9 @@ class TextureTransform(Entry):
 class TextureUse(Entry):
     index: Index
     texCoord: Map = 0
-    transform: Annotated[TextureTransform, BeforeValidator(lambda given: given or {})] = _extension(
-        "KHR_texture_transform", default=TextureTransform()
-    )
+    transform: Annotated[
+        TextureTransform, BeforeValidator(lambda given: given or {})
+    ] = _extension("KHR_texture_transform", default=TextureTransform())
     """What is done to the texture coordinates before it is looked up."""
 
     @property
@@ -252,7 +310,10 @@ class TextureUse(Entry):
 
     def looked_up_as(self, other: TextureUse) -> bool:
         """Whether another texture is looked up at the same places."""
-        moves = [(by.offset, by.rotation, by.scale) for by in (self.transform, other.transform)]
+        moves = [
+            (by.offset, by.rotation, by.scale)
+            for by in (self.transform, other.transform)
+        ]
         return self.attribute == other.attribute and moves[0] == moves[1]
 
 
@@ -278,7 +339,8 @@ class SpecularGlossiness(Entry):
 
 
 CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base colour counts
-CUTOFF = 0.5  # the alpha under which there is nothing, where the file does not say which
+# the alpha under which there is nothing, where the file does not say which
+CUTOFF = 0.5
 
 
 class MaterialEntry(Entry):
@@ -286,7 +348,9 @@ class MaterialEntry(Entry):
     name: str | None = None
     normalTexture: NormalUse | None = None
     emissiveTexture: TextureUse | None = None
-    emissiveFactor: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [0.0] * 3
+    emissiveFactor: Annotated[
+        list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)
+    ] = [0.0] * 3
     alphaMode: str = "OPAQUE"
     alphaCutoff: float = CUTOFF
     doubleSided: Unread = None
@@ -294,24 +358,36 @@ class MaterialEntry(Entry):
     strength: Annotated[float, Field(ge=0.0)] = _extension(
         "KHR_materials_emissive_strength", "emissiveStrength", default=1.0
     )
-    glossiness: SpecularGlossiness | None = _extension("KHR_materials_pbrSpecularGlossiness")
+    glossiness: SpecularGlossiness | None = _extension(
+        "KHR_materials_pbrSpecularGlossiness"
+    )
 
     @property
     def surface(self) -> MetallicRoughness:
-        """Its base colour, roughness and metallic: the format's where it says none, and those of an old extension,
-        whose diffuse colour is the base colour."""
+        """Its base colour, roughness and metallic: the format's where it says none, and
+        those of an old extension, whose diffuse colour is the base colour.
+        """
         old = self.glossiness
         if old is None:
             return self.pbrMetallicRoughness or MetallicRoughness()
-        color, texture, rough = old.diffuseFactor, old.diffuseTexture, 1.0 - old.glossinessFactor
+        color = old.diffuseFactor
+        texture = old.diffuseTexture
+        rough = 1.0 - old.glossinessFactor
         return MetallicRoughness(
-            baseColorFactor=color, baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=rough
+            baseColorFactor=color,
+            baseColorTexture=texture,
+            metallicFactor=0.0,
+            roughnessFactor=rough,
         )
 
     @property
     def layout(self) -> TextureUse | None:
-        """The use of a texture whose coordinates the mesh gets: of the base colour, if it has one."""
-        return self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
+        """The use of a texture whose coordinates the mesh gets: of the base colour, if
+        it has one.
+        """
+        return (
+            self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
+        )
 
     @property
     def attribute(self) -> str:
@@ -319,7 +395,9 @@ class MaterialEntry(Entry):
         return "TEXCOORD_0" if self.layout is None else self.layout.attribute
 
     def reads(self, use: TextureUse | None) -> bool:
-        """Whether a texture is looked up at the same places as the others, if there is one; else it is left out."""
+        """Whether a texture is looked up at the same places as the others, if there is
+        one; else it is left out.
+        """
         return use is None or self.layout is None or use.looked_up_as(self.layout)
 
     @property
@@ -328,7 +406,9 @@ class MaterialEntry(Entry):
         return [channel * self.strength for channel in self.emissiveFactor]
 
 
-REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071  # how a texture goes on beyond its edges
+REPEAT = 10497  # how a texture goes on beyond its edges
+MIRRORED = 33648
+CLAMPED = 33071
 BORDER = 33069  # nothing beyond the edges: OpenGL's and USD's, not glTF's
 NEAREST = 9728  # the filter that leaves texels sharp
 
@@ -347,7 +427,9 @@ class Texture(Entry):
 
     @property
     def image(self) -> int | None:
-        """Number of its picture; None where only an extension that is not understood has one."""
+        """Number of its picture; None where only an extension that is not understood
+        has one.
+        """
         return self.source if self.webp is None else self.webp
 
 
@@ -358,7 +440,9 @@ class Image(Entry):
 
 
 class Header(Entry):
-    """What is read of the JSON of a glTF file; field names are the format's (glTF 2.0, section 5)."""
+    """What is read of the JSON of a glTF file; field names are the format's (glTF 2.0,
+    section 5).
+    """
 
     asset: Asset
     scene: Index | None = None
@@ -375,7 +459,9 @@ class Header(Entry):
     cameras: List[CameraEntry] = []
     skins: List[Skin] = []
     animations: List[Animation] = []
-    vrm: dict[str, HumanBone] = _extension("VRMC_vrm", "humanoid", "humanBones", default={})
+    vrm: dict[str, HumanBone] = _extension(
+        "VRMC_vrm", "humanoid", "humanBones", default={}
+    )
     """The bones of a person by the names of VRM 1."""
     vrm_0: List[HumanBone] = _extension("VRM", "humanoid", "humanBones", default=[])
     lights: List[LightEntry] = _extension("KHR_lights_punctual", "lights", default=[])
@@ -385,10 +471,13 @@ class Header(Entry):
 
     def below(self, nodes: Iterable[int]) -> set[int]:
         """Return nodes, and all that hang on them."""
-        reached, level = set[int](), set(nodes)
+        reached = set[int]()
+        level = set(nodes)
         while level:
             reached |= level
-            level = {child for node in level for child in self.nodes[node].children} - reached
+            level = {
+                child for node in level for child in self.nodes[node].children
+            } - reached
         return reached
 
     @property

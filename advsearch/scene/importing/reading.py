@@ -1,4 +1,6 @@
-"""What readers of mesh files and converters to glTF are made of: parts, glTF, messages, bounds, other programs."""
+"""What readers of mesh files and converters to glTF are made of: parts, glTF, messages,
+bounds, other programs.
+"""
 
 from __future__ import annotations
 

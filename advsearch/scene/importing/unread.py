@@ -1,6 +1,8 @@
-"""Values of a file by their keys: which keys were read is recorded, and the rest is named.
+"""Values of a file by their keys: which keys were read is recorded, and the rest is
+named.
 
-Every reader of a format with keys uses this, so that nothing in a file is left out without a word.
+Every reader of a format with keys uses this, so that nothing in a file is left out
+without a word.
 """
 
 from __future__ import annotations
@@ -23,12 +25,19 @@ class TrackedKeys(Generic[T]):
         entries.unread()                # ["k7"], as the file spells it
         join_names(entries.unread())    # "'k7'": bounded in length, for a message
 
-    `fold` turns a key into the form by which it is looked up, such as ``str.lower``. Of keys with
-    the same form the last counts; the earlier ones are in `repeated`.
+    `fold` turns a key into the form by which it is looked up, such as ``str.lower``. Of
+    keys with the same form the last counts; the earlier ones are in `repeated`.
     """
 
-    def __init__(self, values: Mapping[str, T], *, fold: Callable[[str], str] = str, within: str = "") -> None:
-        self.repeated: list[str] = []  # keys, as spelled, that a later one of the same form hides
+    def __init__(
+        self,
+        values: Mapping[str, T],
+        *,
+        fold: Callable[[str], str] = str,
+        within: str = "",
+    ) -> None:
+        # keys, as spelled, that a later one of the same form hides
+        self.repeated: list[str] = []
         self._fold = fold
         self._within = within
         self._values: dict[str, T] = {}
@@ -43,9 +52,11 @@ class TrackedKeys(Generic[T]):
             self._spelling[folded] = key
 
     def get(self, *keys: str) -> T | None:
-        """Return the value of the first of these keys, in folded form, that has one, or None.
+        """Return the value of the first of these keys, in folded form, that has one, or
+        None.
 
-        That key counts as read, and so do those of the others that have no value (None).
+        That key counts as read, and so do those of the others that have no value
+        (None).
         """
         present = [key for key in keys if self._values.get(key) is not None]
         self._read.update(key for key in keys if key not in present[1:])
@@ -60,9 +71,11 @@ class TrackedKeys(Generic[T]):
         self._read.update(keys)
 
     def nested(self, key: str) -> TrackedKeys[Any]:
-        """Return the keys within the value of a key; what is not read of them is not read of this.
+        """Return the keys within the value of a key; what is not read of them is not
+        read of this.
 
-        It has no keys where there is no such value. A value that is no mapping stays unread.
+        It has no keys where there is no such value. A value that is no mapping stays
+        unread.
         """
         if key not in self._nested:
             value = self._values.get(key)
@@ -71,15 +84,18 @@ class TrackedKeys(Generic[T]):
                 self._read.add(key)
                 inner = {str(name): held for name, held in value.items()}
             spelled = self._spelling.get(key, key)
-            self._nested[key] = TrackedKeys(inner, fold=self._fold, within=f"{self._within}{spelled}.")
+            self._nested[key] = TrackedKeys(
+                inner, fold=self._fold, within=f"{self._within}{spelled}."
+            )
         return self._nested[key]
 
     def unread(self, is_quiet: Callable[[str, T], bool] | None = None) -> list[str]:
-        """Return the keys that were not read, as spelled, each with the keys that it is within.
+        """Return the keys that were not read, as spelled, each with the keys that it is
+        within.
 
         Args:
-            is_quiet: whether a key, in folded form, with its value needs no word, because it
-                changes nothing. It does not judge nested keys.
+            is_quiet: whether a key, in folded form, with its value needs no word,
+                because it changes nothing. It does not judge nested keys.
         """
         names = []
         for key, spelled in self._spelling.items():
@@ -91,7 +107,9 @@ class TrackedKeys(Generic[T]):
         return names
 
     def spelled(self, key: str) -> str:
-        """Return a key, in folded form, as the file spells it, or as it is if it has none."""
+        """Return a key, in folded form, as the file spells it, or as it is if it has
+        none.
+        """
         return self._spelling.get(key, key)
 
     def items(self) -> Iterator[tuple[str, T]]:
@@ -106,7 +124,9 @@ class TrackedKeys(Generic[T]):
 
 
 def join_names(names: Iterable[str], max_named: int = MAX_NAMED) -> str:
-    """Return names out of a file for a message: quoted, cut in length, and the rest as a number."""
+    """Return names out of a file for a message: quoted, cut in length, and the rest as
+    a number.
+    """
     listed = list(dict.fromkeys(names))
     text = ", ".join(shown(name) for name in listed[:max_named])
     rest = len(listed) - max_named

@@ -1,1 +1,3 @@
-"""The one place with Mitsuba's names: variant, libLLVM, dictionary, plugins, scene, denoiser."""
+"""The one place with Mitsuba's names: variant, libLLVM, dictionary, plugins, scene,
+denoiser.
+"""

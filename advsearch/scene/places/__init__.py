@@ -1,1 +1,3 @@
-"""Places as geometry around the object: a glTF file and a YAML file that says what its meshes are."""
+"""Places as geometry around the object: a glTF file and a YAML file that says what its
+meshes are.
+"""

@@ -1,4 +1,6 @@
-"""Environments that are a place: ``--environment my-street/place.yaml``, or one of its lights, ``place.yaml#night``."""
+"""Environments that are a place: ``--environment my-street/place.yaml``, or one of its
+lights, ``place.yaml#night``.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,17 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.grounds import LUMINANCE, irradiance
 from advsearch.scene.importing.files import safe_name
-from advsearch.scene.library import import_environment, list_environments, load_environment
-from advsearch.scene.places.place_file import find_beside, read_place, read_place_file, split_light
+from advsearch.scene.library import (
+    import_environment,
+    list_environments,
+    load_environment,
+)
+from advsearch.scene.places.place_file import (
+    find_beside,
+    read_place,
+    read_place_file,
+    split_light,
+)
 from advsearch.trust.stored_files import reading
 
 
@@ -20,8 +31,10 @@ def import_place(spec: str) -> EnvironmentAsset:
     """Read a place with its light, the first in its file or the one that is named.
 
     Raises:
-        FileFormatError, InputError: a file is missing, damaged, outside of the folder, or says something else.
-        UnknownNameError: the place has no such light, mesh or variant, or there is no such bundled environment.
+        FileFormatError, InputError: a file is missing, damaged, outside of the folder,
+            or says something else.
+        UnknownNameError: the place has no such light, mesh or variant, or there is no
+            such bundled environment.
     """
     name, chosen = split_light(spec)
     path = Path(name)
@@ -29,7 +42,12 @@ def import_place(spec: str) -> EnvironmentAsset:
         file = read_place_file(path)
         light_name = next(iter(file.lights)) if chosen is None else chosen
         if light_name not in file.lights:
-            raise UnknownNameError(f"light of {path}:", light_name, file.lights, f"Write it as {path}#NAME.")
+            raise UnknownNameError(
+                f"light of {path}:",
+                light_name,
+                file.lights,
+                f"Write it as {path}#NAME.",
+            )
         light = file.lights[light_name]
         place = read_place(path, file, light.variant)
         if light.map in list_environments():
@@ -38,16 +56,21 @@ def import_place(spec: str) -> EnvironmentAsset:
             lit = import_environment(find_beside(path, light.map))
     candelas = None
     if light.lux is not None:
-        arriving = irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE)
+        arriving = irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(
+            LUMINANCE
+        )
         if float(arriving) <= 0.0:
             raise InputError(
-                f"{path}: lights.{light_name}: expected a map with light for its lux, got {light.map}, which is black "
+                f"{path}: lights.{light_name}: expected a map with light for its lux, "
+                f"got {light.map}, which is black "
                 "where the sky is; leave lux out"
             )
         candelas = light.lux / float(arriving)
     return replace(
         lit,
-        name=place.name if chosen is None else safe_name(Path(f"{place.name}-{light_name}.x")),
+        name=place.name
+        if chosen is None
+        else safe_name(Path(f"{place.name}-{light_name}.x")),
         source=spec,
         warnings=(*lit.warnings, *place.notes),
         photographed=False,

@@ -1,4 +1,5 @@
-"""The YAML file of a place: which of its meshes is ground, what shines, what is solid, and the light it stands in.
+"""The YAML file of a place: which of its meshes is ground, what shines, what is solid,
+and the light it stands in.
 
     mesh: street.glb
     ground: [road, pavement]
@@ -8,9 +9,10 @@
       day: {map: day.hdr, lux: 75000}
       rain: {map: grey.hdr, lux: 9000, variant: wet}
 
-Lengths are metres, with the object at the origin, x ahead of it, y to its left and z up. The mesh has its own axes, as
-glTF says: y up, and z ahead of the object. All that has one material is one mesh, named by the material. A variant is
-one of KHR_materials_variants.
+Lengths are metres, with the object at the origin, x ahead of it, y to its left and z
+up. The mesh has its own axes, as glTF says: y up, and z ahead of the object. All that
+has one material is one mesh, named by the material. A variant is one of
+KHR_materials_variants.
 """
 
 from __future__ import annotations
@@ -42,73 +44,116 @@ T = TypeVar("T")
 
 
 def is_place_file(spec: object) -> bool:
-    """Whether an environment is asked for as the file of a place, perhaps with one of its lights: ``a.yaml#night``."""
-    return isinstance(spec, (str, Path)) and split_light(str(spec))[0].lower().endswith(SUFFIXES)
+    """Whether an environment is asked for as the file of a place, perhaps with one of
+    its lights: ``a.yaml#night``.
+    """
+    return isinstance(spec, (str, Path)) and split_light(str(spec))[0].lower().endswith(
+        SUFFIXES
+    )
 
 
 def split_light(spec: str) -> tuple[str, str | None]:
-    """Return the file and the light of ``place.yaml#night``; None where it names no light."""
+    """Return the file and the light of ``place.yaml#night``; None where it names no
+    light.
+    """
     file, mark, light = spec.rpartition("#")
-    return (file, light) if mark and file.lower().endswith(SUFFIXES) and not os.path.exists(spec) else (spec, None)
+    return (
+        (file, light)
+        if mark and file.lower().endswith(SUFFIXES) and not os.path.exists(spec)
+        else (spec, None)
+    )
 
 
 def read_place_file(path: Path) -> PlaceFile:
-    """Read the YAML file of a place. Raises FileFormatError: it is missing, is not YAML, or says something else."""
-    content = parsed(path, present_text(path, "the YAML file of a place", LARGEST), "YAML", parse_yaml)
+    """Read the YAML file of a place. Raises FileFormatError: it is missing, is not
+    YAML, or says something else.
+    """
+    content = parsed(
+        path,
+        present_text(path, "the YAML file of a place", LARGEST),
+        "YAML",
+        parse_yaml,
+    )
     if not isinstance(content, dict):
         got = "an empty file" if content is None else type(content).__name__
-        raise FileFormatError(f"{path}: expected entries such as 'mesh: street.glb', got {got}")
+        raise FileFormatError(
+            f"{path}: expected entries such as 'mesh: street.glb', got {got}"
+        )
     try:
         return PlaceFile.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = shown(".".join(map(str, first["loc"])), quoted=False)
         problem = first["msg"].removeprefix("Value error, ")[:200]
-        raise FileFormatError(f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example") from None
+        raise FileFormatError(
+            f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example"
+        ) from None
 
 
 def find_beside(path: Path, name: str) -> Path:
-    """Return a file that the file of a place names. Raises FileFormatError: it leads out of the folder."""
+    """Return a file that the file of a place names. Raises FileFormatError: it leads
+    out of the folder.
+    """
     beside = path.parent / name
     if "\0" in name or not is_inside(beside, path.parent):
-        raise FileFormatError(f"{path}: {name[:200]!r} {OUTSIDE}; put it beside the file")
+        raise FileFormatError(
+            f"{path}: {name[:200]!r} {OUTSIDE}; put it beside the file"
+        )
     return beside
 
 
 def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
-    """Read the meshes of a place. Raises FileFormatError, InputError: as for an imported object; UnknownNameError: it
-    has no such mesh or variant."""
+    """Read the meshes of a place. Raises FileFormatError, InputError: as for an
+    imported object; UnknownNameError: it has no such mesh or variant.
+    """
     parts, notes = read_place_meshes(find_beside(path, file.mesh), variant)
     names = [part.name for part in parts]
     for kind in (file.ground, file.lamps):
         for name in kind:
             if name not in names:
-                raise UnknownNameError(f"mesh of {file.mesh}:", name, names, f"It stands in {path}.")
-    solids = tuple(Solid(entry.name, outline) for entry in file.solids for outline in entry.list_footprints())
+                raise UnknownNameError(
+                    f"mesh of {file.mesh}:", name, names, f"It stands in {path}."
+                )
+    solids = tuple(
+        Solid(entry.name, outline)
+        for entry in file.solids
+        for outline in entry.list_footprints()
+    )
     placed = [
-        replace(part, is_ground=part.name in file.ground, solids=solids if number == 0 else ())
+        replace(
+            part,
+            is_ground=part.name in file.ground,
+            solids=solids if number == 0 else (),
+        )
         for number, part in enumerate(parts)
     ]
-    return Place(safe_name(Path(os.path.abspath(path)).parent), file, tuple(placed), tuple(notes))
+    return Place(
+        safe_name(Path(os.path.abspath(path)).parent), file, tuple(placed), tuple(notes)
+    )
 
 
 @lru_cache(maxsize=8)
 def load_bundled_place(name: str, variant: str | None = None) -> Place:
     """Return a bundled place. Raises FileFormatError: the installation is damaged."""
-    with resources.as_file(resources.files("advsearch.bundled") / "data" / "places" / name) as folder:
+    with resources.as_file(
+        resources.files("advsearch.bundled") / "data" / "places" / name
+    ) as folder:
         path = folder / "place.yaml"
         with reading(path):
             return read_place(path, read_place_file(path), variant)
 
 
 @lru_cache(maxsize=4)
-def lay_place(place: Place, metres: float, candelas: float | None, *, is_dark: bool) -> tuple[MeshPart, ...]:
+def lay_place(
+    place: Place, metres: float, candelas: float | None, *, is_dark: bool
+) -> tuple[MeshPart, ...]:
     """Return the meshes of a place with lengths in the metres of one object size.
 
     Args:
         place: the place.
         metres: of one object size.
-        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit, and its lamps stay off.
+        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit,
+            and its lamps stay off.
         is_dark: whether its lamps shine.
     """
     unit = np.float32(candelas or DEFAULT_LUMINANCE)
@@ -117,13 +162,23 @@ def lay_place(place: Place, metres: float, candelas: float | None, *, is_dark: b
     for part in place.parts:
         emission = part.emission
         if part.name in place.file.lamps:
-            emission = np.array([[place.file.lamps[part.name]]], np.float32) if shines else None
+            emission = (
+                np.array([[place.file.lamps[part.name]]], np.float32)
+                if shines
+                else None
+            )
         solids = tuple(
             Solid(name, Footprint(outline / metres, low / metres, high / metres))
             for name, (outline, low, high) in part.solids
         )
         mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
         laid.append(
-            replace(part, place=place, mesh=mesh, solids=solids, emission=None if emission is None else emission / unit)
+            replace(
+                part,
+                place=place,
+                mesh=mesh,
+                solids=solids,
+                emission=None if emission is None else emission / unit,
+            )
         )
     return tuple(laid)

@@ -1,9 +1,12 @@
-"""The meshes of a place from a glTF file: one for each material, as far as a variant leaves it one.
+"""The meshes of a place from a glTF file: one for each material, as far as a variant
+leaves it one.
 
-Beside what is read of an object's file, materials have the strength of their reflection (KHR_materials_ior and
-KHR_materials_specular) and a clear coat, may repeat their textures, and may be others in a variant
-(KHR_materials_variants). Where a variant changes all that has a material, that mesh keeps its name and only looks
-otherwise; where it changes a part, the part becomes a mesh named by the other material: snow, on what faces up.
+Beside what is read of an object's file, materials have the strength of their reflection
+(KHR_materials_ior and KHR_materials_specular) and a clear coat, may repeat their
+textures, and may be others in a variant (KHR_materials_variants). Where a variant
+changes all that has a material, that mesh keeps its name and only looks otherwise;
+where it changes a part, the part becomes a mesh named by the other material: snow, on
+what faces up.
 """
 
 from __future__ import annotations
@@ -23,9 +26,25 @@ from advsearch.scene.importing import gltf_skeleton
 from advsearch.scene.importing.files import Names, Notes, check_faces, damaged
 from advsearch.scene.importing.geometry import compute_turn
 from advsearch.scene.importing.gltf import GltfFile
-from advsearch.scene.importing.gltf_entries import Entry, Header, Index, MaterialEntry, Primitive
-from advsearch.scene.importing.gltf_parts import GltfSurfaces, Piece, left_out, read_piece
-from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, placed
+from advsearch.scene.importing.gltf_entries import (
+    Entry,
+    Header,
+    Index,
+    MaterialEntry,
+    Primitive,
+)
+from advsearch.scene.importing.gltf_parts import (
+    GltfSurfaces,
+    Piece,
+    left_out,
+    read_piece,
+)
+from advsearch.scene.importing.parts import (
+    NEUTRAL,
+    ImportedPart,
+    ImportedSurface,
+    placed,
+)
 from advsearch.scene.importing.pictures import LARGEST_SUM
 from advsearch.scene.importing.readers import read_mesh_bytes
 from advsearch.scene.importing.scenes import TAKEN
@@ -33,14 +52,23 @@ from advsearch.scene.parts import BASE_COLOR, MeshPart
 from advsearch.trust.stored_files import check_most
 
 SUFFIXES = (".glb", ".gltf")
-TEXTURE_LIMIT = 8192  # longest side of a texture; a facade is larger than what an object wears
+# longest side of a texture; a facade is larger than what an object wears
+TEXTURE_LIMIT = 8192
 MOST_MESHES = 200
 MOST_TEXELS = 2 * LARGEST_SUM
-"""Of all materials: a picture that many of them share is small in the file, and a texture of each in memory."""
+"""Of all materials: a picture that many of them share is small in the file, and a
+texture of each in memory.
+"""
 REFLECTANCE = 0.08  # of a surface of specular 1 that faces the light
-DULL_COAT, GLOSSY_COAT = 0.1, 0.001  # width of the lobe of Mitsuba's clear coat, of gloss 0 and 1
+DULL_COAT = 0.1  # width of the lobe of Mitsuba's clear coat, of gloss 0 and 1
+GLOSSY_COAT = 0.001
 VARIANTS = "KHR_materials_variants"
-READ_HERE = ("KHR_materials_clearcoat", "KHR_materials_ior", "KHR_materials_specular", VARIANTS)
+READ_HERE = (
+    "KHR_materials_clearcoat",
+    "KHR_materials_ior",
+    "KHR_materials_specular",
+    VARIANTS,
+)
 UNNAMED = "mesh"  # what has no material
 
 M = TypeVar("M", bound=BaseModel)
@@ -99,7 +127,11 @@ def _read_extension(path: Path, model: type[M], held: object) -> M:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"]))[:80]
-        raise damaged(path, f"extensions as glTF has them ({where}: {first['msg'][:100]})", "others") from None
+        raise damaged(
+            path,
+            f"extensions as glTF has them ({where}: {first['msg'][:100]})",
+            "others",
+        ) from None
 
 
 def _extension_of(entry: Entry, name: str) -> object:
@@ -117,8 +149,11 @@ class DrawnPrimitive(NamedTuple):
 NameAndMaterial = tuple[str, int | None]
 
 
-def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], list[str]]:
-    """Read the meshes of a place, in metres, z up, with what they emit in cd/m2, and notes on what is left out.
+def read_place_meshes(
+    path: Path, variant: str | None
+) -> tuple[list[MeshPart], list[str]]:
+    """Read the meshes of a place, in metres, z up, with what they emit in cd/m2, and
+    notes on what is left out.
 
     Args:
         path: the glTF file.
@@ -126,7 +161,8 @@ def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], 
 
     Raises:
         FileFormatError: it is missing, damaged, over a limit, or has no faces.
-        InputError: its geometry has NaN or infinite numbers, or it has too many materials.
+        InputError: its geometry has NaN or infinite numbers, or it has too many
+            materials.
         UnknownNameError: it has no such variant.
     """
     notes = Notes(path)
@@ -137,28 +173,45 @@ def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], 
         drawn, surfaces = _read_primitives(file, number, notes)
     used = [name for name in header.extensionsUsed if name not in READ_HERE]
     required = [name for name in header.extensionsRequired if name not in READ_HERE]
-    left_out(header.model_copy(update={"extensionsUsed": used, "extensionsRequired": required}), notes)
+    left_out(
+        header.model_copy(
+            update={"extensionsUsed": used, "extensionsRequired": required}
+        ),
+        notes,
+    )
     _note_left_out(header, drawn, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in drawn))
     groups = _group_by_material(header, drawn)
     if not groups:
-        raise FileFormatError(f"{path}: expected meshes with faces, got none; export triangles")
+        raise FileFormatError(
+            f"{path}: expected meshes with faces, got none; export triangles"
+        )
     _check_materials(path, len(groups))
-    names, parts = Names(TAKEN), list[MeshPart]()
+    names = Names(TAKEN)
+    parts = list[MeshPart]()
     for (name, material), members in groups.items():
         part = _make_part(path, names.free(name), members, surfaces[material])
         parts.append(_with_finish(path, header, material, part))
     return parts, list(notes)
 
 
-def _note_left_out(header: Header, drawn: Sequence[DrawnPrimitive], notes: Notes) -> None:
+def _note_left_out(
+    header: Header, drawn: Sequence[DrawnPrimitive], notes: Notes
+) -> None:
     """Say what the file has that an object would have, and a place has not."""
     if any(primitive.part.colors is not None for primitive in drawn):
-        notes.say(" has colours of vertices, which are left out; paint them into a texture")
+        notes.say(
+            " has colours of vertices, which are left out; paint them into a texture"
+        )
     if header.skins or header.animations:
-        notes.say(" has skins or animations, which are left out: it is shown as it is stored")
+        notes.say(
+            " has skins or animations, which are left out: it is shown as it is stored"
+        )
     if any(node.lamp is not None for node in header.nodes):
-        notes.say(" has lights, which are left out: name what shines in `lamps`, or let its material emit light")
+        notes.say(
+            " has lights, which are left out: name what shines in `lamps`, or "
+            "let its material emit light"
+        )
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
@@ -169,7 +222,9 @@ def _find_variant(path: Path, header: Header, variant: str) -> int:
     return names.index(variant)
 
 
-def _shown_material(path: Path, header: Header, primitive: Primitive, variant: int | None) -> int | None:
+def _shown_material(
+    path: Path, header: Header, primitive: Primitive, variant: int | None
+) -> int | None:
     """Return the material that a primitive has in a variant, by its number."""
     extension = _extension_of(primitive, VARIANTS)
     if variant is None or extension is None:
@@ -177,7 +232,9 @@ def _shown_material(path: Path, header: Header, primitive: Primitive, variant: i
     for mapping in _read_extension(path, _Mappings, extension).mappings:
         if variant in mapping.variants:
             if mapping.material >= len(header.materials):
-                expected = f"glTF with {mapping.material + 1} materials, as it refers to"
+                expected = (
+                    f"glTF with {mapping.material + 1} materials, as it refers to"
+                )
                 raise damaged(path, expected, f"{len(header.materials)}")
             return mapping.material
     return primitive.material
@@ -186,14 +243,23 @@ def _shown_material(path: Path, header: Header, primitive: Primitive, variant: i
 def _read_primitives(
     file: GltfFile, variant: int | None, notes: Notes
 ) -> tuple[list[DrawnPrimitive], dict[int | None, ImportedSurface]]:
-    """Return what the file's nodes draw, and the surface of each material that is shown."""
-    header, path = file.header, file.path
+    """Return what the file's nodes draw, and the surface of each material that is
+    shown.
+    """
+    header = file.header
+    path = file.path
     poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
-    drawn_meshes = [(mesh, pose) for node, pose in poses if (mesh := header.nodes[node].mesh) is not None]
+    drawn_meshes = [
+        (mesh, pose)
+        for node, pose in poses
+        if (mesh := header.nodes[node].mesh) is not None
+    ]
     pieces: dict[tuple[int, int], Piece] = {}
     for mesh in dict.fromkeys(mesh for mesh, _ in drawn_meshes):
         for number, primitive in enumerate(header.meshes[mesh].primitives):
-            shown = primitive.model_copy(update={"material": _shown_material(path, header, primitive, variant)})
+            shown = primitive.model_copy(
+                update={"material": _shown_material(path, header, primitive, variant)}
+            )
             piece = read_piece(file, shown, header.meshes[mesh].extras, False)
             if piece is not None and len(piece.part.faces):
                 pieces[mesh, number] = piece
@@ -207,7 +273,12 @@ def _read_primitives(
     for material, members in by_material.items():
         fitted[material] = readers.surface(material, members)
         texels += _count_texels(fitted[material][0])
-        check_most(path, texels, MOST_TEXELS, "textures of at most {} texels, counted for each material")
+        check_most(
+            path,
+            texels,
+            MOST_TEXELS,
+            "textures of at most {} texels, counted for each material",
+        )
     drawn: list[DrawnPrimitive] = []
     for mesh, pose in drawn_meshes:
         for number, primitive in enumerate(header.meshes[mesh].primitives):
@@ -225,16 +296,25 @@ def _read_primitives(
 
 def _check_materials(path: Path, count: int) -> None:
     if count > MOST_MESHES:
-        raise InputError(f"{path}: expected at most {MOST_MESHES} materials, got {count}; join some of them")
+        raise InputError(
+            f"{path}: expected at most {MOST_MESHES} materials, got "
+            f"{count}; join some of them"
+        )
 
 
 def _count_texels(surface: ImportedSurface) -> int:
     held = (surface.texture, surface.normal_map, surface.emission)
-    return sum(texels.shape[0] * texels.shape[1] for texels in held if texels is not None)
+    return sum(
+        texels.shape[0] * texels.shape[1] for texels in held if texels is not None
+    )
 
 
-def _group_by_material(header: Header, drawn: Sequence[DrawnPrimitive]) -> dict[NameAndMaterial, list[ImportedPart]]:
-    """Return the primitives of each mesh, by its name and the material that it shows, in the order of materials."""
+def _group_by_material(
+    header: Header, drawn: Sequence[DrawnPrimitive]
+) -> dict[NameAndMaterial, list[ImportedPart]]:
+    """Return the primitives of each mesh, by its name and the material that it shows,
+    in the order of materials.
+    """
     shown_by: dict[int | None, set[int | None]] = {}
     for primitive in drawn:
         shown_by.setdefault(primitive.material, set()).add(primitive.shown_material)
@@ -243,16 +323,30 @@ def _group_by_material(header: Header, drawn: Sequence[DrawnPrimitive]) -> dict[
         is_covered = len(shown_by[own]) > 1 and shown != own  # in part
         name = _name_material(header, shown if is_covered else own)
         groups.setdefault((name, shown), []).append(part)
-    return dict(sorted(groups.items(), key=lambda item: -1 if item[0][1] is None else item[0][1]))
+    return dict(
+        sorted(
+            groups.items(), key=lambda item: -1 if item[0][1] is None else item[0][1]
+        )
+    )
 
 
 def _name_material(header: Header, number: int | None) -> str:
-    return UNNAMED if number is None else header.materials[number].name or f"material {number}"
+    return (
+        UNNAMED
+        if number is None
+        else header.materials[number].name or f"material {number}"
+    )
 
 
-def _make_part(path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface) -> MeshPart:
+def _make_part(
+    path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
+) -> MeshPart:
     color = np.full(3, NEUTRAL, np.float32) if surface.color is None else surface.color
-    base = np.broadcast_to(color, (2, 2, len(color))) if surface.texture is None else surface.texture
+    base = (
+        np.broadcast_to(color, (2, 2, len(color)))
+        if surface.texture is None
+        else surface.texture
+    )
     opacity = np.ascontiguousarray(base[..., 3]) if base.shape[-1] == 4 else None
     try:
         mesh = _join(members)
@@ -269,12 +363,16 @@ def _make_part(path: Path, name: str, members: Sequence[ImportedPart], surface: 
     )
 
 
-def _with_finish(path: Path, header: Header, number: int | None, part: MeshPart) -> MeshPart:
+def _with_finish(
+    path: Path, header: Header, number: int | None, part: MeshPart
+) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material."""
     entry = MaterialEntry() if number is None else header.materials[number]
     finish = _read_extension(path, _Finish, entry.extensions)
     ior = finish.KHR_materials_ior.ior
-    facing = finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
+    facing = (
+        finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
+    )
     specular = min(round(facing / REFLECTANCE, 9), 1.0)
     coat = finish.KHR_materials_clearcoat
     material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)
@@ -295,12 +393,17 @@ def _with_finish(path: Path, header: Header, number: int | None, part: MeshPart)
 def _join(members: Sequence[ImportedPart]) -> Mesh:
     """Return parts of a file as one mesh, z up, its front along +x."""
     turn = compute_turn("y", "+z")
-    vertices, faces, normals, uvs = list[Doubles](), list[Ints](), list[Doubles](), list[Doubles]()
+    vertices = list[Doubles]()
+    faces = list[Ints]()
+    normals = list[Doubles]()
+    uvs = list[Doubles]()
     count = 0
     for part in map(_with_normals, members):
         vertices.append(part.vertices)
         faces.append(part.faces + count)
-        normals.append(np.zeros_like(part.vertices) if part.normals is None else part.normals)
+        normals.append(
+            np.zeros_like(part.vertices) if part.normals is None else part.normals
+        )
         uvs.append(np.zeros((len(part.vertices), 2)) if part.uvs is None else part.uvs)
         count += len(part.vertices)
     directions = np.concatenate(normals)
@@ -321,4 +424,6 @@ def _with_normals(part: ImportedPart) -> ImportedPart:
     normals = np.repeat(face_vectors(corners), 3, axis=0)
     uvs = None if part.uvs is None else part.uvs[part.faces].reshape(-1, 2)
     faces = np.arange(len(normals)).reshape(-1, 3)
-    return replace(part, vertices=corners.reshape(-1, 3), faces=faces, normals=normals, uvs=uvs)
+    return replace(
+        part, vertices=corners.reshape(-1, 3), faces=faces, normals=normals, uvs=uvs
+    )

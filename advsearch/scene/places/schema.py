@@ -14,8 +14,12 @@ MOST_SOLIDS = 2000  # outlines of a place
 CORNERS = 8  # of the outline of what is round
 FARTHEST = 1e5  # largest length, metres
 
-Length = Annotated[float, Field(strict=True, ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, gt=0.0, le=FARTHEST, allow_inf_nan=False)]
+Length = Annotated[
+    float, Field(strict=True, ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)
+]
+Positive = Annotated[
+    float, Field(strict=True, gt=0.0, le=FARTHEST, allow_inf_nan=False)
+]
 Luminance = Annotated[float, Field(strict=True, ge=0.0, le=1e9, allow_inf_nan=False)]
 Illuminance = Annotated[float, Field(strict=True, gt=0.0, le=1e9, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
@@ -29,7 +33,9 @@ class _Entry(BaseModel):
 def _is_convex(corners: Doubles) -> bool:
     """Whether corners (K, 2), in turn, turn to one side only, and hold an area."""
     edges = np.roll(corners, -1, axis=0) - corners
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
+        edges[:, 0], -1
+    )
     least = float(turns.min())
     most = float(turns.max())
     rounding = 1e-9 * max(-least, most)
@@ -37,25 +43,43 @@ def _is_convex(corners: Doubles) -> bool:
 
 
 class SolidEntry(_Entry):
-    """What nothing else can be in: a convex outline on the ground, or a round one at some positions."""
+    """What nothing else can be in: a convex outline on the ground, or a round one at
+    some positions.
+    """
 
     name: Name  # as a sentence has it: "a house"
-    outline: Annotated[list[tuple[Length, Length]], Field(min_length=3, max_length=64)] | None = None
-    at: Annotated[list[tuple[Length, Length]], Field(min_length=1, max_length=MOST_SOLIDS)] | None = None
+    outline: (
+        Annotated[list[tuple[Length, Length]], Field(min_length=3, max_length=64)]
+        | None
+    ) = None
+    at: (
+        Annotated[
+            list[tuple[Length, Length]], Field(min_length=1, max_length=MOST_SOLIDS)
+        ]
+        | None
+    ) = None
     radius: Positive | None = None
     heights: Bounds  # from and to
 
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
         is_round = self.at is not None and self.radius is not None
-        if is_round == (self.outline is not None) or (self.at is None) != (self.radius is None):
-            raise ValueError("expected either an outline, or a radius and the positions that it is at")
+        if is_round == (self.outline is not None) or (self.at is None) != (
+            self.radius is None
+        ):
+            raise ValueError(
+                "expected either an outline, or a radius and the "
+                "positions that it is at"
+            )
         if self.heights[0] >= self.heights[1]:
             raise ValueError("heights: expected the lower one first")
         if not self.name.isprintable():
             raise ValueError("name: expected a line of text, such as 'a house'")
         if self.outline is not None and not _is_convex(np.array(self.outline)):
-            raise ValueError("outline: expected the corners of a convex outline in turn; split it into convex ones")
+            raise ValueError(
+                "outline: expected the corners of a convex outline in "
+                "turn; split it into convex ones"
+            )
         return self
 
     def list_footprints(self) -> list[Footprint]:
@@ -64,7 +88,10 @@ class SolidEntry(_Entry):
             return [Footprint(np.array(self.outline), *self.heights)]
         turn = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
         circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        return [Footprint(np.array(center) + (self.radius or 0.0) * circle, *self.heights) for center in self.at or ()]
+        return [
+            Footprint(np.array(center) + (self.radius or 0.0) * circle, *self.heights)
+            for center in self.at or ()
+        ]
 
 
 class ValidEntry(_Entry):
@@ -83,7 +110,9 @@ class ValidEntry(_Entry):
 
 
 class PictureEntry(_Entry):
-    """What stands around, where the maps of the light show it: it fits the ground from near that place only."""
+    """What stands around, where the maps of the light show it: it fits the ground from
+    near that place only.
+    """
 
     height: Positive  # above the ground from which the maps were taken
     x: Bounds  # from and to, of what stands nearest
@@ -93,14 +122,17 @@ class PictureEntry(_Entry):
     def _check_inside(self) -> PictureEntry:
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < 0.0 < high:
-                raise ValueError(f"{axis}: expected bounds on both sides of the object, at 0")
+                raise ValueError(
+                    f"{axis}: expected bounds on both sides of the object, at 0"
+                )
         return self
 
 
 class PlaceLight(_Entry):
     """A light that the place may stand in."""
 
-    map: Name  # an .hdr or .exr file in the folder, or the name of a bundled environment
+    # an .hdr or .exr file in the folder, or the name of a bundled environment
+    map: Name
     lux: Illuminance | None = None  # of level ground under open sky
     variant: Name | None = None  # of the materials
 
@@ -109,12 +141,20 @@ class PlaceFile(_Entry):
     """What a place's file says."""
 
     mesh: Name  # a .glb or .gltf file in the folder
-    ground: Annotated[list[Name], Field(min_length=1, max_length=64)]  # meshes that things stand on
-    lights: Annotated[dict[Name, PlaceLight], Field(min_length=1, max_length=64)]  # the first is taken by itself
-    lane_width: Positive | None = None  # of the lane that the object drives in; None: there is none
-    floor: Length = 0.0  # height of the floor that cameras stand on, where the object stands on something
-    lamps: Annotated[dict[Name, tuple[Luminance, Luminance, Luminance]], Field(max_length=64)] = {}
-    """Luminance in cd/m2, for each colour channel, of meshes that shine when it is dark, and only then."""
+    # meshes that things stand on
+    ground: Annotated[list[Name], Field(min_length=1, max_length=64)]
+    # the first is taken by itself
+    lights: Annotated[dict[Name, PlaceLight], Field(min_length=1, max_length=64)]
+    # of the lane that the object drives in; None: there is none
+    lane_width: Positive | None = None
+    # height of the floor that cameras stand on, where the object stands on something
+    floor: Length = 0.0
+    lamps: Annotated[
+        dict[Name, tuple[Luminance, Luminance, Luminance]], Field(max_length=64)
+    ] = {}
+    """Luminance in cd/m2, for each colour channel, of meshes that shine when it is
+    dark, and only then.
+    """
     solids: Annotated[list[SolidEntry], Field(max_length=MOST_SOLIDS)] = []
     valid: ValidEntry = ValidEntry()
     picture: PictureEntry | None = None  # None: nothing near is in the maps alone

@@ -1,1 +1,3 @@
-"""Light kept on surfaces: pictures of a scene in which nothing moves but the camera, for rays and look-ups alone."""
+"""Light kept on surfaces: pictures of a scene in which nothing moves but the camera,
+for rays and look-ups alone.
+"""

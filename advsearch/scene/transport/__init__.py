@@ -1,1 +1,3 @@
-"""Linear light transport: pictures of a scene in which nothing moves, predicted without rendering."""
+"""Linear light transport: pictures of a scene in which nothing moves, predicted without
+rendering.
+"""

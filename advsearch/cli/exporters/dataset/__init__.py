@@ -13,13 +13,23 @@ class _Dataset(Exporter):
     writes = "a folder"
     options = ("all",)
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
-        count, notes = write_dataset(run, out, self.name, every=bool(options["all"]), progress=progress)
+        count, notes = write_dataset(
+            run, out, self.name, every=bool(options["all"]), progress=progress
+        )
         if not count:
-            raise InputError(f"{run}: no model is wrong in a picture of its rows; --all takes the others too")
-        return Exported({"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes]))
+            raise InputError(
+                f"{run}: no model is wrong in a picture of its rows; "
+                "--all takes the others too"
+            )
+        return Exported(
+            {"pictures": count, "notes": notes},
+            " ".join([f"{count} pictures in {out}.", *notes]),
+        )
 
 
 class Coco(_Dataset):

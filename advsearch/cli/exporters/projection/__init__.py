@@ -16,8 +16,13 @@ class Projection(Exporter):
     writes = "a new folder"
     example = "export mug-projector-001 --format projector --out folder"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        from advsearch.cli.exporters.projection.images import write_projection  # takes seconds
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
+        # takes seconds
+        from advsearch.cli.exporters.projection.images import write_projection
 
         notes = write_projection(run, out)
-        return Exported({"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes]))
+        return Exported(
+            {"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes])
+        )

@@ -17,11 +17,15 @@ class Gltf(Exporter):
     example = "export mug-texture-001 --format gltf --out mug.glb"
     suffix = "glb"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         from advsearch.cli.exporters.scene.files import write_gltf  # takes seconds
 
         notes = write_gltf(run, out)
-        return Exported({"notes": notes}, " ".join([f"The object is in {out}.", *notes]))
+        return Exported(
+            {"notes": notes}, " ".join([f"The object is in {out}.", *notes])
+        )
 
 
 class MitsubaExport(Exporter):
@@ -32,7 +36,9 @@ class MitsubaExport(Exporter):
     example = "export mug-texture-001 --format mitsuba --out folder"
     suffix = "xml"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+    def write(
+        self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
+    ) -> Exported:
         from advsearch.cli.exporters.scene.files import write_mitsuba  # takes seconds
 
         notes = write_mitsuba(run, out)

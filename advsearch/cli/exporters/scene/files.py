@@ -13,66 +13,100 @@ import torch
 import advsearch
 from advsearch.extend import InputError, exports, mitsuba_data, parts, reading, writing
 
-GLB, XML = ".glb", ".xml"
+GLB = ".glb"
+XML = ".xml"
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML with its meshes and pictures beside it, whose names begin with its
-    own, to a file that ends in .xml, or a folder for `scene.xml`; return sentences about how its picture becomes that
-    of the run, and what is no part of it. Raises errors as `AdversarialRun.load`, and InputError where such files are
-    there, or stock Mitsuba has no such scene."""
+    """Write the adversarial scene of a run as XML with its meshes and pictures beside
+    it, whose names begin with its own, to a file that ends in .xml, or a folder for
+    `scene.xml`; return sentences about how its picture becomes that of the run, and
+    what is no part of it. Raises errors as `AdversarialRun.load`, and InputError where
+    such files are there, or stock Mitsuba has no such scene.
+    """
     path = out if out.suffix.lower() == XML else out / mitsuba_data.NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
     there = [file for file in taken if os.path.lexists(file)]
     if there or path.parent.is_file() or os.path.islink(out):
-        raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
+        raise InputError(
+            f"out: {(there or [path.parent])[0]} is there already; choose another name"
+        )
     adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
-    hazes = (part.name for part in renderer.scene.made[0].parts if isinstance(part, parts.HazePart))
+    hazes = (
+        part.name
+        for part in renderer.scene.made[0].parts
+        if isinstance(part, parts.HazePart)
+    )
     hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
     if hazy and backdrop is not None:
-        raise InputError(f"{adversarial.folder}: haze before a plain background is no part of a Mitsuba scene")
+        raise InputError(
+            f"{adversarial.folder}: haze before a plain background is no "
+            "part of a Mitsuba scene"
+        )
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
     height, width = renderer.formation.resolution
     notes = [
-        f"The sensor has {width} x {height} pixels, and light paths have at most {renderer.scene.max_depth} segments.",
-        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut off at 1.",
+        f"The sensor has {width} x {height} pixels, and light paths have at most "
+        f"{renderer.scene.max_depth} segments.",
+        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut "
+        "off at 1.",
     ]
     if backdrop is not None:
-        red, green, blue = (f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist())
-        notes.append(f"Where its alpha is under 1, add 1 - alpha times the plain background ({red}, {green}, {blue}).")
+        red, green, blue = (
+            f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist()
+        )
+        notes.append(
+            "Where its alpha is under 1, add 1 - alpha times the plain "
+            f"background ({red}, {green}, {blue})."
+        )
     if hazy:
         notes.append(
-            f"Haze scatters light, which Mitsuba counts as a segment: {mitsuba_data.SCATTERINGS} more are for that."
+            "Haze scatters light, which Mitsuba counts as a segment: "
+            f"{mitsuba_data.SCATTERINGS} more are for that."
         )
     if renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
     if adversarial.on_picture:
-        notes.append(f"Not in it: what the control {', '.join(adversarial.on_picture)} did to the finished picture.")
+        notes.append(
+            f"Not in it: what the control {', '.join(adversarial.on_picture)} "
+            "did to the finished picture."
+        )
     if adversarial.problem.conditions is not None:
         notes.append("What varied by chance in the run is as in the clean scene.")
     with writing.placed_by("out"), writing.storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
             mitsuba_data.write_scene(
-                renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None
+                renderer.scene,
+                inputs,
+                Path(made) / path.name,
+                " ".join(notes),
+                hide=backdrop is not None,
             )
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
-        what = f"The adversarial scene of {adversarial.folder.name} as a scene for Mitsuba 3"
+        what = (
+            f"The adversarial scene of {adversarial.folder.name} as a scene for "
+            "Mitsuba 3"
+        )
         text = [f"{what} (advsearch {advsearch.__version__}).\n", *notes, ""]
-        writing.write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False)
+        writing.write_text(
+            path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False
+        )
     return notes
 
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's adversarial scene as binary glTF, a file that ends in .glb: displaced and in its
-    pose, with its texture; return sentences about what is not as in the run. Raises errors as `AdversarialRun.load`,
-    and InputError where the file is called otherwise."""
+    """Write the object of a run's adversarial scene as binary glTF, a file that ends in
+    .glb: displaced and in its pose, with its texture; return sentences about what is
+    not as in the run. Raises errors as `AdversarialRun.load`, and InputError where the
+    file is called otherwise.
+    """
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
@@ -80,15 +114,22 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.metres
     if metres is not None:
-        found = replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)))
+        found = replace(
+            found,
+            mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)),
+        )
     with writing.placed_by("out"):
         writing.write_bytes(out, reading.glb([found]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
     if part.surface is not None:
-        notes.append("Its surface is one of Mitsuba's own, of which glTF has the base colour only.")
+        notes.append(
+            "Its surface is one of Mitsuba's own, of which glTF has the base "
+            "colour only."
+        )
     elif found.material.specular > reading.PLAIN:
         notes.append(
-            f"A specular of {found.material.specular:g} is over glTF's largest, {reading.PLAIN:g}, which it has there."
+            f"A specular of {found.material.specular:g} is over glTF's largest, "
+            f"{reading.PLAIN:g}, which it has there."
         )
     return notes

@@ -1,4 +1,6 @@
-"""The bundled object classes: parametric families of household objects, and things of the street, in numpy."""
+"""The bundled object classes: parametric families of household objects, and things of
+the street, in numpy.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,21 @@ from advsearch.questions.harden.objects.kitchen import frying_pan, teapot
 from advsearch.questions.harden.objects.people import person
 from advsearch.questions.harden.objects.things import ball, banana, book, stop_sign
 from advsearch.questions.harden.objects.tools import dumbbell, hammer
-from advsearch.questions.harden.objects.vessels import bottle, bowl, mug, vase, wine_glass
+from advsearch.questions.harden.objects.vessels import (
+    bottle,
+    bowl,
+    mug,
+    vase,
+    wine_glass,
+)
 
 _HOUSEHOLD = (
     mug, bowl, bottle, vase, teapot, wine_glass, frying_pan, hammer, banana, ball, chair, lamp, book, dumbbell,
 )  # fmt: skip
 HOUSEHOLD: dict[str, ObjectFamily] = {family.name: family for family in _HOUSEHOLD}
 """What the reference model is trained on."""
-STREET: dict[str, ObjectFamily] = {family.name: family for family in (car, stop_sign, person)}
+STREET: dict[str, ObjectFamily] = {
+    family.name: family for family in (car, stop_sign, person)
+}
 OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
 __all__ = ["HOUSEHOLD", "OBJECTS", "STREET", "Instance", "ObjectFamily"]

@@ -1,7 +1,8 @@
 """A car: a hatchback of five doors. Units are metres; it drives towards +x.
 
-Body and cabin are stacks of outlines: superellipses seen from above, each with its own length and width, at heights
-that follow the lines of hood, waist and roof. Windows, lights, grilles and wheel arches are carved out of them.
+Body and cabin are stacks of outlines: superellipses seen from above, each with its own
+length and width, at heights that follow the lines of hood, waist and roof. Windows,
+lights, grilles and wheel arches are carved out of them.
 """
 
 from __future__ import annotations
@@ -16,10 +17,20 @@ import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
 from advsearch.questions.harden.objects.family import Instance, family
 from advsearch.questions.harden.objects.shapes import Array, Patch
-from advsearch.questions.harden.objects.textures import Draw, Paint, Texels, hexed, mix, painter, solid, step
+from advsearch.questions.harden.objects.textures import (
+    Draw,
+    Paint,
+    Texels,
+    hexed,
+    mix,
+    painter,
+    solid,
+    step,
+)
 
 AXLES = (1.29, -1.33)
-WHEEL, TYRE = 0.33, 0.215  # radius and width
+WHEEL = 0.33  # radius and width
+TYRE = 0.215
 ARCH = 0.385
 WHEELS = tuple(product(AXLES, (1.0, -1.0)))  # x of the axle, and the side
 MIDDLE = -0.5  # of the cabin
@@ -27,17 +38,29 @@ COLUMNS = 92
 Height = Callable[[Array, Array, Array], Array]
 
 
-def _outline(angle: Array, front: float, rear: float, half: float, power: float, middle: float) -> tuple[Array, Array]:
-    """x and y of a superellipse about (middle, 0) that reaches from `rear` to `front` and `half` to each side."""
-    c, s = np.cos(angle), np.sin(angle)
+def _outline(
+    angle: Array, front: float, rear: float, half: float, power: float, middle: float
+) -> tuple[Array, Array]:
+    """x and y of a superellipse about (middle, 0) that reaches from `rear` to `front`
+    and `half` to each side.
+    """
+    c = np.cos(angle)
+    s = np.sin(angle)
     reach = np.where(c >= 0.0, front - middle, middle - rear)
-    return middle + reach * np.sign(c) * np.abs(c) ** (2 / power), half * np.sign(s) * np.abs(s) ** (2 / power)
+    return middle + reach * np.sign(c) * np.abs(c) ** (2 / power), half * np.sign(
+        s
+    ) * np.abs(s) ** (2 / power)
 
 
-def _shell(rows: Array, power: float, middle: float, height: Height, corner: float) -> list[Patch]:
-    """Painted patches of a stack of superellipses with a power about an x: of each a share of the height, half the
-    width, front and rear end, (R, 4); they are cut at a share of the columns from the middles of front and rear."""
-    # angles are equally far apart along the widest outline, symmetrical, from the rear's middle
+def _shell(
+    rows: Array, power: float, middle: float, height: Height, corner: float
+) -> list[Patch]:
+    """Painted patches of a stack of superellipses with a power about an x: of each a
+    share of the height, half the width, front and rear end, (R, 4); they are cut at a
+    share of the columns from the middles of front and rear.
+    """
+    # angles are equally far apart along the widest outline, symmetrical, from the
+    # rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
@@ -50,13 +73,20 @@ def _shell(rows: Array, power: float, middle: float, height: Height, corner: flo
     around = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     across = np.gradient(around, axis=1)[:, 1:-1]
     normals = shapes.unit(np.cross(across, np.gradient(points, axis=0)))
-    opposite, cut = COLUMNS // 2, int(COLUMNS * corner)
+    opposite = COLUMNS // 2
+    cut = int(COLUMNS * corner)
     patches = []
-    for first, last in pairwise((0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)):
+    for first, last in pairwise(
+        (0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)
+    ):
         part = points[:, first : last + 1]
         u, v = (shapes.mean_lengths(part, axis) for axis in (1, 0))
         size = (float(u[-1]), float(v[-1]))
-        patches.append(shapes.grid("paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]))
+        patches.append(
+            shapes.grid(
+                "paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]
+            )
+        )
     return patches
 
 
@@ -67,7 +97,9 @@ def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
 
 def _softest(*fields: Array) -> Array:
     """The least of some distances, with corners rounded by about 3 cm."""
-    return np.asarray(logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0)
+    return np.asarray(
+        logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
+    )
 
 
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
@@ -77,7 +109,17 @@ _WAIST = _line(
         (1.75, 0.775), (2.0, 0.7), (2.2, 0.62),
     ]
 )  # fmt: skip
-_ROOF = _line([(-2.2, 1.26), (-1.75, 1.345), (-1.3, 1.405), (-0.7, 1.435), (-0.2, 1.43), (0.2, 1.395), (1.1, 1.2)])
+_ROOF = _line(
+    [
+        (-2.2, 1.26),
+        (-1.75, 1.345),
+        (-1.3, 1.405),
+        (-0.7, 1.435),
+        (-0.2, 1.43),
+        (0.2, 1.395),
+        (1.1, 1.2),
+    ]
+)
 _BODY = [  # share of the height, half the width, front end, rear end
     (0.0, 0.80, 1.98, -2.0), (0.03, 0.835, 2.06, -2.06), (0.1, 0.86, 2.1, -2.1), (0.28, 0.872, 2.135, -2.135),
     (0.45, 0.878, 2.14, -2.14), (0.62, 0.889, 2.13, -2.125), (0.75, 0.898, 2.1, -2.1), (0.82, 0.885, 2.06, -2.085),
@@ -87,7 +129,8 @@ _CABIN = [
     (0.0, 0.795, 1.0, -1.955), (0.25, 0.765, 0.79, -1.9), (0.5, 0.732, 0.57, -1.83), (0.75, 0.692, 0.34, -1.74),
     (0.88, 0.663, 0.2, -1.66), (0.95, 0.63, 0.08, -1.58), (0.985, 0.58, -0.06, -1.47), (1.0, 0.5, -0.22, -1.3),
 ]  # fmt: skip
-_BODY_POWER, _CABIN_POWER = 4.2, 4.6
+_BODY_POWER = 4.2
+_CABIN_POWER = 4.6
 
 
 def _deck(x: Array, y: Array) -> Array:
@@ -108,29 +151,43 @@ def _inside(p: Array) -> dict[str, Array]:
     x, y, z = p.T
     out = np.abs(y)
     reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
-    size = (np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER) ** (1 / _CABIN_POWER)
-    half = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])  # about half the cabin's width
+    size = (
+        np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
+    ) ** (1 / _CABIN_POWER)
+    # about half the cabin's width
+    half = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     sill = _WAIST(x) + 0.04
     lintel = sill + 0.83 * (_ROOF(x) - sill)
-    pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81  # distance behind the line of the windscreen's pillar
+    # distance behind the line of the windscreen's pillar
+    pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
     lamp = out - 0.42
     lens = _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
     low_grille = _softest(0.62 - out, z - 0.24 + 0.02 * out, 0.37 - 0.02 * out - z)
     high_grille = _softest(0.41 - out, z - 0.5 - 0.04 * out, 0.64 + 0.04 * out - z)
-    arches = [np.where(out > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0) for axle in AXLES]
+    arches = [
+        np.where(out > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
+        for axle in AXLES
+    ]
     return {
         "cabin": 0.72 * (1.0 - size),
         "front arch": arches[0],
         "rear arch": arches[1],
         "headlight": np.where(x > 1.2, lens, -1.0),
-        "taillight": np.where(x < -1.0, _softest(out - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0),
+        "taillight": np.where(
+            x < -1.0, _softest(out - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0
+        ),
         "low grille": np.where(x > 1.5, low_grille, -1.0),
         "high grille": np.where(x > 1.5, high_grille, -1.0),
-        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,  # the dark lower edge, higher at the back
+        # the dark lower edge, higher at the back
+        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,
         "windscreen": np.where(x > 0.0, _softest(0.85 * half - out, 1.36 - z), -1.0),
-        "rear window": np.where(x < -1.5, _softest(0.86 * half - out, z - 1.045, 1.325 - z), -1.0),
-        "side windows": np.where(out > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0),
+        "rear window": np.where(
+            x < -1.5, _softest(0.86 * half - out, z - 1.045, 1.325 - z), -1.0
+        ),
+        "side windows": np.where(
+            out > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0
+        ),
     }
 
 
@@ -149,9 +206,15 @@ def _opening(name: str) -> shapes.Field:
 
 
 def _body_and_cabin() -> list[Patch]:
-    deck = [(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)]
-    roof = [(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)]
-    body, cabin = np.array([*shapes.spline(_BODY, 23), *deck]), np.array([*shapes.spline(_CABIN, 16), *roof])
+    deck = [
+        (1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)
+    ]
+    roof = [
+        (1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8)
+        for s in (0.75, 0.45, 0.15, 0.002)
+    ]
+    body = np.array([*shapes.spline(_BODY, 23), *deck])
+    cabin = np.array([*shapes.spline(_CABIN, 16), *roof])
     parts = {
         "body": _shell(body, _BODY_POWER, 0.0, _body_height, 0.085),
         "cabin": _shell(cabin, _CABIN_POWER, MIDDLE, _cabin_height, 0.1),
@@ -163,20 +226,42 @@ def _body_and_cabin() -> list[Patch]:
 
 
 def _wheels() -> list[Patch]:
-    half, rim = TYRE / 2, 0.212  # about the z axis, the outer side up, in the middle of the tyre
-    outside = [(rim, half - 0.008), (rim + 0.012, half), (0.29, half + 0.004), (WHEEL - 0.012, half - 0.02)]
+    half = TYRE / 2  # about the z axis, the outer side up, in the middle of the tyre
+    rim = 0.212
+    outside = [
+        (rim, half - 0.008),
+        (rim + 0.012, half),
+        (0.29, half + 0.004),
+        (WHEEL - 0.012, half - 0.02),
+    ]
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
     wheel = shapes.lathe([("rubber", tyre)], 28)
-    wheel += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
+    wheel += shapes.lathe(
+        [
+            (
+                "rim",
+                [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)],
+            )
+        ],
+        28,
+    )
     wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
-    spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
+    spoke = np.array(
+        [
+            (0.03, 0.0, half - 0.035),
+            (0.11, 0.0, half - 0.022),
+            (rim - 0.012, 0.0, half - 0.018),
+        ]
+    )
     section = shapes.rectangle(0.03, 0.03, 0.008, 1)
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
         turn = shapes.rotation("z", 72.0 * number)
-        wheel += shapes.placed(shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn)
+        wheel += shapes.placed(
+            shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn
+        )
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
     wheel += shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
     patches = []
@@ -195,23 +280,43 @@ def _wells() -> list[Patch]:
         rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
         ring = rows[1]
         if side > 0:
-            rows, ring = rows[::-1], ring[::-1]
+            rows = rows[::-1]
+            ring = ring[::-1]
         normals = np.broadcast_to(-outwards, rows.shape)
         across = np.linspace(0.0, 1.0, len(angle))
-        patches.append(shapes.grid("well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across))
+        patches.append(
+            shapes.grid(
+                "well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across
+            )
+        )
         patches.append(shapes.cap("well", ring, np.array([0.0, side, 0.0])))
-    x, y = _outline(np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0)
-    return [*patches, shapes.cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
+    x, y = _outline(
+        np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0
+    )
+    return [
+        *patches,
+        shapes.cap(
+            "well",
+            np.stack([x, y, np.full_like(x, 0.2)], axis=1),
+            np.array([0.0, 0.0, -1.0]),
+        ),
+    ]
 
 
 def _fittings() -> list[Patch]:
     patches = []
     for side in (1.0, -1.0):  # mirrors
         shell = shapes.box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
-        patches += shapes.placed(shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005))
-        patches += shapes.box("trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1)
+        patches += shapes.placed(
+            shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005)
+        )
+        patches += shapes.box(
+            "trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1
+        )
     plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1)
-    badge = shapes.lathe([("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24)
+    badge = shapes.lathe(
+        [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24
+    )
     for thing, lean, place in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
         (plate, 3.0, (-2.138, 0.0, 0.705)),
@@ -220,15 +325,27 @@ def _fittings() -> list[Patch]:
     ):
         patches += shapes.placed(thing, shapes.rotation("y", lean), place)
     for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
-        patches += shapes.box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
+        patches += shapes.box(
+            "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1
+        )
     spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
-    return [*patches, *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364))]
+    return [
+        *patches,
+        *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)),
+    ]
 
 
 _DOORS = (
     [(0.86, 1.0), (0.88, 0.6), (0.84, 0.32), (0.78, 0.25), (-0.9, 0.25)],
     [(-0.26, 1.0), (-0.24, 0.6), (-0.27, 0.25)],
-    [(-1.3, 1.1), (-1.22, 0.86), (-1.05, 0.70), (-0.93, 0.5), (-0.88, 0.32), (-0.9, 0.25)],
+    [
+        (-1.3, 1.1),
+        (-1.22, 0.86),
+        (-1.05, 0.70),
+        (-0.93, 0.5),
+        (-0.88, 0.32),
+        (-0.9, 0.25),
+    ],
 )
 
 
@@ -237,25 +354,41 @@ def _lacquer(t: Texels, color: Array) -> Array:
     """Paint with the gaps of doors, hood and tailgate."""
     x, y, z = t.xyz.T
     out = np.abs(y)
-    hood = shapes.away_from(x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)])
-    gate = shapes.away_from(out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
+    hood = shapes.away_from(
+        x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)]
+    )
+    gate = shapes.away_from(
+        out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
+    )
     gaps = [
         np.where((out > 0.6) & (z < 1.02), shapes.away_from(x, z, *_DOORS), 9.0),
         np.where((x > 0.8) & (z > 0.6), hood, 9.0),
         np.where(x < -1.7, gate, 9.0),
-        np.where((y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0),  # the tank's lid
+        # the tank's lid
+        np.where(
+            (y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0
+        ),
     ]
-    fold = np.clip(1.0 - shapes.away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0)
+    fold = np.clip(
+        1.0 - shapes.away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0
+    )
     shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
-    return mix(shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, 0.011))
+    return mix(
+        shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, 0.011)
+    )
 
 
 def _panes(t: Texels) -> Array:
-    """Dark glass, with the pillar between the doors, and behind the windscreen what one sees of two seats."""
+    """Dark glass, with the pillar between the doors, and behind the windscreen what one
+    sees of two seats.
+    """
     x, y, z = t.xyz.T
     color = mix(hexed("20272b"), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
     out = np.abs(y)
-    seat = np.minimum(np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2), np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055))
+    seat = np.minimum(
+        np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2),
+        np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055),
+    )
     ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, 0.15), 0.0)
     pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, 0.01), 0.0)
     return mix(color, hexed("0b0c0d"), np.maximum(pillar, ahead))
@@ -271,23 +404,37 @@ def _lamps(t: Texels) -> Array:
 
 def _tail(t: Texels) -> Array:
     z = t.xyz[:, 2]
-    return mix(hexed("8e0d12"), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01))
+    return mix(
+        hexed("8e0d12"), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01)
+    )
 
 
 def _slats(t: Texels) -> Array:
     x, _, z = t.xyz.T
-    slat = np.where((x > 1.9) & (z > 0.48), step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006), 0.0)
+    slat = np.where(
+        (x > 1.9) & (z > 0.48),
+        step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006),
+        0.0,
+    )
     return mix(hexed("17181a"), hexed("8b9095"), slat)
 
 
 @painter
 def _plate(t: Texels, ground: Array) -> Array:
     """A licence plate: dark strokes on a light ground; nobody's number."""
-    y, z = t.xyz[:, 1] / 0.26, t.xyz[:, 2] / 0.056
+    y = t.xyz[:, 1] / 0.26
+    z = t.xyz[:, 2] / 0.056
     cell = (y + 0.86) / 0.215
-    field = (np.abs(y) < 0.86) & (np.abs(z) < 0.62) & (np.floor(cell) != 3) & (t.xyz[:, 0] > -1.0)
+    field = (
+        (np.abs(y) < 0.86)
+        & (np.abs(z) < 0.62)
+        & (np.floor(cell) != 3)
+        & (t.xyz[:, 0] > -1.0)
+    )
     place = np.abs(cell % 1.0 - 0.5)
-    strokes = (np.abs(place - 0.27) < 0.09) | ((place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13))
+    strokes = (np.abs(place - 0.27) < 0.09) | (
+        (place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
+    )
     return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
 
 
@@ -307,8 +454,12 @@ FINISHES = {
 
 @family(metres=1.0, texels=384)
 def car(draw: Draw) -> Instance:
-    color = draw.colour("2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2)
-    stretch = np.array([draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)])
+    color = draw.colour(
+        "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
+    )
+    stretch = np.array(
+        [draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)]
+    )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
     metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
@@ -317,4 +468,11 @@ def car(draw: Draw) -> Instance:
         "well": solid("0a0a0b"),
     }  # fmt: skip
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
-    return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES, drives=True)
+    return Instance(
+        shapes.stretched(patches, stretch),
+        paints,
+        FINISHES["paint"],
+        detail,
+        FINISHES,
+        drives=True,
+    )

@@ -30,46 +30,91 @@ from advsearch.questions.harden.objects.textures import (
 Place = tuple[float, float, float]
 
 
-def _post(tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]) -> list[Patch]:
-    """A straight post between two points, scaled from the first to the second end value."""
+def _post(
+    tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]
+) -> list[Patch]:
+    """A straight post between two points, scaled from the first to the second end
+    value.
+    """
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
     lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
-    return shapes.sweep(tag, path, section, scale, first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0), caps=True)
+    return shapes.sweep(
+        tag,
+        path,
+        section,
+        scale,
+        first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0),
+        caps=True,
+    )
 
 
 @family(metres=0.01)
 def chair(draw: Draw) -> Instance:
     """Faces +x; the back stands at -x."""
-    wide, deep = draw(43.0, 36.0, 50.0), draw(42.0, 36.0, 48.0)
-    seat, total = draw(45.0, 40.0, 50.0), draw(92.0, 78.0, 108.0)
-    thick, leg = draw(3.6, 2.4, 5.5), draw(2.1, 1.5, 3.0)
-    splay, lean = draw(1.5, 0.0, 6.0), draw(5.0, 1.0, 11.0)
+    wide = draw(43.0, 36.0, 50.0)
+    deep = draw(42.0, 36.0, 48.0)
+    seat = draw(45.0, 40.0, 50.0)
+    total = draw(92.0, 78.0, 108.0)
+    thick = draw(3.6, 2.4, 5.5)
+    leg = draw(2.1, 1.5, 3.0)
+    splay = draw(1.5, 0.0, 6.0)
+    lean = draw(5.0, 1.0, 11.0)
     square = draw.chance(0.5, True)
-    section = shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
+    section = (
+        shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
+    )
     taper = (leg * draw(0.75, 0.55, 1.0), leg)
-    x, y = deep / 2 - leg - 0.4, wide / 2 - leg - 0.4
+    x = deep / 2 - leg - 0.4
+    y = wide / 2 - leg - 0.4
     patches: list[Patch] = []
     for sx, sy in product((-1.0, 1.0), repeat=2):
         foot = (sx * (x + splay), sy * (y + splay), 0.0)
-        patches += _post("up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper)
-    patches += shapes.box("seat", (0.0, 0.0, seat - thick / 2), (deep, wide, thick), 0.45 * thick, steps=3, cells=2)
+        patches += _post(
+            "up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper
+        )
+    patches += shapes.box(
+        "seat",
+        (0.0, 0.0, seat - thick / 2),
+        (deep, wide, thick),
+        0.45 * thick,
+        steps=3,
+        cells=2,
+    )
     if draw.chance(0.35):
-        patches += shapes.box("cushion", (0.5, 0.0, seat + 1.4), (deep - 4.0, wide - 4.0, 4.4), 2.1, steps=3, cells=2)
+        patches += shapes.box(
+            "cushion",
+            (0.5, 0.0, seat + 1.4),
+            (deep - 4.0, wide - 4.0, 4.4),
+            2.1,
+            steps=3,
+            cells=2,
+        )
     if draw.chance(0.55, True):
         low = seat * draw(0.36, 0.25, 0.6)
         ahead, aside = (one + splay * (1.0 - low / seat) for one in (x, y))
-        thin, thinner = (0.55 * leg, 0.55 * leg), (0.5 * leg, 0.5 * leg)
+        thin = (0.55 * leg, 0.55 * leg)
+        thinner = (0.5 * leg, 0.5 * leg)
         for sy in (-1.0, 1.0):
-            patches += _post("along", (-ahead, sy * aside, low), (ahead, sy * aside, low), section, thin)
-        patches += _post("cross", (0.0, -aside, low), (0.0, aside, low), section, thinner)
+            patches += _post(
+                "along",
+                (-ahead, sy * aside, low),
+                (ahead, sy * aside, low),
+                section,
+                thin,
+            )
+        patches += _post(
+            "cross", (0.0, -aside, low), (0.0, aside, low), section, thinner
+        )
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
     turned = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
 
     offset = draw.offset()
     timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
-    paint_color = draw.colour("f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040")
+    paint_color = draw.colour(
+        "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
+    )
     painted = draw.chance(0.4)
     wild = natural(draw, total, solid(paint_color), 0.5)
 
@@ -82,12 +127,25 @@ def chair(draw: Draw) -> Instance:
         checks(fabric, hexed("efe6d4"), 4.0), dots(solid(fabric), hexed("f4efe4"), 6.0),
     )  # fmt: skip
     seat_paint = cover if draw.chance(0.25) else grain(0)
-    paints = {"up": grain(2), "along": grain(0), "cross": grain(1), "seat": seat_paint, "cushion": cover}
+    paints = {
+        "up": grain(2),
+        "along": grain(0),
+        "cross": grain(1),
+        "seat": seat_paint,
+        "cushion": cover,
+    }
     return Instance(turned, paints, finish(draw, 0.45, 0.2))
 
 
 def _chair_back(
-    draw: Draw, x: float, y: float, seat: float, total: float, lean: float, leg: float, section: Array
+    draw: Draw,
+    x: float,
+    y: float,
+    seat: float,
+    total: float,
+    lean: float,
+    leg: float,
+    section: Array,
 ) -> list[Patch]:
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
@@ -97,12 +155,24 @@ def _chair_back(
         return -x - lean * (z - seat) / (total - seat)
 
     for sy in (-1.0, 1.0):
-        patches += _post("up", (at(foot), sy * y, foot), (at(total), sy * y, total), section, (leg, 0.85 * leg))
+        patches += _post(
+            "up",
+            (at(foot), sy * y, foot),
+            (at(total), sy * y, total),
+            section,
+            (leg, 0.85 * leg),
+        )
     tilt = shapes.rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
     depth = draw(1.6, 1.2, 2.4)
 
-    def slat(tag: str, z: float, width: float, height: float, shift: float = 0.0) -> list[Patch]:
-        return shapes.placed(shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5), tilt, (at(z), shift, z))
+    def slat(
+        tag: str, z: float, width: float, height: float, shift: float = 0.0
+    ) -> list[Patch]:
+        return shapes.placed(
+            shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5),
+            tilt,
+            (at(z), shift, z),
+        )
 
     inner = 2 * (y - 0.3 * leg)
     high = total - seat
@@ -115,7 +185,13 @@ def _chair_back(
         for i in range(count):
             shift = inner * ((i + 1) / (count + 1) - 0.5)
             top = total - 0.15 * high
-            patches += slat("up", (low + top) / 2, inner * draw(0.075, 0.05, 0.11), top - low + 1.0, shift)
+            patches += slat(
+                "up",
+                (low + top) / 2,
+                inner * draw(0.075, 0.05, 0.11),
+                top - low + 1.0,
+                shift,
+            )
     elif style == "ladder":
         count = int(draw.pick(3, 2, 4))
         for i in range(count):
@@ -123,15 +199,25 @@ def _chair_back(
             patches += slat("cross", z, inner, high * draw(0.15, 0.1, 0.2))
     else:
         tall = draw(0.6, 0.35, 0.75) * high
-        patches += slat("cushion" if draw.chance(0.3) else "up", total - tall / 2 - 0.04 * high, inner, tall)
+        patches += slat(
+            "cushion" if draw.chance(0.3) else "up",
+            total - tall / 2 - 0.04 * high,
+            inner,
+            tall,
+        )
     return patches
 
 
-def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> list[Patch]:
+def _shade(
+    draw: Draw, low: float, high: float, wide: float, narrow: float
+) -> list[Patch]:
     """An open lampshade with a thin wall, standing free from `low` to `high`."""
     wall = 0.25
     belly = draw(0.0, -0.1, 0.12) * wide
-    outer = shapes.spline([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)], 14)
+    outer = shapes.spline(
+        [(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)],
+        14,
+    )
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
         ("shade", shapes.dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner),
@@ -140,8 +226,11 @@ def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> l
     return shapes.lathe(pieces, 56)
 
 
-def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
-    under, top = [(0.0, 0.0), (radius - 0.4, 0.0)], [(stem, low), (0.0, low)]
+def _lamp_base(
+    draw: Draw, style: str, low: float, radius: float, stem: float
+) -> list[Patch]:
+    under = [(0.0, 0.0), (radius - 0.4, 0.0)]
+    top = [(stem, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, 1.2, 3.2)
         corners = [
@@ -158,29 +247,58 @@ def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -
         (radius * 0.96, 1.2), (radius * 0.8, 2.4), (belly, at), *waist, (stem * 1.5, 0.86 * low), (stem, 0.93 * low),
     ]  # fmt: skip
     body = shapes.spline(knots, 34)
-    ring = shapes.rounded([under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3)
+    ring = shapes.rounded(
+        [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3
+    )
     neck = [knots[-1], top[0]]
-    return shapes.lathe([("base", under), ("foot", ring), ("body", body), ("base", neck), ("base", top)], 44)
+    return shapes.lathe(
+        [
+            ("base", under),
+            ("foot", ring),
+            ("body", body),
+            ("base", neck),
+            ("base", top),
+        ],
+        44,
+    )
 
 
 @family(metres=0.01)
 def lamp(draw: Draw) -> Instance:
-    total, tall, wide = draw(48.0, 42.0, 58.0), draw(20.0, 14.0, 24.0), draw(16.5, 12.0, 19.0)
+    total = draw(48.0, 42.0, 58.0)
+    tall = draw(20.0, 14.0, 24.0)
+    wide = draw(16.5, 12.0, 19.0)
     narrow = wide * draw(0.6, 0.35, 1.0)
     low = total - tall
-    radius, stem = draw(7.4, 6.0, 9.5), draw(0.8, 0.6, 1.3)
+    radius = draw(7.4, 6.0, 9.5)
+    stem = draw(0.8, 0.6, 1.3)
     style = draw.pick("body", "disc", "gourd")
     base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
     patches = base + _shade(draw, low, total, wide, narrow)
-    patches += shapes.sphere("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
-    ring_z, inside = total - 0.12 * tall, narrow + (wide - narrow) * 0.12
+    patches += shapes.sphere(
+        "bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20
+    )
+    ring_z = total - 0.12 * tall
+    inside = narrow + (wide - narrow) * 0.12
     for angle in (20.0, 140.0, 260.0):
-        spoke = shapes.sweep("base", [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)], shapes.ellipse(0.22, 0.22, 8))
+        spoke = shapes.sweep(
+            "base",
+            [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)],
+            shapes.ellipse(0.22, 0.22, 8),
+        )
         patches += shapes.placed(spoke, shapes.rotation("z", angle))
     rod = [(0, 0, z) for z in (low + 0.2 * tall, ring_z, ring_z + 0.8, ring_z + 1.0)]
-    patches += shapes.sweep("base", rod, shapes.ellipse(0.35, 0.35, 10), (1.0, 1.0, 1.6, 0.0), first=(1.0, 0.0, 0.0))
+    patches += shapes.sweep(
+        "base",
+        rod,
+        shapes.ellipse(0.35, 0.35, 10),
+        (1.0, 1.0, 1.6, 0.0),
+        first=(1.0, 0.0, 0.0),
+    )
     offset = draw.offset()
-    linen = draw.colour("f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25)
+    linen = draw.colour(
+        "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
+    )
     weave = clouded(linen, 0.93, 1.2, offset)
     kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
     accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
@@ -199,7 +317,9 @@ def lamp(draw: Draw) -> Instance:
         for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
             weave = over(weave, hem, solid(shade(linen, 0.75)))
     cloth = natural(draw, total, weave, 0.3)
-    clay = draw.colour("2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b")
+    clay = draw.colour(
+        "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
+    )
     body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {

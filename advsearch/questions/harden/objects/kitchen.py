@@ -32,40 +32,59 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     tip = np.array([radius * draw(1.85, 1.6, 2.0), 0.0, height * draw(0.94, 0.8, 1.02)])
     bend = 0.22 if style == "curved" else 0.04
     middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
-    above = start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
+    above = (
+        start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
+    )
     path = shapes.spline([start, middle, above, tip], 18)
-    root, end = draw(1.75, 1.3, 2.2), draw(0.72, 0.55, 0.95)
+    root = draw(1.75, 1.3, 2.2)
+    end = draw(0.72, 0.55, 0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
     tangent, first, second = shapes.frames(path, (0.0, 1.0, 0.0))
     order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
     inner = scale[[17, 16, 15, 14, 13]] - 0.24
-    radii = np.concatenate([scale, [end - 0.06, end - 0.12, inner[0], inner[1], inner[2], inner[3], 0.0]])
+    radii = np.concatenate(
+        [scale, [end - 0.06, end - 0.12, inner[0], inner[1], inner[2], inner[3], 0.0]]
+    )
     push = np.zeros(len(order))
     push[18:21] = (0.1, 0.12, 0.06)
     frame = (tangent[order], first[order], second[order])
     return shapes.sweep(
-        "spout", path[order] + push[:, None] * tangent[order], shapes.ellipse(1.0, 1.0, 20), radii, frame=frame
+        "spout",
+        path[order] + push[:, None] * tangent[order],
+        shapes.ellipse(1.0, 1.0, 20),
+        radii,
+        frame=frame,
     )
 
 
 @family(metres=0.01)
 def teapot(draw: Draw) -> Instance:
-    radius, height = draw(7.2, 6.4, 8.0), draw(10.2, 8.0, 12.5)
-    foot, mouth = radius * draw(0.58, 0.5, 0.75), radius * draw(0.48, 0.42, 0.6)
-    at, full = draw(0.45, 0.35, 0.58), draw(0.9, 0.82, 0.97)
+    radius = draw(7.2, 6.4, 8.0)
+    height = draw(10.2, 8.0, 12.5)
+    foot = radius * draw(0.58, 0.5, 0.75)
+    mouth = radius * draw(0.48, 0.42, 0.6)
+    at = draw(0.45, 0.35, 0.58)
+    full = draw(0.9, 0.82, 0.97)
     knots = [
         (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
         (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
     ]  # fmt: skip
     side = shapes.spline(knots, 26)
-    dome, r = draw(1.5, 0.7, 2.4), draw(1.0, 0.7, 1.4)
+    dome = draw(1.5, 0.7, 2.4)
+    r = draw(1.0, 0.7, 1.4)
     top = height + dome + 0.2
     rim = [
         (mouth, height), (mouth * 0.97, height + 0.02), (mouth * 0.94, height - 0.12), (mouth * 0.94, height + 0.05),
         (mouth * 0.97, height + 0.05),
     ]  # fmt: skip
     lid = shapes.spline(
-        [rim[-1], (mouth * 0.9, height + 0.35), (mouth * 0.55, height + 0.75 * dome + 0.2), (0.35, top)], 10
+        [
+            rim[-1],
+            (mouth * 0.9, height + 0.35),
+            (mouth * 0.55, height + 0.75 * dome + 0.2),
+            (0.35, top),
+        ],
+        10,
     )
     knob = shapes.spline(
         [(0.45, top), (0.5, top + 0.3), (r, top + 0.45 + r * 0.6), (0.7 * r, top + 0.45 + 1.35 * r),
@@ -77,7 +96,8 @@ def teapot(draw: Draw) -> Instance:
     ]  # fmt: skip
     body = shapes.lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
-    high, low = height * 0.84, height * (0.84 - 0.62 * span)
+    high = height * 0.84
+    low = height * (0.84 - 0.62 * span)
     top_root, low_root = (shapes.at_height(side, z) - 0.25 for z in (high, low))
     reach = radius * draw(0.72, 0.5, 0.9)
     lift = draw(0.05, -0.02, 0.2) * height
@@ -88,19 +108,32 @@ def teapot(draw: Draw) -> Instance:
     ]  # fmt: skip
     section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
     grip = shapes.sweep(
-        "handle", shapes.upright(shapes.spline(knots, 26)), section, 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3
+        "handle",
+        shapes.upright(shapes.spline(knots, 26)),
+        section,
+        1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,
     )
-    patches = [*body, *_spout(draw, radius, height), *shapes.placed(grip, shapes.rotation("z", 180.0))]
+    patches = [
+        *body,
+        *_spout(draw, radius, height),
+        *shapes.placed(grip, shapes.rotation("z", 180.0)),
+    ]
     patches = shapes.placed(patches, shapes.rotation("z", 118.0))
 
     offset = draw.offset()
-    clay = draw.colour("7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0")
+    clay = draw.colour(
+        "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
+    )
     glaze = clouded(clay, 1.25, 3.5, offset, 1.6)
     second = draw.colour("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     kind = draw.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
     if kind == "bands":
-        paint = over(glaze, between(0.7 * height, 0.74 * height, soft=0.1), solid(second))
-        paint = over(paint, between(0.77 * height, 0.785 * height, soft=0.1), solid(second))
+        paint = over(
+            glaze, between(0.7 * height, 0.74 * height, soft=0.1), solid(second)
+        )
+        paint = over(
+            paint, between(0.77 * height, 0.785 * height, soft=0.1), solid(second)
+        )
     elif kind == "dots":
         paint = dots(glaze, second, draw(2.6, 1.6, 4.0), draw(0.28, 0.18, 0.4))
     elif kind == "stripes":
@@ -122,45 +155,96 @@ def teapot(draw: Draw) -> Instance:
 
 @family(metres=0.01)
 def frying_pan(draw: Draw) -> Instance:
-    base, rim = draw(10.5, 9.0, 11.5), draw(13.0, 12.2, 14.5)
-    depth, wall = draw(4.2, 2.8, 5.5), draw(0.38, 0.3, 0.55)
-    side = shapes.spline([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)], 14)
+    base = draw(10.5, 9.0, 11.5)
+    rim = draw(13.0, 12.2, 14.5)
+    depth = draw(4.2, 2.8, 5.5)
+    wall = draw(0.38, 0.3, 0.55)
+    side = shapes.spline(
+        [
+            (base - 0.8, 0.0),
+            (base, 0.25),
+            (base + 0.55 * (rim - base), 0.5 * depth),
+            (rim, depth),
+        ],
+        14,
+    )
     body = shapes.vessel(side, wall, 0.5, columns=64, step=1.6)
 
     length = draw(18.0, 14.0, 21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
-    along = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise), (length, rise * draw(1.05, 0.8, 1.2))]
+    along = [
+        (0.0, 0.0),
+        (0.22 * length, 0.55 * rise),
+        (0.6 * length, rise),
+        (length, rise * draw(1.05, 0.8, 1.2)),
+    ]
     path = shapes.spline(root + shapes.upright(np.array(along)), 26)
     t = np.linspace(0.0, 1.0, 26)
-    width, thick = draw(1.15, 0.85, 1.5), draw(0.62, 0.45, 0.9)
-    shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t))
+    width = draw(1.15, 0.85, 1.5)
+    thick = draw(0.62, 0.45, 0.9)
+    shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
+        1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t)
+    )
     end = np.sqrt(np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0))
-    scale = np.stack([thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)), width * shape], axis=1) * end[:, None]
-    section = shapes.ellipse(1.0, 1.0, 20) if draw.chance(0.5, True) else shapes.rectangle(2.0, 2.0, 0.7)
+    scale = (
+        np.stack(
+            [thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)), width * shape], axis=1
+        )
+        * end[:, None]
+    )
+    section = (
+        shapes.ellipse(1.0, 1.0, 20)
+        if draw.chance(0.5, True)
+        else shapes.rectangle(2.0, 2.0, 0.7)
+    )
     grip = shapes.sweep("handle", path, section, scale)
     inner = shapes.at_height(side, 0.72 * depth) - wall
-    rivet = shapes.sphere("rivet", 0.38, (inner + 0.02, 0.0, 0.72 * depth), rows=8, columns=12)
-    rivets = [patch for y in (-1.1, 1.1) for patch in shapes.placed(rivet, offset=(0.0, y, 0.0))]
-    spine = [(rim - 1.4, 0.72 * depth), (rim - 0.3, 0.75 * depth), (rim + 0.2 * length, 0.78 * depth + 0.5 * rise)]
-    bracket = shapes.sweep(
-        "bracket", shapes.upright(np.array(spine)), shapes.rectangle(0.7, 3.0, 0.25), (1.0, 1.0, 0.62), caps=True
+    rivet = shapes.sphere(
+        "rivet", 0.38, (inner + 0.02, 0.0, 0.72 * depth), rows=8, columns=12
     )
-    patches = shapes.placed([*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0))
+    rivets = [
+        patch
+        for y in (-1.1, 1.1)
+        for patch in shapes.placed(rivet, offset=(0.0, y, 0.0))
+    ]
+    spine = [
+        (rim - 1.4, 0.72 * depth),
+        (rim - 0.3, 0.75 * depth),
+        (rim + 0.2 * length, 0.78 * depth + 0.5 * rise),
+    ]
+    bracket = shapes.sweep(
+        "bracket",
+        shapes.upright(np.array(spine)),
+        shapes.rectangle(0.7, 3.0, 0.25),
+        (1.0, 1.0, 0.62),
+        caps=True,
+    )
+    patches = shapes.placed(
+        [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
+    )
 
     offset = draw.offset()
     coat = draw.colour("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
 
     def turned(t: Texels) -> Array:
         """Faint rings, as turning leaves."""
-        return step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8) * 0.35
+        return (
+            step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8)
+            * 0.35
+        )
 
-    inside = speckled(clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06)
+    inside = speckled(
+        clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06
+    )
     if draw.chance(0.4, True):
         inside = over(inside, turned, solid(shade(coat, 1.6)))
     outer = draw.colour("a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b")
-    enamel = clouded(outer, 0.85, 5.0, offset)  # darker towards the bottom, with a dark line at the rim
-    enamel = over(enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6)))
+    # darker towards the bottom, with a dark line at the rim
+    enamel = clouded(outer, 0.85, 5.0, offset)
+    enamel = over(
+        enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6))
+    )
     enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
     outside = natural(draw, 2 * rim, enamel, 0.3)
     inside = natural(draw, 2 * rim, inside, 0.2)
@@ -171,6 +255,12 @@ def frying_pan(draw: Draw) -> Instance:
         "wild": solid(draw.colour("a9231f")),
     }
     steel = solid(draw.colour("b9bcc0", "8c8f94", wild=0.1))
-    paints = {"outside": outside, "inside": inside, "handle": holds[style], "rivet": steel, "bracket": steel}
+    paints = {
+        "outside": outside,
+        "inside": inside,
+        "handle": holds[style],
+        "rivet": steel,
+        "bracket": steel,
+    }
     paints["base"] = solid(draw.colour("77797c", "2b2c2e"))
     return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})

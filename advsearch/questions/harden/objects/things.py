@@ -31,17 +31,34 @@ from advsearch.questions.harden.objects.textures import (
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
-PENTAGONS = shapes.unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))
-"""The 12 unit directions of an icosahedron's corners: the middles of a football's dark panels."""
+PENTAGONS = shapes.unit(
+    np.array(
+        [
+            corner
+            for a, b in _SIGNS
+            for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))
+        ]
+    )
+)
+"""The 12 unit directions of an icosahedron's corners: the middles of a football's dark
+panels.
+"""
 _NEAR = PENTAGONS @ PENTAGONS.T > 0.4
-_FACES = [face for face in combinations(range(12), 3) if all(_NEAR[pair] for pair in combinations(face, 2))]
+_FACES = [
+    face
+    for face in combinations(range(12), 3)
+    if all(_NEAR[pair] for pair in combinations(face, 2))
+]
 HEXAGONS = shapes.unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES]))
 """The 20 unit directions of its face middles: the middles of the light panels."""
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
-    """Return (N,) distance to the nearest seam and (N,) whether the panel is a pentagon, on a truncated icosahedron."""
-    pentagon = direction @ PENTAGONS.T / 0.9393  # offsets of the two kinds of faces from the centre
+    """Return (N,) distance to the nearest seam and (N,) whether the panel is a
+    pentagon, on a truncated icosahedron.
+    """
+    # offsets of the two kinds of faces from the centre
+    pentagon = direction @ PENTAGONS.T / 0.9393
     hexagon = direction @ HEXAGONS.T / 0.9149
     both = np.sort(np.concatenate([pentagon, hexagon], axis=1), axis=1)
     return both[:, -1] - both[:, -2], pentagon.max(axis=1) > hexagon.max(axis=1)
@@ -50,24 +67,47 @@ def football_seams(direction: Array) -> tuple[Array, Array]:
 def basketball_seams(d: Array) -> Array:
     """Return (N,) a distance to the nearest groove of a basketball."""
     curve = np.abs(np.abs(d[:, 1]) - (0.42 + 0.38 * d[:, 2] ** 2))
-    return np.asarray(np.min([np.abs(d[:, 0]), np.abs(d[:, 2]), np.where(d[:, 1] != 0.0, curve, 1.0)], axis=0))
+    return np.asarray(
+        np.min(
+            [np.abs(d[:, 0]), np.abs(d[:, 2]), np.where(d[:, 1] != 0.0, curve, 1.0)],
+            axis=0,
+        )
+    )
 
 
 def tennis_seam(d: Array) -> Array:
     """Return (N,) a distance to the seam of a tennis ball."""
-    return np.abs(d[:, 0] ** 2 - d[:, 1] ** 2 - 0.75 * d[:, 2] * (1.2 - 0.2 * d[:, 2] ** 2)) * 0.5
+    return (
+        np.abs(
+            d[:, 0] ** 2 - d[:, 1] ** 2 - 0.75 * d[:, 2] * (1.2 - 0.2 * d[:, 2] ** 2)
+        )
+        * 0.5
+    )
 
 
-def _grooved(patches: list[Patch], radius: float, depth: float, seam: Callable[[Array], Array]) -> list[Patch]:
-    """Press the seams into the sphere; normals stay those of the sphere, the groove is a shade, not an edge."""
-    depths = (depth * np.exp(-((seam(patch.vertices / radius) / 0.03) ** 2)) for patch in patches)
-    return [replace(p, vertices=p.vertices * (1.0 - by)[:, None]) for p, by in zip(patches, depths, strict=True)]
+def _grooved(
+    patches: list[Patch], radius: float, depth: float, seam: Callable[[Array], Array]
+) -> list[Patch]:
+    """Press the seams into the sphere; normals stay those of the sphere, the groove is
+    a shade, not an edge.
+    """
+    depths = (
+        depth * np.exp(-((seam(patch.vertices / radius) / 0.03) ** 2))
+        for patch in patches
+    )
+    return [
+        replace(p, vertices=p.vertices * (1.0 - by)[:, None])
+        for p, by in zip(patches, depths, strict=True)
+    ]
 
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
     away, pentagon = football_seams(shapes.unit(t.xyz))
-    base = mix(light, dark, pentagon.astype(np.float64)) * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
+    base = (
+        mix(light, dark, pentagon.astype(np.float64))
+        * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
+    )
     return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
 
 
@@ -75,7 +115,11 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
     angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
     pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
-    return np.where(pole[:, None], light, np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)])
+    return np.where(
+        pole[:, None],
+        light,
+        np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)],
+    )
 
 
 @painter
@@ -85,30 +129,50 @@ def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
 
 @painter
 def _star(t: Texels, radius: float) -> Array:
-    x, y = t.xyz[:, 0], t.xyz[:, 1]
-    return step(np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, 0.04)
+    x = t.xyz[:, 0]
+    y = t.xyz[:, 1]
+    return step(
+        np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, 0.04
+    )
 
 
 @family(metres=0.01)
 def ball(draw: Draw) -> Instance:
     radius = 11.0
-    style = draw.pick("football", "beach", "basket", "tennis", "star", "plain", "wild", "wild")
+    style = draw.pick(
+        "football", "beach", "basket", "tennis", "star", "plain", "wild", "wild"
+    )
     squash = draw(1.0, 0.95, 1.03)
     patches = shapes.sphere("ball", radius, rows=28, columns=48)
-    turn = shapes.rotation("z", draw(12.0, 0.0, 360.0)) @ shapes.rotation("x", draw(24.0, 0.0, 180.0))
+    turn = shapes.rotation("z", draw(12.0, 0.0, 360.0)) @ shapes.rotation(
+        "x", draw(24.0, 0.0, 180.0)
+    )
     offset = draw.offset()
     light = draw.colour("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
     dark = draw.colour("1d1f22", "23395d", "b5442e", wild=0.3)
     if style == "beach":
-        bright = [draw.colour(code, wild=0.5) for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()]
-        paint = _beach([color if draw.chance(0.7) else light for color in bright], light, radius)
+        bright = [
+            draw.colour(code, wild=0.5)
+            for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
+        ]
+        paint = _beach(
+            [color if draw.chance(0.7) else light for color in bright], light, radius
+        )
     elif style == "basket":
         skin = draw.colour("c8642b", "b5532a", "7a3b22", wild=0.2)
-        paint = over(clouded(skin, 0.85, 0.7, offset), _near_to(basketball_seams, 0.03), solid("1b1715"))
+        paint = over(
+            clouded(skin, 0.85, 0.7, offset),
+            _near_to(basketball_seams, 0.03),
+            solid("1b1715"),
+        )
         patches = _grooved(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
         felt = draw.colour("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
-        paint = over(clouded(felt, 0.85, 0.6, offset), _near_to(tennis_seam, 0.045), solid("eeeee6"))
+        paint = over(
+            clouded(felt, 0.85, 0.6, offset),
+            _near_to(tennis_seam, 0.045),
+            solid("eeeee6"),
+        )
     elif style == "star":
         paint = over(solid(dark), _star(radius), solid(light))
     elif style == "plain":
@@ -117,20 +181,29 @@ def ball(draw: Draw) -> Instance:
         paint = anything(draw, 2 * radius)
     else:
         paint = _football(light, dark, offset)
-        patches = _grooved(patches, radius, 0.008, lambda d: football_seams(shapes.unit(d))[0] * 1.5)
-    shaped = [replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash])) for p in shapes.placed(patches, turn)]
+        patches = _grooved(
+            patches, radius, 0.008, lambda d: football_seams(shapes.unit(d))[0] * 1.5
+        )
+    shaped = [
+        replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
+        for p in shapes.placed(patches, turn)
+    ]
     return Instance(shaped, {"ball": paint}, finish(draw, 0.4, 0.3))
 
 
 @family(metres=0.01)
 def banana(draw: Draw) -> Instance:
-    length, bend = draw(19.0, 15.0, 22.0), draw(105.0, 65.0, 130.0)
-    thick, stem = draw(1.65, 1.45, 2.1), draw(2.4, 1.6, 3.6)
+    length = draw(19.0, 15.0, 22.0)
+    bend = draw(105.0, 65.0, 130.0)
+    thick = draw(1.65, 1.45, 2.1)
+    stem = draw(2.4, 1.6, 3.6)
     count = 44
     t = np.linspace(0.0, 1.0, count)
     angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
     path = np.zeros((count, 3))
-    path[1:, 0], path[1:, 1] = (np.cumsum(turn(angle)) * (length / (count - 1)) for turn in (np.sin, np.cos))
+    path[1:, 0], path[1:, 1] = (
+        np.cumsum(turn(angle)) * (length / (count - 1)) for turn in (np.sin, np.cos)
+    )
     at = t * length
     body = np.clip((at - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
     taper = np.clip((length - at) / (0.24 * length), 0.0, 1.0) ** 0.62
@@ -142,7 +215,9 @@ def banana(draw: Draw) -> Instance:
     phi = 2 * np.pi * np.arange(30) / 30
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
     section = np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
-    patches = shapes.sweep("banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True)
+    patches = shapes.sweep(
+        "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
+    )
     patches = shapes.placed(patches, shapes.rotation("y", draw(9.0, 0.0, 14.0)))
     patches = shapes.placed(patches, shapes.rotation("z", draw(78.0, 45.0, 120.0)))
 
@@ -156,23 +231,34 @@ def banana(draw: Draw) -> Instance:
         xyz = t.xyz
         start, end = (np.linalg.norm(xyz - head, axis=1) for head in heads)
         base = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
-        base = mix(base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75)
+        base = mix(
+            base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75
+        )
         base = mix(base, green, np.clip(1.0 - end / 2.2, 0.0, 1.0) * 0.5)
-        fleck = step(noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08)
+        fleck = step(
+            noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08
+        )
         fleck = np.maximum(fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08))
         base = mix(base, brown, fleck * 0.85)
         base = mix(base, brown, step(-start, -0.5 * stem, 1.3) * 0.5)
         base = mix(base, tip, step(-start, -0.45, 0.5))
         return mix(base, tip, step(-end, -0.75, 0.5))
 
-    return Instance(patches, {"banana": natural(draw, length, paint, 0.4)}, finish(draw, 0.45, 0.1))
+    return Instance(
+        patches, {"banana": natural(draw, length, paint, 0.4)}, finish(draw, 0.45, 0.1)
+    )
 
 
 @family(metres=0.01)
 def book(draw: Draw) -> Instance:
-    """A closed hardback on its back cover; the spine runs along y at -x, the pages show at the other three sides."""
-    width, height, thick = draw(15.5, 12.0, 18.0), 22.5, draw(4.2, 2.2, 6.0)
-    board, lip = draw(0.34, 0.2, 0.45), draw(0.4, 0.2, 0.6)
+    """A closed hardback on its back cover; the spine runs along y at -x, the pages show
+    at the other three sides.
+    """
+    width = draw(15.5, 12.0, 18.0)
+    height = 22.5
+    thick = draw(4.2, 2.2, 6.0)
+    board = draw(0.34, 0.2, 0.45)
+    lip = draw(0.4, 0.2, 0.6)
     bulge = draw(0.35, 0.0, 0.7)
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
@@ -181,14 +267,22 @@ def book(draw: Draw) -> Instance:
     patches += shapes.box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
     half = thick / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    outer = np.stack([-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1)
-    inner = np.stack([-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine], axis=1)[::-1]
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    outer = np.stack(
+        [-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1
+    )
+    inner = np.stack(
+        [-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine],
+        axis=1,
+    )[::-1]
     patches += _spine(outer, inner, height)
     turned = shapes.placed(patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0)))
 
     offset = draw.offset()
-    cloth = draw.colour("7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd")
+    cloth = draw.colour(
+        "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
+    )
     gold = draw.colour("d8b45a", "efe6cf", "1d1f22", wild=0.25)
     base = natural(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
     title = draw.pick("frame", "blocks", "picture", "plain")
@@ -196,43 +290,93 @@ def book(draw: Draw) -> Instance:
     paper = hexed("ece2c8") if draw.chance(0.7, True) else hexed("f4f2ea")
 
     def pages_paint(t: Texels) -> Array:
-        lines = noise(np.stack([t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1) + offset)
+        lines = noise(
+            np.stack(
+                [t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1
+            )
+            + offset
+        )
         return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
     def spine(t: Texels) -> Array:
         y = np.abs(t.xyz[:, 1]) / height
-        band = np.maximum(step(0.008 - np.abs(y - 0.36), 0.0, 0.006), step(0.008 - np.abs(y - 0.42), 0.0, 0.006))
-        block = step(0.16 - y, 0.0, 0.01) * step(0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, 0.05)
-        words = step(noise(np.stack([t.xyz[:, 1] * 1.8, t.xyz[:, 2] * 0.2, 0 * y], axis=1) + 3.0), 0.36, 0.1)
+        band = np.maximum(
+            step(0.008 - np.abs(y - 0.36), 0.0, 0.006),
+            step(0.008 - np.abs(y - 0.42), 0.0, 0.006),
+        )
+        block = step(0.16 - y, 0.0, 0.01) * step(
+            0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, 0.05
+        )
+        words = step(
+            noise(
+                np.stack([t.xyz[:, 1] * 1.8, t.xyz[:, 2] * 0.2, 0 * y], axis=1) + 3.0
+            ),
+            0.36,
+            0.1,
+        )
         return mix(base(t), gold, np.maximum(band, block * words))
 
-    return Instance(turned, {"cover": front, "pages": pages_paint, "spine": spine}, finish(draw, 0.55, 0.0))
+    return Instance(
+        turned,
+        {"cover": front, "pages": pages_paint, "spine": spine},
+        finish(draw, 0.55, 0.0),
+    )
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
-    """Extrude the spine's section along y: its outer curve (K, 2) upwards in (x, z), its inner one downwards."""
+    """Extrude the spine's section along y: its outer curve (K, 2) upwards in (x, z),
+    its inner one downwards.
+    """
     loop = np.concatenate([outer, inner])[::-1]
-    frame = (np.tile([0.0, -1.0, 0.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.tile([0.0, 0.0, 1.0], (2, 1)))
-    patches = shapes.sweep("spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame)
-    size = (float(np.ptp(outer[:, 1])), float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])))
+    frame = (
+        np.tile([0.0, -1.0, 0.0], (2, 1)),
+        np.tile([1.0, 0.0, 0.0], (2, 1)),
+        np.tile([0.0, 0.0, 1.0], (2, 1)),
+    )
+    patches = shapes.sweep(
+        "spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame
+    )
+    size = (
+        float(np.ptp(outer[:, 1])),
+        float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])),
+    )
     for side in (1.0, -1.0):
-        rows = [np.insert(curve, 1, side * height / 2, axis=1) for curve in (outer, inner[::-1])]
+        rows = [
+            np.insert(curve, 1, side * height / 2, axis=1)
+            for curve in (outer, inner[::-1])
+        ]
         ends = np.stack(rows if side > 0 else rows[::-1])
         normal = np.broadcast_to([0.0, side, 0.0], ends.shape)
         patches.append(
-            shapes.grid("spine", ends, normal, size, np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(outer)))
+            shapes.grid(
+                "spine",
+                ends,
+                normal,
+                size,
+                np.array([0.0, 1.0]),
+                np.linspace(0.0, 1.0, len(outer)),
+            )
         )
     return patches
 
 
-def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, height: float, thick: float) -> Paint:
+def _front(
+    draw: Draw,
+    base: Paint,
+    gold: Array,
+    title: str,
+    width: float,
+    height: float,
+    thick: float,
+) -> Paint:
     accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:
         return step(w - np.abs(x), 0.0, 0.12) * step(h - np.abs(y), 0.0, 0.12)
 
     def paint(t: Texels) -> Array:
-        x, y = t.xyz[:, 0] - 0.25, -t.xyz[:, 1]
+        x = t.xyz[:, 0] - 0.25
+        y = -t.xyz[:, 1]
         top = (t.xyz[:, 2] > thick - 0.1).astype(np.float64)
         color = base(t)
         if title == "plain":
@@ -240,17 +384,30 @@ def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, heigh
         if title == "picture":
             picture = inside(x, y + 0.12 * height, 0.36 * width, 0.26 * height) * top
             color = mix(color, accent, picture)
-            color = mix(color, gold, picture * step(0.16 * width - np.hypot(x, y + 0.12 * height), 0.0, 0.15))
+            color = mix(
+                color,
+                gold,
+                picture
+                * step(0.16 * width - np.hypot(x, y + 0.12 * height), 0.0, 0.15),
+            )
         if title == "frame":
-            frame = inside(x, y, 0.43 * width, 0.45 * height) - inside(x, y, 0.43 * width - 0.28, 0.45 * height - 0.28)
+            frame = inside(x, y, 0.43 * width, 0.45 * height) - inside(
+                x, y, 0.43 * width - 0.28, 0.45 * height - 0.28
+            )
             color = mix(color, gold, frame * top)
-        words = step(noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0), 0.3, 0.08)
+        words = step(
+            noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0),
+            0.3,
+            0.08,
+        )
         rows = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, 0.1) * words
         lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
         color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
         if title != "picture":
             away = np.hypot(x, y + 0.16 * height)
-            seal = step(0.14 * width - away, 0.0, 0.12) - step(0.1 * width - away, 0.0, 0.12)
+            seal = step(0.14 * width - away, 0.0, 0.12) - step(
+                0.1 * width - away, 0.0, 0.12
+            )
             color = mix(color, gold, seal * top)
         return color
 
@@ -258,10 +415,11 @@ def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, heigh
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A stop sign as it stands at road works, on a low stand. Units are metres; it is read from +x.
+# A stop sign as it stands at road works, on a low stand. Units are metres; it is read
+# from +x.
 #
-# The stand is low because data sets draw the box of a stop sign around its plate: on a tall post the box of all that is
-# there would be another one.
+# The stand is low because data sets draw the box of a stop sign around its plate: on a
+# tall post the box of all that is there would be another one.
 
 _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
     "S": [[(0.58, 0.82), (0.48, 0.97), (0.12, 0.97), (0.02, 0.84), (0.02, 0.66), (0.12, 0.54),
@@ -279,15 +437,20 @@ FINISHES = {
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """The word in white on red, with a white rim. Octagon of a circumradius, painted before it is raised."""
+    """The word in white on red, with a white rim. Octagon of a circumradius, painted
+    before it is raised.
+    """
     inner = radius * np.cos(np.pi / 8)
     turns = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
-    y, z = t.xyz[:, 1], t.xyz[:, 2]
+    y = t.xyz[:, 1]
+    z = t.xyz[:, 2]
     out = np.max([y * np.cos(a) + z * np.sin(a) for a in turns], axis=0)
     rim = step(out - 0.915 * inner, 0.0, 0.006) * step(0.985 * inner - out, 0.0, 0.006)
-    high, letters = 0.52 * inner, "STOP"
+    high = 0.52 * inner
+    letters = "STOP"
     strokes = [
-        np.array(path) * high + np.array([((k - len(letters) / 2) * 0.74 + 0.07) * high, -high / 2])
+        np.array(path) * high
+        + np.array([((k - len(letters) / 2) * 0.74 + 0.07) * high, -high / 2])
         for k, letter in enumerate(letters)
         for path in _STROKES[letter]
     ]
@@ -297,20 +460,57 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 
 @family(metres=1.0, texels=192)
 def stop_sign(draw: Draw) -> Instance:
-    radius, height = draw(0.45, 0.4, 0.5), draw(0.74, 0.66, 0.84)
+    radius = draw(0.45, 0.4, 0.5)
+    height = draw(0.74, 0.66, 0.84)
     red = draw.colour("b3121d", "a8161f", "c0202a", wild=0.0)
-    ring, ahead = shapes.polygon(8, 0.02, 2) * radius, np.array([1.0, 0.0, 0.0])
-    back = np.insert(ring, 0, 0.0, axis=1)  # an octagon that looks along +x, its middle at the origin
-    edge = shapes.sweep("metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0))
-    plate = [shapes.cap("face", back + 0.004 * ahead, ahead), *edge, shapes.cap("metal", back[::-1], -ahead)]
+    ring = shapes.polygon(8, 0.02, 2) * radius
+    ahead = np.array([1.0, 0.0, 0.0])
+    # an octagon that looks along +x, its middle at the origin
+    back = np.insert(ring, 0, 0.0, axis=1)
+    edge = shapes.sweep(
+        "metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0)
+    )
+    plate = [
+        shapes.cap("face", back + 0.004 * ahead, ahead),
+        *edge,
+        shapes.cap("metal", back[::-1], -ahead),
+    ]
     plate = shapes.placed(plate, offset=(0.036, 0.0, height))
-    tube = shapes.rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
-    post = shapes.lathe([("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])], 20)
+    tube = shapes.rounded(
+        [
+            (0.03, 0.0),
+            (0.03, height + 0.7 * radius),
+            (0.0, height + 0.7 * radius + 0.004),
+        ],
+        0.004,
+        2,
+    )
+    post = shapes.lathe(
+        [("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])],
+        20,
+    )
     foot = shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2)
     foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1)
     heights = (height - 0.5 * radius, height + 0.5 * radius)
-    clamps = [patch for z in heights for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)]
+    clamps = [
+        patch
+        for z in heights
+        for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)
+    ]
     grey = draw.colour("9a9da0", "7d8083", wild=0.0)
-    paints = {"face": _face(red, radius), "metal": solid("a4a7aa"), "post": solid(grey), "rubber": solid("1d1d1f")}
-    turned = shapes.placed([*plate, *post, *foot, *clamps], shapes.rotation("z", draw(0.0, -25.0, 25.0)))
-    return Instance(turned, paints, FINISHES["face"], {"metal": 0.25, "post": 0.18, "rubber": 0.3}, FINISHES)
+    paints = {
+        "face": _face(red, radius),
+        "metal": solid("a4a7aa"),
+        "post": solid(grey),
+        "rubber": solid("1d1d1f"),
+    }
+    turned = shapes.placed(
+        [*plate, *post, *foot, *clamps], shapes.rotation("z", draw(0.0, -25.0, 25.0))
+    )
+    return Instance(
+        turned,
+        paints,
+        FINISHES["face"],
+        {"metal": 0.25, "post": 0.18, "rubber": 0.3},
+        FINISHES,
+    )

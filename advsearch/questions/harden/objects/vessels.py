@@ -1,4 +1,6 @@
-"""Open containers turned about an axis: mug, bowl, bottle, vase, wine glass. Units are centimetres."""
+"""Open containers turned about an axis: mug, bowl, bottle, vase, wine glass. Units are
+centimetres.
+"""
 
 from __future__ import annotations
 
@@ -31,19 +33,41 @@ from advsearch.questions.harden.objects.textures import (
     zigzag,
 )
 
-BACK = shapes.rotation("z", 220.0)  # turns the seam of a lathe away from the default camera, at azimuth 40
+# turns the seam of a lathe away from the default camera, at azimuth 40
+BACK = shapes.rotation("z", 220.0)
 
 
-def handle(draw: Draw, style: str, low: float, high: float, reach: float, profile: Array, inset: float) -> list[Patch]:
-    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that reaches so far out between the
-    heights of its roots, inset in the wall: "round", "ear" (widest at the top), "square" or "loop" (small)."""
+def handle(
+    draw: Draw,
+    style: str,
+    low: float,
+    high: float,
+    reach: float,
+    profile: Array,
+    inset: float,
+) -> list[Patch]:
+    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that
+    reaches so far out between the heights of its roots, inset in the wall: "round",
+    "ear" (widest at the top), "square" or "loop" (small).
+    """
     at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
-        corners = [(at_high, high), (edge + reach, high), (edge + reach, low), (at_low, low)]
-        curve = shapes.spline(shapes.dense(shapes.rounded(corners, 0.45 * reach, 6), 0.8), 26)
+        corners = [
+            (at_high, high),
+            (edge + reach, high),
+            (edge + reach, low),
+            (at_low, low),
+        ]
+        curve = shapes.spline(
+            shapes.dense(shapes.rounded(corners, 0.45 * reach, 6), 0.8), 26
+        )
     else:
-        tops = {"round": (0.82, 0.98, 0.82), "ear": (0.98, 0.9, 0.5), "loop": (0.85, 1.0, 0.85)}[style]
+        tops = {
+            "round": (0.82, 0.98, 0.82),
+            "ear": (0.98, 0.9, 0.5),
+            "loop": (0.85, 1.0, 0.85),
+        }[style]
         span = high - low
         knots = [
             (at_high, high), (edge + 0.45 * reach, high + 0.04 * span), (edge + tops[0] * reach, high - 0.16 * span),
@@ -51,7 +75,8 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
             (edge + 0.3 * reach, low + 0.03 * span), (at_low, low),
         ]  # fmt: skip
         curve = shapes.spline(knots, 26)
-    thick, broad = draw(0.42, 0.32, 0.6), draw(0.62, 0.4, 0.95)
+    thick = draw(0.42, 0.32, 0.6)
+    broad = draw(0.62, 0.4, 0.95)
     flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
     section = shapes.ellipse(thick, broad, 16)
     if not draw.chance(0.7, True):
@@ -61,63 +86,115 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
 
 def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
     """Decorations a potter or a printer might put around a vessel of that height."""
-    kind = draw.pick("band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings")
+    kind = draw.pick(
+        "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
+    )
     second = draw.colour("2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6")
     pale = "f4efe4"
     if kind == "band":
-        return over(glaze, between(draw(0.36, 0.1, 0.5) * height, draw(0.72, 0.55, 0.9) * height, soft=0.12), accent)
+        return over(
+            glaze,
+            between(
+                draw(0.36, 0.1, 0.5) * height, draw(0.72, 0.55, 0.9) * height, soft=0.12
+            ),
+            accent,
+        )
     if kind == "bands":
-        return over(glaze, between(0.62 * height, 0.9 * height), rings(hexed(pale), second, 0.13 * height))
+        return over(
+            glaze,
+            between(0.62 * height, 0.9 * height),
+            rings(hexed(pale), second, 0.13 * height),
+        )
     if kind == "dots":
         return dots(glaze, second, draw(2.0, 1.2, 3.2), draw(0.3, 0.2, 0.4))
     if kind == "stripes":
         ground = draw.colour(pale, "f4f4f2")
-        return stripes(ground, second, draw(1.8, 1.0, 4.0), draw(0.5, 0.25, 0.6), int(draw.pick(0, 2)))
+        return stripes(
+            ground,
+            second,
+            draw(1.8, 1.0, 4.0),
+            draw(0.5, 0.25, 0.6),
+            int(draw.pick(0, 2)),
+        )
     if kind == "checks":
         board = checks(draw.colour(pale), second, draw(1.4, 0.9, 2.2))
         return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
-        return over(glaze, between(0.3 * height, 0.7 * height), zigzag(draw.colour(pale), second, 2.5))
+        return over(
+            glaze,
+            between(0.3 * height, 0.7 * height),
+            zigzag(draw.colour(pale), second, 2.5),
+        )
     if kind == "dip":
-        return over(glaze, between(draw(0.5, 0.3, 0.7) * height, 2 * height, soft=0.1), accent)
+        return over(
+            glaze, between(draw(0.5, 0.3, 0.7) * height, 2 * height, soft=0.1), accent
+        )
     if kind == "rings":
-        return rings(draw.colour(pale), second, height * draw(0.12, 0.06, 0.25), draw(0.5, 0.2, 0.7))
+        return rings(
+            draw.colour(pale),
+            second,
+            height * draw(0.12, 0.06, 0.25),
+            draw(0.5, 0.2, 0.7),
+        )
     return glaze
 
 
 @family(metres=0.01)
 def mug(draw: Draw) -> Instance:
-    height, top = draw(9.4, 7.6, 12.0), draw(4.15, 3.6, 5.0)
+    height = draw(9.4, 7.6, 12.0)
+    top = draw(4.15, 3.6, 5.0)
     foot = top * draw(0.93, 0.72, 1.02)
     belly = draw(0.0, -0.06, 0.13) * top
-    wall, low = draw(0.36, 0.28, 0.5), draw(0.7, 0.3, 1.2)
-    corners = [(foot - low, 0.0), (foot, low), (0.5 * (foot + top) + belly, 0.5 * height), (top, height)]
+    wall = draw(0.36, 0.28, 0.5)
+    low = draw(0.7, 0.3, 1.2)
+    corners = [
+        (foot - low, 0.0),
+        (foot, low),
+        (0.5 * (foot + top) + belly, 0.5 * height),
+        (top, height),
+    ]
     side = shapes.spline(np.array(corners[1:]), 14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
     body = shapes.vessel(outside, wall, draw(0.6, 0.5, 0.9))
 
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
-    grip_low = height * (draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3))
-    grip = handle(draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall)
+    grip_low = height * (
+        draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3)
+    )
+    grip = handle(
+        draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall
+    )
 
     offset = draw.offset()
-    clay = draw.colour("e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0")
+    clay = draw.colour(
+        "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
+    )
     specks = draw.colour("7d6247", wild=0.2)
-    glaze = speckled(clouded(clay, 0.93, 3.0, offset), specks, 0.28, offset, draw(0.06, 0.0, 0.14))
+    glaze = speckled(
+        clouded(clay, 0.93, 3.0, offset), specks, 0.28, offset, draw(0.06, 0.0, 0.14)
+    )
     deep = draw.colour("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, 1.35, 2.2, offset)
     outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
     inner = outer
     if not draw.chance(0.15):
-        inner = solid(draw.colour("efe6d4", "f3f1ec", wild=0.3)) if draw.chance(0.5, True) else glaze
+        inner = (
+            solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
+            if draw.chance(0.5, True)
+            else glaze
+        )
     raw = solid("a98663")
     paints = {
         "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw) if draw.chance(0.4, True) else outer,
         "inside": inner, "base": raw, "handle": draw.pick(glaze, outer, accent),
     }  # fmt: skip
-    patches = shapes.placed([*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK)
-    return Instance(patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6})
+    patches = shapes.placed(
+        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
+    )
+    return Instance(
+        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
+    )
 
 
 @family(metres=0.01)
@@ -133,7 +210,10 @@ def bowl(draw: Draw) -> Instance:
         (radius * full, 0.55 * height), (radius * (0.5 + 0.5 * full), 0.8 * height), (radius + flare, height),
     ]  # fmt: skip
     body = shapes.vessel(
-        np.array([(foot, 0.0), *shapes.spline(knots, 22)]), draw(0.45, 0.32, 0.65), ring + 0.55, step=0.9
+        np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
+        draw(0.45, 0.32, 0.65),
+        ring + 0.55,
+        step=0.9,
     )
     offset = draw.offset()
     clay = draw.colour("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
@@ -145,14 +225,23 @@ def bowl(draw: Draw) -> Instance:
         outer = over(rim, between(-1.0, 0.55, soft=0.1), raw)
     else:
         outer = natural(draw, 2 * radius, _ceramic(draw, height, glaze, accent))
-    inner = draw.pick(accent, glaze, outer, solid(draw.colour("f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
+    inner = draw.pick(
+        accent,
+        glaze,
+        outer,
+        solid(draw.colour("f3f1ec")),
+        rings(clay, shade(clay, 1.3), height * 0.2),
+    )
     paints = {"outside": outer, "inside": inner, "base": raw}
-    return Instance(shapes.placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6})
+    return Instance(
+        shapes.placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6}
+    )
 
 
 @family(metres=0.01)
 def bottle(draw: Draw) -> Instance:
-    height, radius = draw(30.0, 24.0, 32.0), draw(3.75, 3.0, 4.8)
+    height = draw(30.0, 24.0, 32.0)
+    radius = draw(3.75, 3.0, 4.8)
     neck = draw(1.35, 1.0, 1.7)
     shoulder = height * draw(0.62, 0.45, 0.68)
     rise = height * draw(0.15, 0.08, 0.22)
@@ -165,54 +254,100 @@ def bottle(draw: Draw) -> Instance:
     ]  # fmt: skip
     curve = shapes.rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
     wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
-    ring = [(wide, height - 1.5), (wide, height - 0.6), (neck * 0.97, height - 0.5), (neck * 0.93, height)]
+    ring = [
+        (wide, height - 1.5),
+        (wide, height - 0.6),
+        (neck * 0.97, height - 0.5),
+        (neck * 0.93, height),
+    ]
     capped = draw.chance(0.4)
     outside = np.concatenate([shapes.dense(curve, 1.6), ring])
     patches = shapes.vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
     if capped:
         patches += _cap(draw, wide + 0.12, height)
     offset = draw.offset()
-    glass = draw.colour("17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416")
+    glass = draw.colour(
+        "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
+    )
     surface = natural(draw, height, clouded(glass, 1.25, 9.0, offset), 0.25)
     paper = draw.colour("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
     ink = draw.colour("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
-    low, high = 0.14 * height, min(draw(0.44, 0.3, 0.5) * height, shoulder - 1.5)
-    outer = surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
+    low = 0.14 * height
+    high = min(draw(0.44, 0.3, 0.5) * height, shoulder - 1.5)
+    outer = (
+        surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
+    )
     foil = draw.colour("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if draw.chance(0.5, True):
-        outer = over(outer, between(height * 0.8, 2 * height), speckled(solid(foil), shade(foil, 1.3), 0.5, offset))
+        outer = over(
+            outer,
+            between(height * 0.8, 2 * height),
+            speckled(solid(foil), shade(foil, 1.3), 0.5, offset),
+        )
     paints = {
         "outside": outer, "inside": solid(shade(glass, 0.6)), "base": solid(glass),
         "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }  # fmt: skip
-    return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
-
-
-def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
-    low, top = height - draw(1.5, 0.9, 2.2), height + 0.35
-    under = np.array([[0.6 * radius, low], [radius, low]])
-    side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
-    return shapes.lathe(
-        [("cap", under), ("cap", shapes.dense(side, 0.8)), ("cap", [[0.6 * radius, top], [0.0, top]])], 40
+    return Instance(
+        shapes.placed(patches, BACK),
+        paints,
+        finish(draw, 0.2, 0.6),
+        {"inside": 0.25, "base": 0.5},
     )
 
 
-def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float) -> Paint:
-    """A paper label opposite the texture's seam, with a frame, a title bar, lines of text and a round seal."""
-    at, half = 180.0, draw(95.0, 60.0, 180.0)
+def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
+    low = height - draw(1.5, 0.9, 2.2)
+    top = height + 0.35
+    under = np.array([[0.6 * radius, low], [radius, low]])
+    side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
+    return shapes.lathe(
+        [
+            ("cap", under),
+            ("cap", shapes.dense(side, 0.8)),
+            ("cap", [[0.6 * radius, top], [0.0, top]]),
+        ],
+        40,
+    )
+
+
+def _labelled(
+    draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float
+) -> Paint:
+    """A paper label opposite the texture's seam, with a frame, a title bar, lines of
+    text and a round seal.
+    """
+    at = 180.0
+    half = draw(95.0, 60.0, 180.0)
     span = high - low
     label = over(surface, facing(at, half, low, high, 0.08), solid(paper))
-    label = over(label, facing(at, half - 6.0, high - 0.12 * span, high - 0.07 * span, 0.05), solid(ink))
-    label = over(label, facing(at, half - 6.0, low + 0.06 * span, low + 0.1 * span, 0.05), solid(ink))
-    title = facing(at, 0.42 * min(half, 95.0), low + 0.6 * span, low + 0.76 * span, 0.05)
+    label = over(
+        label,
+        facing(at, half - 6.0, high - 0.12 * span, high - 0.07 * span, 0.05),
+        solid(ink),
+    )
+    label = over(
+        label,
+        facing(at, half - 6.0, low + 0.06 * span, low + 0.1 * span, 0.05),
+        solid(ink),
+    )
+    title = facing(
+        at, 0.42 * min(half, 95.0), low + 0.6 * span, low + 0.76 * span, 0.05
+    )
     label = over(label, title, solid(shade(ink, 0.8)))
     for i, share in enumerate((0.5, 0.36, 0.44)):
         z = low + (0.5 - 0.1 * i) * span
-        label = over(label, facing(at, share * min(half, 95.0), z, z + 0.035 * span, 0.05), solid(ink))
+        label = over(
+            label,
+            facing(at, share * min(half, 95.0), z, z + 0.035 * span, 0.05),
+            solid(ink),
+        )
 
     def seal(texels: Texels) -> Array:
         xyz = texels.xyz
-        angle = np.radians((np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - at + 180.0) % 360.0 - 180.0)
+        angle = np.radians(
+            (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - at + 180.0) % 360.0 - 180.0
+        )
         radius = float(np.hypot(xyz[:, 0], xyz[:, 1]).max())
         away = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
         return step(0.09 * span - away, 0.0, 0.08)
@@ -224,8 +359,10 @@ def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, 
 def vase(draw: Draw) -> Instance:
     height = 24.0
     foot = draw(3.6, 2.6, 4.4)
-    belly, belly_at = draw(7.2, 5.2, 8.6), height * draw(0.52, 0.3, 0.68)
-    neck, neck_at = draw(2.6, 2.2, 3.8), height * draw(0.84, 0.78, 0.88)
+    belly = draw(7.2, 5.2, 8.6)
+    belly_at = height * draw(0.52, 0.3, 0.68)
+    neck = draw(2.6, 2.2, 3.8)
+    neck_at = height * draw(0.84, 0.78, 0.88)
     lip = neck + draw(1.5, 0.5, 2.6)
     knots = [
         (foot, 0.0), (foot * 0.97, 0.5), (0.45 * foot + 0.55 * belly, 0.48 * belly_at), (belly, belly_at),
@@ -234,35 +371,63 @@ def vase(draw: Draw) -> Instance:
     profile = shapes.spline(knots, 34)
     patches = shapes.vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
     if draw.chance(0.25):
-        low, high = belly_at + 0.15 * (neck_at - belly_at), neck_at - 0.2
+        low = belly_at + 0.15 * (neck_at - belly_at)
+        high = neck_at - 0.2
         ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
-        patches += [*shapes.placed(ear, shapes.rotation("z", 130.0)), *shapes.placed(ear, shapes.rotation("z", -50.0))]
+        patches += [
+            *shapes.placed(ear, shapes.rotation("z", 130.0)),
+            *shapes.placed(ear, shapes.rotation("z", -50.0)),
+        ]
     offset = draw.offset()
     clay = draw.colour("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
     glaze = clouded(clay, 0.95, 4.0, offset)
     outer = natural(draw, height, _vase_paint(draw, glaze, height, offset))
-    paints = {"outside": outer, "inside": solid(shade(clay, 0.8)), "base": solid("b79b7c"), "handle": glaze}
-    return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.25, 0.6), {"inside": 0.35, "base": 0.5})
+    paints = {
+        "outside": outer,
+        "inside": solid(shade(clay, 0.8)),
+        "base": solid("b79b7c"),
+        "handle": glaze,
+    }
+    return Instance(
+        shapes.placed(patches, BACK),
+        paints,
+        finish(draw, 0.25, 0.6),
+        {"inside": 0.35, "base": 0.5},
+    )
 
 
 def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint:
-    """Blue brushwork on white for the canonical vase; glazes, bands and drips for the others."""
+    """Blue brushwork on white for the canonical vase; glazes, bands and drips for the
+    others.
+    """
     ink = draw.colour("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
         return _ceramic(draw, height, glaze, clouded(ink, 1.3, 3.0, offset))
 
     def scroll(texels: Texels) -> Array:
-        angle, z = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0]), texels.xyz[:, 2] / height
+        angle = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])
+        z = texels.xyz[:, 2] / height
         curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
         petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
-        return step(petal, 0.55, 0.16) * between(0.24 * height, 0.74 * height, soft=0.1)(texels)
+        return step(petal, 0.55, 0.16) * between(
+            0.24 * height, 0.74 * height, soft=0.1
+        )(texels)
 
     def frieze(texels: Texels) -> Array:
-        teeth = step(np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, 0.5)
+        teeth = step(
+            np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, 0.5
+        )
         return between(0.09 * height, 0.17 * height, soft=0.1)(texels) * teeth
 
     paint = over(glaze, scroll, solid(ink))
-    for low, high in ((0.05, 0.08), (0.18, 0.2), (0.215, 0.225), (0.76, 0.77), (0.785, 0.805), (0.96, 2.0)):
+    for low, high in (
+        (0.05, 0.08),
+        (0.18, 0.2),
+        (0.215, 0.225),
+        (0.76, 0.77),
+        (0.785, 0.805),
+        (0.96, 2.0),
+    ):
         paint = over(paint, between(low * height, high * height, soft=0.12), solid(ink))
     return over(paint, frieze, solid(ink))
 
@@ -270,21 +435,35 @@ def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint
 @family(metres=0.01)
 def wine_glass(draw: Draw) -> Instance:
     foot = draw(3.5, 2.9, 4.2)
-    stem, stem_top = draw(0.42, 0.32, 0.6), draw(9.5, 6.0, 12.0)
-    bowl, deep = draw(4.1, 3.2, 5.0), draw(9.8, 6.5, 11.5)
+    stem = draw(0.42, 0.32, 0.6)
+    stem_top = draw(9.5, 6.0, 12.0)
+    bowl = draw(4.1, 3.2, 5.0)
+    deep = draw(9.8, 6.5, 11.5)
     mouth = bowl * draw(0.8, 0.7, 1.12)
-    wide_at, wall = draw(0.42, 0.3, 0.55), draw(0.24, 0.2, 0.3)
+    wide_at = draw(0.42, 0.3, 0.55)
+    wall = draw(0.24, 0.2, 0.3)
     under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
-    rising = [(foot, 0.28), (0.55 * foot, 0.6), (0.22 * foot, 1.25), (stem * 1.15, 2.4), (stem, 0.6 * stem_top)]
+    rising = [
+        (foot, 0.28),
+        (0.55 * foot, 0.6),
+        (0.22 * foot, 1.25),
+        (stem * 1.15, 2.4),
+        (stem, 0.6 * stem_top),
+    ]
     knob = draw.chance(0.25)
-    neck = [(stem * (2.2 if knob else 1.0), 0.78 * stem_top), (stem * 1.1, 0.92 * stem_top)]
+    neck = [
+        (stem * (2.2 if knob else 1.0), 0.78 * stem_top),
+        (stem * 1.1, 0.92 * stem_top),
+    ]
     cup = [
         (0.5 * bowl, stem_top + 0.07 * deep), (0.86 * bowl, stem_top + 0.2 * deep), (bowl, stem_top + wide_at * deep),
         (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep), (mouth, stem_top + deep),
     ]  # fmt: skip
     outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
     normal = np.gradient(outer, axis=0)
-    normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(
+        normal, axis=1, keepdims=True
+    )
     inner = (outer - wall * normal)[::-1]
     inner = inner[inner[:, 1] > stem_top + 0.11 * deep]
     angle = np.pi * np.arange(1, 4) / 4
@@ -300,7 +479,9 @@ def wine_glass(draw: Draw) -> Instance:
     ]  # fmt: skip
     body = shapes.lathe(profile, 52)
     height = stem_top + deep
-    tint = draw.colour("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)
+    tint = draw.colour(
+        "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
+    )
     drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
     level = stem_top + deep * draw(0.48, 0.3, 0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
@@ -311,7 +492,15 @@ def wine_glass(draw: Draw) -> Instance:
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
     outside = natural(draw, height, outside, 0.3)
     if draw.chance(0.2, True):
-        outside = over(outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b"))
-    foot_paint = draw.pick(plain, outside, plain) if draw.chance(0.7, True) else anything(draw, height)
+        outside = over(
+            outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
+        )
+    foot_paint = (
+        draw.pick(plain, outside, plain)
+        if draw.chance(0.7, True)
+        else anything(draw, height)
+    )
     paints = {"foot": foot_paint, "bowl": outside, "inside": inside}
-    return Instance(shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12))
+    return Instance(
+        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
+    )
