@@ -19,7 +19,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
+.PHONY: help setup attack test test-all test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,12 +33,12 @@ $(STAMP): constraints.txt setup.cfg pyproject.toml tools/setup.sh
 attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS="--epsilon 0.05"
 	@$(BIN)/advsearch attack --object mug --control texture $(ARGS)
 
-test: $(STAMP) ## run the tests; ARGS="-k name" picks some
+test: $(STAMP) ## run the quick tests and the smallest whole commands, in four minutes; ARGS="-k name" picks some
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not docs and not medium" $(ARGS)
+
+test-all: $(STAMP) ## run all tests but the slow ones
 	@bash tools/browser.sh
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
-
-test-quick: $(STAMP) ## run the quick tests of every room
-	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not docs and not medium" $(ARGS)
 
 test-slow: $(STAMP) ## run the tests that take minutes; ARGS="--one-in 10" runs a tenth, others every day
 	@$(BIN)/python -m pytest -m slow $(ARGS)
@@ -49,7 +49,7 @@ test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' n
 fuzz: $(STAMP) ## load 400 hostile files and run folders, each in bounds of time and memory; ARGS="--seed 1" makes others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
 
-check: lint typecheck test docs ## everything that has to pass before a commit
+check: lint typecheck test-all docs ## everything that has to pass before a commit
 
 lint: $(STAMP) ## look for mistakes, for code that is not formatted for pages that are not true of the code and for bundled files that the scripts in scenes/ do not make
 	@$(BIN)/ruff check $(SOURCES)

@@ -2,7 +2,8 @@
 objectives without noise.
 
     python benchmarks/closed_form.py [--policy cmaes nes] [--objective "linear, l2"]
-    [--seeds 10] python benchmarks/closed_form.py --write
+        [--seeds 10]
+    python benchmarks/closed_form.py --write
 
 Measures by trying ever larger budgets (10, 20, 50, ... 20,000 renders) until the search
 of every seed reaches the optimum, and prints a row for each policy and objective as
@@ -262,7 +263,7 @@ def with_table(page: str) -> str:
 
 
 # ---- the objectives
-# -------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

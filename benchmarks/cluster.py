@@ -2,7 +2,7 @@
 thousands that are simulated.
 
     python benchmarks/cluster.py [--turns 3] [--pictures 512] [--rows 100000] [--figure
-    FILE.png] [--only KIND]
+        FILE.png] [--only KIND]
 
 Kinds: real, searches, simulated.
 
@@ -45,20 +45,20 @@ threads.configure()
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from simulated_cluster import Simulated, SimulatedWorkers  # noqa: E402
-from sweep import ConstantRenderer, resident  # noqa: E402
+from simulated_cluster import Simulated, SimulatedWorkers
+from sweep import ConstantRenderer, resident
 
-from advsearch.attacks import Evaluation  # noqa: E402
-from advsearch.engine.journal import Sent  # noqa: E402
-from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.sweep import job as swept_scene  # noqa: E402
-from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
-from advsearch.questions.sweep.job import KIND  # noqa: E402
-from advsearch.questions.sweep.loop import Sweep  # noqa: E402
-from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
-from advsearch.runs.directory import RunDirectory  # noqa: E402
-from advsearch.runs.store import NAME, Store  # noqa: E402
-from advsearch.tasks import Judgement, Prediction  # noqa: E402
+from advsearch.attacks import Evaluation
+from advsearch.engine.journal import Sent
+from advsearch.progress import NullProgress
+from advsearch.questions.sweep import job as swept_scene
+from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import NAME, Store
+from advsearch.tasks import Judgement, Prediction
 
 SECONDS = 0.5
 LAG = 0.005
@@ -94,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 # ---- real workers
-# ---------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def real(turns: int, pictures: int) -> list[bool]:
@@ -195,7 +195,7 @@ def _listed(ratios: Sequence[float]) -> str:
 
 
 # ---- simulated ones
-# -------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 class Timed(Simulated):

@@ -166,7 +166,7 @@ def pairs(runs: int) -> int:
                 other: float, rng: Random = rng, units: npt.NDArray[np.int64] = units
             ) -> bool:
                 one = answer(rng, len(units) // FRAMES, 0.8)  # noqa: B023
-                two = answer(rng, len(units) // FRAMES, other)
+                two = answer(rng, len(units) // FRAMES, other)  # noqa: B023
                 return paired_by_unit(one.ravel(), two.ravel(), units)[2] <= 0.05
 
             errors = sum(told(0.8) for _ in range(runs))
@@ -213,8 +213,10 @@ def rules(runs: int) -> int:
                 def told(less: float, rng: Random = rng, drives: int = drives) -> bool:
                     here = under(rng, drives)  # noqa: B023
                     right = np.where(
-                        here, answer(rng, drives, 0.8 - less), answer(rng, drives, 0.8)
-                    )  # noqa: B023
+                        here,
+                        answer(rng, drives, 0.8 - less),
+                        answer(rng, drives, 0.8),  # noqa: B023
+                    )
                     right = right if less else answer(rng, drives, 0.8)  # noqa: B023
                     counts = (right & here, here, right & ~here, ~here)
                     return fewer_by_chance(*(one.sum(axis=1) for one in counts)) <= 0.01

@@ -2,8 +2,8 @@
 rendering each step.
 
     python benchmarks/equal_seconds.py [--object mug] [--environment studio] [--model
-                                       reference] [--label mug] [--epsilon 0.1]
-                                       [--seconds 8] [--seeds 10]
+        reference] [--label mug]
+                                       [--epsilon 0.1] [--seconds 8] [--seeds 10]
 
 Each seed searches twice, turn by turn in one process: with a matrix, whose making and
 comparisons count, and with rendered pictures and the adjoint. Both use the default
@@ -28,14 +28,14 @@ from advsearch import seeds, threads
 
 threads.configure()
 
-from advsearch.attacks import Query, get_objective, make_policy, search  # noqa: E402
-from advsearch.controls import make_space  # noqa: E402
-from advsearch.controls.texture import TextureControl  # noqa: E402
-from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
-from advsearch.engine.problem import Problem  # noqa: E402
-from advsearch.engine.transport import Transport  # noqa: E402
-from advsearch.models import load_model  # noqa: E402
-from advsearch.tasks import Classification, Facts  # noqa: E402
+from advsearch.attacks import Query, get_objective, make_policy, search
+from advsearch.controls import make_space
+from advsearch.controls.texture import TextureControl
+from advsearch.engine.loading import load_scene, make_renderer
+from advsearch.engine.problem import Problem
+from advsearch.engine.transport import Transport
+from advsearch.models import load_model
+from advsearch.tasks import Classification, Facts
 
 SPP = 8
 TIMED = 3

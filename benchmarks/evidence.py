@@ -1,9 +1,10 @@
 """Seven runs as of one day's work on a model, their evidence, and every figure of it
 read against the rows.
 
-    python benchmarks/evidence.py --out card                                     # bundled mug and model, two minutes
-    python benchmarks/evidence.py --out card --model detector.pt2 --labels coco90
-    --label car --resolution 160
+    python benchmarks/evidence.py --out card                                     # bundled
+        mug and model, two minutes
+    python benchmarks/evidence.py --out card --model detector.pt2 --labels coco90 --label
+        car --resolution 160
 
 With the bundled model a mug in four rooms, with a detector a car in the avenue by day,
 in the rain, at dusk and at night: a sweep over these and over distances, its rules, a
@@ -156,7 +157,7 @@ def make(args: argparse.Namespace) -> None:
 
 
 # ---- what the rows say
-# ----------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def exact(right: int, of: int, sure: float = 0.95) -> Interval:
@@ -581,7 +582,7 @@ READERS: dict[str, Callable[[Path, dict[str, Any]], Counted]] = {
 
 
 # ---- line by line
-# ---------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def sections(text: str) -> Iterator[tuple[str, list[str]]]:

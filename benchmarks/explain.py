@@ -1,8 +1,8 @@
 """Whether `explain` tells planted failures, and nothing where there is none; and
 whether its intervals hold.
 
-    python benchmarks/explain.py [--seeds 10] [--rows 10000] [--noise 0.05] [--samples
-    300] [--studies 300]
+    python benchmarks/explain.py [--seeds 10] [--rows 10000] [--noise 0.05] [--samples 300]
+        [--studies 300]
 
 Each law makes a model wrong; a share of the predictions is turned round. A law counts
 as told where the rules name its parameters, no other one, and its bounds to a twentieth

@@ -1,8 +1,8 @@
 """How far away a detector first sees a car, from a dashcam that follows it: by day, in
 the wet, at dusk, by night.
 
-    python benchmarks/first_seen.py detector.pt2 [--labels coco90] [--label car]
-    [--draws 8] [--distances 10,16,22]
+    python benchmarks/first_seen.py detector.pt2 [--labels coco90] [--label car] [--draws 8]
+        [--distances 10,16,22]
 
 A sweep over the distance for each light. What differs between the draws is where in the
 lane the camera is, how high and how level it is, how much it sees and where in the

@@ -45,13 +45,13 @@ from advsearch.engine.gradients import (
     interior_point,
     restrict_plan,
     smooth_loss,
-)  # noqa: E402
-from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
-from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
-from advsearch.scene.formation import EVERYTHING  # noqa: E402
-from advsearch.scene.gradients import Group  # noqa: E402
-from advsearch.scene.renderer import Renderer  # noqa: E402
+)
+from advsearch.engine.loading import load_scene
+from advsearch.questions.attack.carry_out import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.scene.formation import EVERYTHING
+from advsearch.scene.gradients import Group
+from advsearch.scene.renderer import Renderer
 
 POSE = {
     "pose": {

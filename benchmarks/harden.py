@@ -21,11 +21,11 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.progress import watched  # noqa: E402
-from advsearch.questions.harden import harden  # noqa: E402
-from advsearch.questions.harden.result import HardenConfig, HardenResult, Share, shown  # noqa: E402
-from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
-from advsearch.settings import parse_assignment  # noqa: E402
+from advsearch.progress import watched
+from advsearch.questions.harden import harden
+from advsearch.questions.harden.result import HardenConfig, HardenResult, Share, shown
+from advsearch.runs.directory import CONFIG, is_run
+from advsearch.settings import parse_assignment
 
 SETTINGS: dict[str, object] = {
     "controls": "texture,pose,light",

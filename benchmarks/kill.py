@@ -2,7 +2,8 @@
 rows with those of a whole run.
 
     python benchmarks/kill.py [--kills 50] [--resolution 32] [--command
-        attack|verdict|sweep|views|workers| drive|drive-workers|over-path]
+        attack|verdict|sweep|views|workers|
+        drive|drive-workers|over-path]
 
 Every row must agree in every column but times. The attack has an adjoint, so it runs
 under `--deterministic`; the sweep does not. The rows of `views` are predicted by light

@@ -1,8 +1,8 @@
 """What leaving things out brings, at equal gradient error, over pairs of scene and
 control; and that verdicts agree.
 
-    python benchmarks/leaving_out.py [--size 128] [--spp 8] [--repeats 5]
-    [--configurations 200] [--json FILE]
+    python benchmarks/leaving_out.py [--size 128] [--spp 8] [--repeats 5] [--configurations
+        200] [--json FILE]
 
 The gain of a pair is (squared error x time) of a gradient with nothing left out over
 that with everything left out, so that a smaller error counts as less time. Errors are

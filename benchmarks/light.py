@@ -1,11 +1,12 @@
 """Light as the attack: gradients of a projector's pattern in five scenes, a step by its
 matrix, a stop sign at dusk.
 
-    python benchmarks/light.py gradients [--size 64] python benchmarks/light.py step
-    [--object mug] [--environment studio] [--model reference] [--label mug] python
-    benchmarks/light.py sign --model ssd.pt2 --labels ssd.labels.json [--lumens 3000]
-    [--steps 60] python benchmarks/light.py shadow --object bowl --environment sky
-    --steps 150
+    python benchmarks/light.py gradients [--size 64]
+    python benchmarks/light.py step [--object mug] [--environment studio] [--model
+        reference] [--label mug]
+    python benchmarks/light.py sign --model ssd.pt2 --labels ssd.labels.json [--lumens 3000]
+        [--steps 60]
+    python benchmarks/light.py shadow --object bowl --environment sky --steps 150
 
 - `gradients`: derivatives by the adjoint along smooth patterns beside central
   differences with other seeds and four times the samples: the cosine of both, and the
@@ -35,13 +36,13 @@ from advsearch import threads
 
 threads.configure()
 
-import transport  # noqa: E402
+import transport
 
-import advsearch  # noqa: E402
-from advsearch.controls import make_control  # noqa: E402
-from advsearch.questions.attack.result import AttackResult  # noqa: E402
-from advsearch.runs.files import to_8bit  # noqa: E402
-from advsearch.scene.renderer import Renderer  # noqa: E402
+import advsearch
+from advsearch.controls import make_control
+from advsearch.questions.attack.result import AttackResult
+from advsearch.runs.files import to_8bit
+from advsearch.scene.renderer import Renderer
 
 SCENES = (
     ("mug", "studio"),

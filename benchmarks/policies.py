@@ -2,7 +2,7 @@
 often it is not worse.
 
     python benchmarks/policies.py [--policy auto] [--renders 40] [--noise 0 0.3]
-    [--dimensions 1 3 6 12] [--seeds 6]
+        [--dimensions 1 3 6 12] [--seeds 6]
 
 Objectives stand for what is met over poses, lights and choices: a bowl, a ramp, bumps,
 waves of several lengths down to that of a pixel, a saturated margin, angles, and
@@ -107,7 +107,7 @@ def gap(
 
 
 # ---- the objectives
-# -------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def waves(

@@ -1,8 +1,9 @@
 """Whether recommended settings keep their promise on scenes that nobody tuned them on.
 
-    python benchmarks/precision.py [--error 0.1] [--seconds 120] [--resolution 128]
-    [--scene bowl/kitchen ...]
-    python benchmarks/precision.py --intervals      how often intervals of errors cover the truth; nothing is rendered
+    python benchmarks/precision.py [--error 0.1] [--seconds 120] [--resolution 128] [--scene
+        bowl/kitchen ...]
+    python benchmarks/precision.py --intervals      how often intervals of errors cover the
+        truth; nothing is rendered
 
 For each scene: the settings that `advsearch precision` recommends for the picture and
 for the gradient, then the error that they really have, measured anew with other seeds
@@ -26,21 +27,21 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.gradients import interior_point, smooth_loss  # noqa: E402
-from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
-from advsearch.questions.precision import precision  # noqa: E402
+from advsearch.engine.gradients import interior_point, smooth_loss
+from advsearch.questions.attack.carry_out import problem_from_config
+from advsearch.questions.precision import precision
 from advsearch.questions.precision.benches import (
     GradientBench,
     PictureBench,
     TimeBudget,
     list_gradient_parts,
-)  # noqa: E402
-from advsearch.questions.precision.result import PrecisionConfig, Recommended  # noqa: E402
+)
+from advsearch.questions.precision.result import PrecisionConfig, Recommended
 from advsearch.questions.precision.rule import (
     ReferenceValue,
     SampleSetting,
     summarize_samples,
-)  # noqa: E402
+)
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"

@@ -2,12 +2,15 @@
 dense sample of the space beside.
 
     python benchmarks/searches.py [--spaces pose camera light environment.rotation]
-                                  [--policies auto random ...] [--renders 60] [--seeds
-                                  10] [--dense 600] [--dense-trials 12] [--resolution
-                                  64] [--spp N] [--object FILE --environment FILE
-                                  --model FILE --labels FILE --label NAME]
-    python benchmarks/searches.py --texture [--seeds 10] python benchmarks/searches.py
-    --transport [--seeds 10] [--renders 40] [--epsilon E] [--resolution 128]
+        [--policies auto random ...]
+                                  [--renders 60] [--seeds 10] [--dense 600] [--dense-trials
+                                      12] [--resolution 64]
+                                  [--spp N]
+                                  [--object FILE --environment FILE --model FILE --labels
+                                      FILE --label NAME]
+    python benchmarks/searches.py --texture [--seeds 10]
+    python benchmarks/searches.py --transport [--seeds 10] [--renders 40] [--epsilon E]
+        [--resolution 128]
 
 The first prints, for each space and policy, the median over seeds of the verified
 margin (the mean of fresh trials at a high sample count, in logits; below 0 the model is

@@ -1,11 +1,12 @@
 """Light on surfaces: what a picture from a new viewpoint takes, and how far it is off,
 beside a rendered one.
 
-    python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats
-    5] [--sizes 128,224] python benchmarks/surface_light.py [SCENE ...] --sweep [--rows
-    1000] python benchmarks/surface_light.py [SCENE ...] --rule [--views 20] python
-    benchmarks/surface_light.py [SCENE ...] --viewpoints [--sizes 128] python
-    benchmarks/surface_light.py [SCENE ...] --region
+    python benchmarks/surface_light.py [SCENE ...] [--views 5] [--truth 1024] [--repeats 5]
+        [--sizes 128,224]
+    python benchmarks/surface_light.py [SCENE ...] --sweep [--rows 1000]
+    python benchmarks/surface_light.py [SCENE ...] --rule [--views 20]
+    python benchmarks/surface_light.py [SCENE ...] --viewpoints [--sizes 128]
+    python benchmarks/surface_light.py [SCENE ...] --region
 
 A SCENE is OBJECT@ENVIRONMENT, each a bundled name or a file; the default is the bundled
 mug, bottle and bowl. The model is the reference model, for scenes whose object has a
@@ -66,20 +67,20 @@ from advsearch.engine.acceptance import (
     Deviation,
     compared,
     view_of,
-)  # noqa: E402
-from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.models import Model, load_model  # noqa: E402
-from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.attack.run import attack_once  # noqa: E402
-from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
-from advsearch.questions.recipe.description import planned, read_recipe  # noqa: E402
-from advsearch.questions.recipe.result import RecipeConfig  # noqa: E402
-from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
-from advsearch.questions.sweep.loop import Sweep  # noqa: E402
-from advsearch.questions.sweep.result import SweepResult  # noqa: E402
-from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
-from advsearch.scene.renderer import Renderer  # noqa: E402
-from advsearch.scene.surface.renderer import SurfaceRenderer, why_not  # noqa: E402
+)
+from advsearch.engine.loading import load_scene
+from advsearch.models import Model, load_model
+from advsearch.progress import NullProgress
+from advsearch.questions.attack.run import attack_once
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.recipe.description import planned, read_recipe
+from advsearch.questions.recipe.result import RecipeConfig
+from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.result import SweepResult
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
 
 SCENES = ("mug@studio", "bottle@studio", "bowl@kitchen")
 SPP = 8

@@ -31,21 +31,21 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.controls import Space  # noqa: E402
-from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
-from advsearch.models import load_model  # noqa: E402
-from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.sweep import job as swept_scene  # noqa: E402
-from advsearch.questions.sweep.axes import read_axes  # noqa: E402
-from advsearch.questions.sweep.job import Job, NamedScene  # noqa: E402
-from advsearch.questions.sweep.loop import Sweep  # noqa: E402
-from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
-from advsearch.runs.directory import RunDirectory  # noqa: E402
-from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
-from advsearch.scene.gradients import GradientPlan  # noqa: E402
-from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
-from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
-from advsearch.tasks import Classification  # noqa: E402
+from advsearch.controls import Space
+from advsearch.engine.loading import as_controls, framed, load_scene
+from advsearch.models import load_model
+from advsearch.progress import NullProgress
+from advsearch.questions.sweep import job as swept_scene
+from advsearch.questions.sweep.axes import read_axes
+from advsearch.questions.sweep.job import Job, NamedScene
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.scene.formation import EVERYTHING, ImageFormation
+from advsearch.scene.gradients import GradientPlan
+from advsearch.scene.mitsuba_backend.denoise import denoise
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.tasks import Classification
 
 ASKED_PER_SECOND = 10_000
 ASKED_SHARE = 0.95
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 # ---- the loop by itself
-# ---------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 class ConstantRenderer:
@@ -205,7 +205,7 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
 
 
 # ---- beside rendering
-# -----------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def against_bare(size: int, pictures: int, turns: int) -> tuple[float, float, float]:

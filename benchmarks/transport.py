@@ -1,8 +1,8 @@
 """Searching textures by a matrix of light transport: a step, what the matrix costs, and
 how far its pictures are off.
 
-    python benchmarks/transport.py [--object mug] [--environment studio] [--model
-    reference] [--label mug] [--repeats 5]
+    python benchmarks/transport.py [--object mug] [--environment studio] [--model reference]
+        [--label mug] [--repeats 5]
 
 Each figure is the median of turns that are taken one after the other in one process; of
 steps by the matrix and the
@@ -31,10 +31,10 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.models import load_model  # noqa: E402
-from advsearch.scene.renderer import Renderer  # noqa: E402
-from advsearch.scene.transport.matrix import LinearRenderer  # noqa: E402
+from advsearch.engine.loading import load_scene
+from advsearch.models import load_model
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 EPSILON = 0.1
 SPP = 8

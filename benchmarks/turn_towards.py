@@ -22,13 +22,13 @@ from advsearch import threads
 
 threads.configure(1)
 
-import torch  # noqa: E402
-from torch import Tensor, nn  # noqa: E402
+import torch
+from torch import Tensor, nn
 
-from advsearch import seeds  # noqa: E402
-from advsearch.controls import compose  # noqa: E402
-from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer  # noqa: E402
-from advsearch.scene.color import to_8_bit  # noqa: E402
+from advsearch import seeds
+from advsearch.controls import compose
+from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
+from advsearch.scene.color import to_8_bit
 
 SIDE = 32
 FOV = 35.0

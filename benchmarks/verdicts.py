@@ -1,8 +1,8 @@
 """Whether verdicts that cost less are as good: the rule of trials, the choice of the
 sample count, and close calls.
 
-    python benchmarks/verdicts.py [--runs 400] [--epsilons .01 .02 .03 .04] [--object
-    FILE] [--environment FILE] ...
+    python benchmarks/verdicts.py [--runs 400] [--epsilons .01 .02 .03 .04] [--object FILE]
+        [--environment FILE] ...
 
 *Before* is how verdicts were taken at first: samples until the margin moves by less than half of itself, and then 20
 trials of which 19 have to succeed. *Now* samples stop where more of them leave the

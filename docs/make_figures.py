@@ -137,7 +137,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 # ---- parts made from the code
-# ---------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def flags(record: Record) -> str:
@@ -503,7 +503,7 @@ def _shown(value: object) -> str:
 
 
 # ---- the reference model
-# --------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def stored_record() -> dict[str, Any]:
@@ -603,7 +603,7 @@ def _classes(labels: Sequence[str], figures: Record) -> list[list[str]]:
 
 
 # ---- recipes
-# --------------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 RECIPES = "images/recipes/results.json"
 
@@ -668,8 +668,7 @@ def reliability_diagram(heldout: Record) -> str:
     how many pictures it holds.
 
     Args:
-        heldout: a `calibration.Report` as it is stored: `bins`, `count`, `accuracy`,
-            `error`.
+        heldout: a `calibration.Report` as it is stored: `bins`, `count`, `accuracy`, `error`.
     """
     width = LEFT + SIDE + 16
     height = TOP + SIDE + GAP + COUNTS + 44

@@ -1,8 +1,8 @@
 """Carries out the recipes, and keeps what they say and their figures for
 docs/recipe-results.md.
 
-    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until
-    HH:MM] [--anew]
+    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until HH:MM]
+        [--anew]
 
 Runs are kept in the folder OUT: what is done there is not done again. On bundled
 objects they are quick ones. With
@@ -116,8 +116,8 @@ def keep(name: str, result: RecipeResult, suffix: str, cpu: float | None) -> Non
         name: of the recipe.
         result: of the run.
         suffix: ``data``, or empty for bundled objects.
-        cpu: seconds of processors; None for a run that was begun before, which keeps
-            what was told of it.
+        cpu: seconds of processors; None for a run that was begun before, which keeps what
+            was told of it.
     """
     IMAGES.mkdir(parents=True, exist_ok=True)
     kept: dict[str, dict[str, Any]] = (

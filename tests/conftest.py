@@ -1,7 +1,7 @@
-"""Shared by all tests: where the optional real data is, and which tests `make test-quick` leaves out.
+"""Shared by all tests: where the optional real data is, and how long tests take.
 
-`pytest --measure` counts the CPU seconds of each test, which other work on the machine does not change, and keeps the
-names of those that are not quick in tests/medium.txt.
+`make test` leaves out the tests marked `medium`. `pytest --measure` counts the CPU seconds of each test, which other
+work on the machine changes little, and lists the tests whose marker is wrong.
 
 `pytest -m slow --one-in 10` runs a tenth of the slow tests, another one every day.
 """
@@ -22,13 +22,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 """Meshes, environments and an ImageNet classifier that nobody on this project made; see README. May be absent."""
-MEDIUM = Path(__file__).with_name("medium.txt")
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Side by side, tests render on one thread each: a second one polls for work, which takes a third of all the time.
     # `two_threads` is for what waits forever on one.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-QUICK, QUICKEST = 0.15, 5.0
-"""CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
+QUICK = 0.15
+"""CPU seconds that a test without the marker `medium` should take at most."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,7 +36,7 @@ def own_models() -> None:
     but what it names."""
     from advsearch.trust.code import allow_code
 
-    allow_code(*(f"small_models:{name}" for name in ("easy", "hard", "near", "strange", "Colours")))
+    allow_code(*(f"small_models:{name}" for name in ("easy", "finder", "hard", "near", "strange", "Colours")))
 
 
 @pytest.fixture(scope="session")
@@ -60,68 +59,58 @@ def two_threads() -> Iterator[None]:
     threads.configure()
 
 
-def medium() -> set[str]:
-    """Return the names of the tests that are not quick, as pytest has them."""
-    return set(MEDIUM.read_text("utf-8").splitlines())
-
-
-def is_there(name: str) -> bool:
-    """Whether there is a test of that name, whatever its parameters are."""
-    file, _, function = name.partition("[")[0].partition("::")
-    return (ROOT / file).exists() and f"\ndef {function}(" in (ROOT / file).read_text("utf-8")
-
-
 def cpu_seconds() -> float:
     """Return the CPU seconds of this process and of those that it started and that have ended."""
     own, others = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
     return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
 
 
-class Measured:
-    """Sums the CPU seconds of each test and keeps the names of those that are not quick."""
+class CpuTimes:
+    """Sums the CPU seconds of each test and reports the slowest, and those whose marker does not fit."""
 
     def __init__(self) -> None:
-        self.begun = 0.0
-        self.spent: dict[str, float] = defaultdict(float)
+        self.start = 0.0
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.is_medium: dict[str, bool] = {}
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self) -> None:
-        self.begun = cpu_seconds()
+        self.start = cpu_seconds()
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    def pytest_runtest_makereport(self, item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         report = yield
         now = cpu_seconds()
-        report.user_properties.append(("cpu", now - self.begun))  # goes from a worker to the process that writes
-        self.begun = now
+        # user properties go from a worker to the process that prints
+        report.user_properties.append(("cpu", now - self.start))
+        report.user_properties.append(("medium", item.get_closest_marker("medium") is not None))
+        self.start = now
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.spent[report.nodeid] += sum(float(str(value)) for name, value in report.user_properties if name == "cpu")
+        properties = dict(report.user_properties)
+        self.seconds[report.nodeid] += float(str(properties["cpu"]))
+        self.is_medium[report.nodeid] = bool(properties["medium"])
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        quickest = dict[str, float]()
-        for name, seconds in self.spent.items():
-            file = name.partition("::")[0]
-            quickest[file] = min(seconds, quickest.get(file, QUICKEST))
-        kept = {name for name in medium() if name not in self.spent and is_there(name)}
-        bounds = {name: max(QUICK, quickest[name.partition("::")[0]]) for name in self.spent}
-        found = kept | {name for name, seconds in self.spent.items() if seconds > bounds[name]}
-        MEDIUM.write_text("".join(f"{name}\n" for name in sorted(found)), encoding="utf-8")
-        terminalreporter.write_line(f"{sum(self.spent.values()):.0f} CPU seconds in {len(self.spent)} tests")
-        for name, seconds in sorted(self.spent.items(), key=lambda pair: -pair[1])[:20]:
+        total = sum(self.seconds.values())
+        terminalreporter.write_line(f"{total:.0f} CPU seconds in {len(self.seconds)} tests")
+        for name, seconds in sorted(self.seconds.items(), key=lambda pair: -pair[1])[:20]:
             terminalreporter.write_line(f"{seconds:6.1f} {name}")
+        unmarked = [name for name, seconds in self.seconds.items() if seconds > QUICK and not self.is_medium[name]]
+        for name in sorted(unmarked, key=lambda name: -self.seconds[name]):
+            terminalreporter.write_line(f"not marked medium: {self.seconds[name]:6.2f} {name}")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--measure", action="store_true", help="count CPU seconds and renew tests/medium.txt")
+    parser.addoption("--measure", action="store_true", help="count CPU seconds, and list tests whose marker is wrong")
     parser.addoption("--one-in", type=int, default=1, help="of the slow tests run one in so many, others every day")
     parser.addoption("--day", type=date.fromisoformat, default=date.today(), help="which day's; as 2030-12-31")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--measure"):
-        config.pluginmanager.register(Measured())
+        config.pluginmanager.register(CpuTimes())
 
 
 def of_the_day(name: str, day: int, parts: int) -> bool:
@@ -131,11 +120,9 @@ def of_the_day(name: str, day: int, parts: int) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the tests that are not quick, and leave out slow ones that are not of the day."""
-    known, parts, day = medium(), config.getoption("--one-in"), config.getoption("--day").toordinal()
-    for item in items:
-        if item.nodeid in known:
-            item.add_marker("medium")
+    """Leave out slow tests that are not of the day."""
+    parts = config.getoption("--one-in")
+    day = config.getoption("--day").toordinal()
     kept = [one for one in items if not one.get_closest_marker("slow") or of_the_day(one.nodeid, day, parts)]
     config.hook.pytest_deselected(items=[*set(items).difference(kept)])
     items[:] = kept

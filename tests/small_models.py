@@ -89,6 +89,12 @@ def easy() -> Model:
     return advsearch.load_model(Blue(0.11), labels=["mug", "vase"], input_size=SIDE, name="easy")
 
 
+def finder() -> Model:
+    """A detector of the mug by its blue band."""
+    labels = ["mug", "bowl", "dog"]
+    return advsearch.load_model(Finder(), task="detection", labels=labels, input_size=SIDE, name="finder")
+
+
 def hard() -> Model:
     """Another one that takes more, with other labels and another input size."""
     return advsearch.load_model(Blue(0.07, True), labels=["dog", "vase", "mug"], input_size=24, name="hard")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from samples import sweep
 
 from advsearch.files import JsonValue
 from advsearch.options import Value
@@ -23,6 +22,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
+from samples import sweep
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
 

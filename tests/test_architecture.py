@@ -190,6 +190,7 @@ def _room_allowed(own: str, other: str, rule: Rule) -> bool:
     return rule.rooms is None or other in rule.rooms or other == "extend"  # islands are in many rooms, see test_islands
 
 
+@pytest.mark.medium
 def test_rooms_import_only_what_they_may() -> None:
     assert sorted(broken_rules()) == []
 
@@ -344,6 +345,7 @@ LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pandas", "pyarrow")
 SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "code",
     [
@@ -364,6 +366,7 @@ def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
+@pytest.mark.medium
 def test_an_attack_on_what_is_bundled_needs_little() -> None:
     """torch's compilers take two seconds, and only files of `torch.export` need them; a quarter of one goes to
     scipy.stats, which draws from nets."""
@@ -419,6 +422,7 @@ def texts_of_people(source: str) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.value
 
 
+@pytest.mark.medium
 def test_messages_name_settings_as_python_has_them_and_no_flags() -> None:
     flags = [
         f"{path.relative_to(ROOT)}:{line}: {text}"
@@ -530,6 +534,7 @@ def repository_files() -> list[Path]:
     return [ROOT / name for name in listed if name and (ROOT / name).is_file()]
 
 
+@pytest.mark.medium
 def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
     here = {re.escape(f"{ROOT}/").encode(), re.escape(f"{Path.home()}/").encode()}
     machine = re.compile(rb"(?<![\w.$}/])/(?:work|root)/|" + b"|".join(sorted(here)))
@@ -546,6 +551,7 @@ def test_the_repository_stays_small() -> None:
     assert sum(path.stat().st_size for path in repository_files()) < 60e6
 
 
+@pytest.mark.medium
 def test_imports_inside_functions_are_few_and_say_why() -> None:
     concepts = runpy.run_path(str(ROOT / "tools" / "concepts.py"))
     inner = {name: concepts["inner_imports"](path.read_text()) for name, path in concepts["modules_of"](ROOT).items()}

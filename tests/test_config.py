@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import pytest
 import yaml
-from hostile import HOSTILE, shown
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
@@ -32,6 +31,7 @@ from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, PythonOnly, Setting, all_finite, parse_assignment, read_yaml, settings
+from hostile import HOSTILE, shown
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": (
@@ -348,6 +348,7 @@ def own_settings(config: type[Config]) -> list[Setting]:
     return [one for one in settings(config) if repr(one) not in told]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=lambda config: config.command)
 def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> None:
     """Refused in one line that names the setting, or accepted and then the same in every form."""
@@ -471,6 +472,7 @@ def test_a_file_of_an_older_schema_is_refused(tmp_path: Path) -> None:
         AttackConfig.from_yaml(file)
 
 
+@pytest.mark.medium
 @examples(max_examples=60, deadline=None)
 @given(
     epsilon=st.none() | st.floats(1e-20, 1e6), exposure=st.floats(-10, 10), seed=st.integers(0, 2**63 - 1),

@@ -21,7 +21,6 @@ import torch
 import yaml
 from check_docs import DOCS, PAGES, ROOT, blocks, name_of, script
 from PIL import Image
-from samples import attack
 
 import advsearch
 import advsearch.config
@@ -59,6 +58,7 @@ from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.tasks import make_task
+from samples import attack
 
 every_page_with = {
     language: pytest.mark.parametrize("page", having, ids=[name_of(page) for page in having])
@@ -101,10 +101,10 @@ MISTAKES: list[tuple[Callable[[], Iterator[str]], str, str, str, str]] = [
     (check_docs.numbers, "docs/questions.md", "four times", "five times", "four times"),
     (check_docs.links, "README.md", "](docs/", "](dox/", "leads nowhere"),
     (check_docs.words, "docs/runs.md", "a", "colored", "colored"),
-    (check_docs.quick_tests, "tests/medium.txt", "test_", "tset_", "there is no"),
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("check", "file", "right", "wrong", "said"),
     MISTAKES,
@@ -211,6 +211,7 @@ def check_other(words: list[str]) -> None:
         assert words == [".", ".venv/bin/activate"], f"an example that no test can check: {shlex.join(words)}"
 
 
+@pytest.mark.medium
 @every_page_with["sh"]
 def test_every_command_in_an_example_is_one_that_the_tools_take(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -287,6 +288,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     assert names["result"].search.renders == planned_renders(40)
 
 
+@pytest.mark.medium
 @pytest.mark.docs
 def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
@@ -348,6 +350,7 @@ def made_up_record() -> dict[str, Any]:
     return {"schema": 1, "labels": labels, "figures": {**figures, "default_views": views}}
 
 
+@pytest.mark.medium
 def test_the_figures_of_the_reference_model_come_from_its_record() -> None:
     figures = script("make_figures")
     record = made_up_record()
@@ -360,6 +363,7 @@ def test_the_figures_of_the_reference_model_come_from_its_record() -> None:
     assert wanted[DOCS / "images" / "reliability.svg"] == figures.reliability_diagram(record["figures"]["heldout"])
 
 
+@pytest.mark.medium
 def test_without_a_record_the_page_says_so_and_nothing_is_drawn() -> None:
     figures = script("make_figures")
     assert "not been measured" in figures.reference({})

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fuzz import cases, run
-from fuzz.case import Case
 
 from advsearch.cli.main import main
+from fuzz import cases, run
+from fuzz.case import Case
 
 SEED, NUMBERS = 7, len(cases.MAKERS)
 
@@ -19,6 +19,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
+@pytest.mark.medium
 def test_hostile_files_are_loaded_or_refused(folder: Path) -> None:
     outcomes = list(run.run([(number, cases.make(SEED, number)) for number in range(NUMBERS)], folder))
     assert [outcome for outcome in outcomes if outcome.faults] == []
@@ -43,6 +44,7 @@ def test_a_case_is_the_same_files_each_time() -> None:
         assert cases.make(SEED, number) == cases.make(SEED, number)
 
 
+@pytest.mark.medium
 def test_the_fuzz_sees_what_must_not_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = {
         "nothing": "",

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import ROOT
-from simulated_cluster import Simulated, SimulatedWorkers
-from small_models import easy
 
 from advsearch.cli.output import LookingProgress
 from advsearch.interrupts import INTERRUPTS, ONE, Interrupts, interruptible, unless_interrupted
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from conftest import ROOT
+from simulated_cluster import Simulated, SimulatedWorkers
+from small_models import easy
 
 
 def strike() -> None:
@@ -126,6 +126,7 @@ def progress_stages() -> None:
     LookingProgress(NullProgress()).stage("next")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("look", [scene_pictures, model_answers, workers_results, progress_advances, progress_stages])
 def test_whatever_takes_time_looks(look: Callable[[], Any]) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -146,6 +147,7 @@ sys.exit(main.main())
 """
 
 
+@pytest.mark.medium
 def test_a_second_one_ends_native_code_at_once_and_one_that_is_passed_on_does_not() -> None:
     words, environment = [sys.executable, "-c", SECOND], {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:

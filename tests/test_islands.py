@@ -12,9 +12,9 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from test_architecture import PACKAGE, ROOT, imports, python_files
 
 from advsearch.catalog import BUILT_INS
+from test_architecture import PACKAGE, ROOT, imports, python_files
 
 CORE = {
     "experiment": {"attack", "sweep", "render"},

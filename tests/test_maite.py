@@ -49,6 +49,7 @@ def test_a_classifier_is_a_model_with_gradients() -> None:
     assert float(gradient.sum()) == pytest.approx(4.0)
 
 
+@pytest.mark.medium
 def test_a_detector_is_a_model_of_detection() -> None:
     with pytest.warns(UserWarning, match="no gradient of model boxes reaches its image"):
         model = maite.load_model(Boxes(), input_size=32, task="detection")
@@ -56,6 +57,7 @@ def test_a_detector_is_a_model_of_detection() -> None:
     assert swept.summary.model == "boxes" and all("mug" in str(row.label) for row in swept.rows())
 
 
+@pytest.mark.medium
 def test_scenes_are_a_dataset() -> None:
     scenes = maite.Scenes("mug", "camera", 2, labels=("bowl", "mug"), resolution=16, spp=2)
     (image, target, first), (other, _, second) = (scenes[place] for place in range(len(scenes)))
@@ -67,6 +69,7 @@ def test_scenes_are_a_dataset() -> None:
     assert torch.equal(again[1][0], other) and torch.equal(again[-1][0], other)
 
 
+@pytest.mark.medium
 def test_boxes_are_those_of_the_object() -> None:
     scenes = maite.Scenes("mug", "pose.yaw", 1, labels=("bowl", "mug"), task="detection", resolution=16, spp=2)
     _, target, _ = scenes[0]
@@ -84,6 +87,7 @@ def test_what_has_no_protocol_is_told() -> None:
         maite.Scenes("mug", "camera", 0, labels=("mug", "vase"))
 
 
+@pytest.mark.medium
 def test_the_package_itself_takes_them() -> None:
     tasks = pytest.importorskip("maite.tasks")
     classification = pytest.importorskip("maite.protocols.image_classification")

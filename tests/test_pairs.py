@@ -109,6 +109,7 @@ def model() -> advsearch.Model:
     return advsearch.load_model(Weighted(), labels=("mug", "vase", "bowl", "pan"), input_size=SIZE, name="weighted")
 
 
+@pytest.mark.medium
 def test_every_control_is_here_and_varies() -> None:
     assert set(FORMS) == set(CONTROLS.own), "FORMS of tests/test_pairs.py names a control that there is not"
     for kind, form in FORMS.items():
@@ -116,6 +117,7 @@ def test_every_control_is_here_and_varies() -> None:
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("pair", pairs(QUICK))
 def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], model: advsearch.Model) -> None:
     scene = advsearch.load_scene(suited(pair), things=beside(pair))
@@ -206,6 +208,7 @@ def assert_close_pictures(one: Tensor, other: Tensor) -> None:
     assert int(((one - other).abs().amax(dim=-1) > 0.5 / 255).sum()) <= 1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("pair", pairs(QUICK[:1]))
 def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) -> None:
     config = AttackConfig(
@@ -227,6 +230,7 @@ def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) ->
         assert_close_pictures(picture, searched_picture(alone, u))
 
 
+@pytest.mark.medium
 def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None:
     config = AttackConfig(
         object="mug", controls={"occlusion": {"coverage": [0.2, 0.4]}}, over={"camera": {"sizes": [1, 5]}},

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, most_samples
@@ -30,6 +29,7 @@ from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
+from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
 """Words of our own, which nobody who waits should have to know."""
@@ -183,6 +183,7 @@ FEW: dict[str, Any] = {"object": "mug", "resolution": 16, "threads": 1}
 SMALL: dict[str, Any] = {**FEW, "spp": 1}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "config",
     [
@@ -242,6 +243,7 @@ def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypat
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
+@pytest.mark.medium
 def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

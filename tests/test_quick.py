@@ -1,19 +1,16 @@
-"""Which tests are left out of `make test-quick`, and which slow ones are of the day."""
+"""Which slow tests are of the day, and how few cases cover all values."""
 
 from __future__ import annotations
 
 from itertools import product
 
 import pytest
-from conftest import medium, of_the_day
+
+from conftest import of_the_day
 from covering import covering
 
 
-def test_what_is_left_out_is_marked(request: pytest.FixtureRequest) -> None:
-    for item in request.session.items:
-        assert (item.get_closest_marker("medium") is not None) == (item.nodeid in medium())
-
-
+@pytest.mark.medium
 def test_in_as_many_days_as_there_are_parts_each_slow_test_runs_once() -> None:
     names = [f"a_test[{number}]" for number in range(200)]
     days = [{name for name in names if of_the_day(name, day, 10)} for day in range(739000, 739010)]

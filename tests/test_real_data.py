@@ -186,6 +186,7 @@ def test_a_real_detector_gives_another_name_where_the_object_is(real_data: Path,
         assert row.kind == "control" or row.label in names
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:

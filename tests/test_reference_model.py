@@ -29,6 +29,7 @@ def _coloured(count: int, size: int = 32) -> tuple[Tensor, Tensor]:
     return values.to(torch.uint8), labels
 
 
+@pytest.mark.medium
 def test_training_learns_and_repeats_bit_for_bit() -> None:
     data, labels = _coloured(64)
     plain = Augmentation(colour=0.02, brightness=0.05, contrast=0.1, cutout=0.1)

@@ -134,6 +134,7 @@ def examples() -> list[list[str]]:
     return [line.split()[1:] for line in lines if line.startswith("advsearch")]
 
 
+@pytest.mark.medium
 @pytest.mark.docs
 def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
     """Its task, too, is searched, swept and rendered; all in one process."""

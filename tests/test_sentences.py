@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
+
 from test_architecture import ROOT, python_files
 
 SENTENCES = frozenset(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import sbom
+
 from conftest import ROOT
 
 TRIED = """

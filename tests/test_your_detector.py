@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from check_docs import DOCS, blocks
-from small_models import SIDE, Finder
 
 from advsearch.cli.main import main
+from small_models import SIDE, Finder
 
 PAGE = DOCS / "your-detector.md"
 NETWORK = "torchvision:ssdlite320_mobilenet_v3_large"

@@ -8,7 +8,6 @@ such as the commands of a page, is in tests/test_docs.py.
 
 from __future__ import annotations
 
-import ast
 import importlib
 import importlib.util
 import inspect
@@ -73,7 +72,6 @@ PAGES = [
     *sorted(DOCS.rglob("*.md")),
 ]
 FOLDERS = ("advsearch", "benchmarks", "docs", "scenes", "tests", "tools")
-MEDIUM = ROOT / "tests" / "medium.txt"
 
 
 def main() -> int:
@@ -130,7 +128,7 @@ def absent(name: str, texts: Iterable[str], text: str | None = None) -> Iterator
 
 
 # ---- everything that has a name is documented
-# -----------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def commands() -> Iterator[str]:
@@ -325,7 +323,7 @@ def results() -> Iterator[str]:
 
 
 # ---- what is made from the code is up to date
-# -----------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def made() -> Iterator[str]:
@@ -508,7 +506,7 @@ def numbers() -> Iterator[str]:
 
 
 # ---- links and words
-# ------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 
 def prose(path: Path) -> str:
@@ -562,7 +560,7 @@ def words() -> Iterator[str]:
 
 
 # ---- citations
-# ------------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_registry.py"}
 """Tests of such rules, which name modules that are not there."""
@@ -642,57 +640,6 @@ def is_there(name: str) -> bool:
     return True
 
 
-# ---- tests
-# ----------------------------------------------------------------------------------------------------------
-
-WHOLE_RUNS = {"tests/test_real_data.py"}
-"""Nothing in them is quick."""
-
-
-def quick_tests() -> Iterator[str]:
-    """`make test-quick` covers every file of tests, and the list of what it leaves out
-    names tests that there are.
-    """
-    left_out = set(read(MEDIUM).splitlines())
-    functions = {
-        name_of(path): functions_of(path)
-        for path in (ROOT / "tests").rglob("test_*.py")
-    }
-    for file, known in functions.items():
-        quick = [
-            name
-            for name, slow in known.items()
-            if not slow and f"{file}::{name}" not in left_out
-        ]
-        if not quick and file not in WHOLE_RUNS:
-            yield (
-                f"{file}: expected a test that is neither slow nor in tests/medium.txt"
-            )
-    for test in left_out:
-        file, _, name = test.partition("[")[0].partition("::")
-        if name not in functions.get(file, {}):
-            yield (
-                f"tests/medium.txt: there is no {test}; make test ARGS=--measure "
-                "takes it out"
-            )
-
-
-def functions_of(path: Path) -> dict[str, bool]:
-    """Return the tests of a file by name, and whether each is slow whatever its
-    parameters are.
-    """
-    tree = ast.parse(read(path))
-    functions = [
-        node
-        for node in tree.body
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
-    ]
-    return {
-        one.name: "pytest.mark.slow" in map(ast.unparse, one.decorator_list)
-        for one in functions
-    }
-
-
 CHECKS = (
     commands,
     controls,
@@ -704,7 +651,6 @@ CHECKS = (
     links,
     words,
     citations,
-    quick_tests,
 )
 
 if __name__ == "__main__":

@@ -443,8 +443,8 @@ def found_by(
     Args:
         root: the copy.
         fault: what is planted.
-        failing: tests that fail without a fault too, and find nothing; those that are
-            met are added.
+        failing: tests that fail without a fault too, and find nothing; those that are met
+            are added.
         all_tests: run all tests where those of the fault do not find it.
     """
     for tests in (fault.tests, ("tests",)) if all_tests else (fault.tests,):

@@ -170,7 +170,7 @@ def figures(steps: list[Step]) -> tuple[int, int, int, int]:
 
 
 # ---- from the syntax trees
-# ------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Trees = dict[str, ast.Module]

@@ -33,16 +33,17 @@ class EnvironmentFamily:
 
     Attributes:
         name: usable on the command line.
-        split: "train" when models may be trained under it, "heldout" when it is kept
-            for testing; "street" for streets, which the reference model never sees;
-            "place" for those whose map is nothing by itself.
+        split: "train" when models may be trained under it, "heldout" when it is kept for
+            testing; "street" for streets,
+            which the reference model never sees; "place" for those whose map is nothing by
+                itself.
         paint: maps unit directions (N, 3), z up, to linear radiance (N, 3).
         script: the file that makes it, within this repository.
         needs_mitsuba: whether making it runs Mitsuba.
         height: rows of the map; it has twice as many columns.
         ground: the kind of ground that belongs to it; None for the usual table.
-        lux: illuminance on an open level surface, where the map stands for light of a
-            known strength.
+        lux: illuminance on an open level surface, where the map stands for light of a known
+            strength.
         map: the environment whose map it has; its own unless given.
     """
 

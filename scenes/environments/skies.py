@@ -122,10 +122,11 @@ def _bake(azimuth: float, elevation: float) -> tuple[Array, Array]:
     """Read Mitsuba's sky and sun for a sun direction in degrees.
 
     Returns:
-        (ROWS, COLUMNS, 3) sky radiance, row 0 at the horizon and the last at the
-        zenith, equally spaced in the square root of the elevation (denser near the
-        horizon), column 0 at azimuth 0; and the (3,) irradiance of the sun across its
-        beam.
+        (ROWS, COLUMNS, 3) sky radiance, row 0 at the horizon and the last at the zenith,
+            equally spaced in the square
+        root of the elevation (denser near the horizon), column 0 at azimuth 0; and the (3,)
+            irradiance of the sun
+        across its beam.
     """
     from advsearch.scene.mitsuba_backend.variant import mitsuba
 

@@ -10,8 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from covering import only
-from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
@@ -22,6 +20,8 @@ from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.listing import can_resume, listed_runs
 from advsearch.runs.store import Row, Store
+from covering import only
+from stand_ins import interrupted
 
 SIZE = 32
 LABELS = ("mug", "vase")
@@ -58,6 +58,7 @@ def level(scene: advsearch.Scene) -> float:
         return float(render(render.start, spp=64)[SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4].mean())
 
 
+@pytest.mark.medium
 def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
     summary = result.summary
@@ -76,6 +77,7 @@ def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: fl
     assert (tmp_path / "run" / "report.html").is_file()
 
 
+@pytest.mark.medium
 def test_the_result_stays_in_its_budget_and_beats_its_start(scene: advsearch.Scene, level: float) -> None:
     result = advsearch.attack(
         scene, model(level + 0.03), controls={"texture": {"epsilon": 0.05}}, baseline=False, **FAST
@@ -87,6 +89,7 @@ def test_the_result_stays_in_its_budget_and_beats_its_start(scene: advsearch.Sce
     assert result.run is None and result.summary.baseline is None
 
 
+@pytest.mark.medium
 def test_an_l2_budget_is_kept(scene: advsearch.Scene, level: float) -> None:
     controls = {"texture": {"epsilon": 3.0, "norm": "l2", "resolution": 32}}
     result = advsearch.attack(scene, model(level + 0.03), controls=controls, baseline=False, **FAST)
@@ -103,6 +106,7 @@ def test_a_start_that_is_already_wrong_is_said_and_not_counted(scene: advsearch.
     assert summary.renders["search"] == summary.renders["gradient"] == 0
 
 
+@pytest.mark.medium
 def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     summary = advsearch.attack(scene, model(0.98), **FAST).summary
     assert summary.ending == "budget spent"
@@ -110,6 +114,7 @@ def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     assert summary.clean.control and summary.clean.control.correct == 6
 
 
+@pytest.mark.medium
 def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:
     runs = [
         advsearch.attack(scene, model(level + 0.03), deterministic=True, baseline=False, **FAST).u for _ in range(2)
@@ -117,6 +122,7 @@ def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearc
     assert torch.equal(*runs)
 
 
+@pytest.mark.medium
 def test_a_custom_objective_is_an_ordinary_function(scene: advsearch.Scene, level: float) -> None:
     seen: list[tuple[torch.Size, torch.Size, list[int]]] = []
 
@@ -138,6 +144,7 @@ def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) 
     assert u.grad is not None and float(u.grad.abs().sum()) > 0.0
 
 
+@pytest.mark.medium
 def test_ctrl_c_keeps_the_run_so_far(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +155,7 @@ def test_ctrl_c_keeps_the_run_so_far(
     assert result.summary.steps == 3
 
 
+@pytest.mark.medium
 def test_a_stopped_run_goes_on_where_it_was(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +177,7 @@ def rows_of(run: Path) -> list[Row]:
         return [dataclasses.replace(row, seconds=None, time=None) for row in store.rows()]
 
 
+@pytest.mark.medium
 def test_a_target_and_the_average_are_in_the_summary(scene: advsearch.Scene, level: float) -> None:
     result = advsearch.attack(scene, model(level + 0.03), target="vase", average=5, baseline=False, **FAST)
     summary = result.summary
@@ -179,6 +188,7 @@ def test_a_target_and_the_average_are_in_the_summary(scene: advsearch.Scene, lev
     assert average.margin >= average.worst_margin
 
 
+@pytest.mark.medium
 def test_the_smallest_epsilon_is_bracketed_and_verified(scene: advsearch.Scene, level: float) -> None:
     summary = advsearch.attack(scene, model(level + 0.03), smallest=True, **FAST).summary
     bracket = summary.smallest
@@ -187,6 +197,7 @@ def test_the_smallest_epsilon_is_bracketed_and_verified(scene: advsearch.Scene, 
     assert bracket.not_found_at is None or bracket.not_found_at["texture"] < bracket.epsilon["texture"]
 
 
+@pytest.mark.medium
 def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
     scene: advsearch.Scene, level: float, tmp_path: Path
 ) -> None:
@@ -201,6 +212,7 @@ def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
     assert adversarial in ([], clean)  # nothing, if the clean scene is wrong in half of them
 
 
+@pytest.mark.medium
 def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_the_trials_that_count(
     scene: advsearch.Scene, level: float, tmp_path: Path
 ) -> None:
@@ -233,6 +245,7 @@ def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_th
     assert len({round(row.probability or 0.0, 6) for row in rows["control"].values()}) > 12
 
 
+@pytest.mark.medium
 def test_nan_logits_during_the_search_end_it_and_are_counted(
     scene: advsearch.Scene, level: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +287,7 @@ def test_a_gradient_that_is_not_finite_is_told_whatever_makes_the_pictures(level
     assert any("not finite and were set to 0" in one for one in told.warnings), told.warnings
 
 
+@pytest.mark.medium
 def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(
     scene: advsearch.Scene, level: float, tmp_path: Path
 ) -> None:
@@ -312,6 +326,7 @@ def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level:
     assert (run / "mine.txt").read_text("utf-8") == "keep"
 
 
+@pytest.mark.medium
 def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
     scene: advsearch.Scene, level: float, tmp_path: Path
 ) -> None:
@@ -343,6 +358,7 @@ def test_a_search_is_as_long_as_what_is_asked_needs(asked: dict[str, Any], steps
     assert (problem.steps, problem.draws) == (steps, draws)
 
 
+@pytest.mark.medium
 def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, level: float) -> None:
     told: list[str] = []
 
@@ -362,6 +378,7 @@ def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, le
     assert not any("many conditions" in text for text in told)
 
 
+@pytest.mark.medium
 def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

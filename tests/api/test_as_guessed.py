@@ -82,6 +82,7 @@ def attacked(scene: advsearch.Scene, model: advsearch.Model, tmp_path_factory: p
 # ---- a run from its folder ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_an_attack_comes_back_from_its_folder(attacked: AttackResult) -> None:
     assert attacked.run is not None
     loaded = advsearch.load_run(attacked.run)
@@ -95,6 +96,7 @@ def test_an_attack_comes_back_from_its_folder(attacked: AttackResult) -> None:
         loaded.render()
 
 
+@pytest.mark.medium
 def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path) -> None:
     swept = advsearch.sweep(
         scene, model, {"pose.yaw": np.array([0.0, 90.0])}, run=tmp_path / "sweep", trials=0, **PICTURE
@@ -120,6 +122,7 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
 # ---- an answer elsewhere --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackResult, tmp_path: Path) -> None:
     same, turned = attacked.render(spp=64), attacked.render(settings={"camera.azimuth": 200.0}, spp=64)
     texture, plain = attacked.artifacts["texture"], {**PICTURE, "spp": 64}
@@ -143,6 +146,7 @@ def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackRes
         other.render()
 
 
+@pytest.mark.medium
 def test_an_adversarial_scene_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
     asked: dict[str, Any] = {**FAST, "resolution": 32, "steps": 1}
     controls: list[Any] = ["pose.yaw", LightControl()]
@@ -155,6 +159,7 @@ def test_an_adversarial_scene_of_another_session_is_rendered_with_what_its_run_n
     assert torch.equal(one.views[0].picture, other.views[0].picture) and one.model == other.model == "reference"
 
 
+@pytest.mark.medium
 def test_the_adversarial_scene_of_several_models_is_rendered(scene: advsearch.Scene) -> None:
     """Each of them says what it sees, and a metric gets what each of them says."""
 
@@ -171,6 +176,7 @@ def test_the_adversarial_scene_of_several_models_is_rendered(scene: advsearch.Sc
     assert found.render(both[1], spp=4).views[0].predictions[0].label == "vase"
 
 
+@pytest.mark.medium
 def test_what_an_adversarial_scene_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
     found = advsearch.attack(scene, model, controls={"pose.yaw": np.array([0.0, 90.0])}, policy="random", **FAST)
     with pytest.raises(InputError, match=r"settings: the adversarial configuration says what pose.yaw is"):
@@ -215,6 +221,7 @@ def test_metrics_are_columns_of_an_attack(attacked: AttackResult) -> None:
     assert all(row.metrics.keys() == {"red"} for row in attacked.rows())
 
 
+@pytest.mark.medium
 def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
     scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path
 ) -> None:
@@ -265,6 +272,7 @@ def _other() -> Callable[..., float]:
     return both
 
 
+@pytest.mark.medium
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
     from advsearch.engine.judging import metrics_as_settings, only_here
     from advsearch.questions.sweep.carry_out import job_of, sweep_worker
@@ -326,6 +334,7 @@ def test_progress_is_a_bar_where_somebody_looks(
         watcher(3)
 
 
+@pytest.mark.medium
 def test_every_question_takes_true(
     scene: advsearch.Scene, model: advsearch.Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -342,6 +351,7 @@ def test_every_question_takes_true(
 # ---- what is taken --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_labels_numbers_and_ranges_come_as_they_are(scene: advsearch.Scene) -> None:
     asked: dict[str, Any] = {**FAST, "steps": 1, "policy": "random"}
     labels: list[Any] = [np.int64(0), torch.tensor(0), 0]
@@ -393,6 +403,7 @@ def test_a_detector_is_told_what_it_is() -> None:
     assert advsearch.render("mug", detector, task="detection", resolution=SIDE, spp=1).model == "Detector"
 
 
+@pytest.mark.medium
 def test_a_loaded_scene_is_asked_about_as_it_is(model: advsearch.Model, tmp_path: Path) -> None:
     turned = advsearch.load_scene("mug", settings={"pose.yaw": 77.0})
     asked: dict[str, Any] = {**FAST, "steps": 1, "average": 6, "policy": "random"}
@@ -408,6 +419,7 @@ def test_a_loaded_scene_is_asked_about_as_it_is(model: advsearch.Model, tmp_path
 # ---- what is shown --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_rows_are_there_without_a_folder(
     scene: advsearch.Scene, model: advsearch.Model, attacked: AttackResult
 ) -> None:
@@ -449,6 +461,7 @@ def test_columns_have_plain_names_and_units_stand_beside_them(scene: advsearch.S
     assert frame.attrs["units"] == {"pose.yaw": "degrees", "camera.azimuth": "degrees"}
 
 
+@pytest.mark.medium
 def test_a_notebook_shows_pictures(scene: advsearch.Scene, model: advsearch.Model) -> None:
     rendering = advsearch.render(scene, model, resolution=SIDE, spp=1, denoise="none")
     renderer = scene.renderer("pose.yaw", resolution=SIDE, denoise="none")

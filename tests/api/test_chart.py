@@ -56,6 +56,7 @@ def photographed(path: Path, *, lamp: tuple[float, float, float], slope: float, 
     return path
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("lamp", "slope", "slant"), [((1.0, 1.0, 1.0), 0.0, 0.0), ((0.95, 0.8, 0.55), 0.3, 0.06)], ids=["even", "a lamp"]
 )

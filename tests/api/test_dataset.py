@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from samples import make_attacked
-from small_models import easy
 
 import advsearch
 from advsearch.cli.exporters.dataset.files import find_runs
@@ -25,6 +23,8 @@ from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import read_png
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.geometry import camera_to_world
+from samples import make_attacked
+from small_models import easy
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -72,6 +72,7 @@ def test_runs_come_back_as_the_mask(share: float) -> None:
     assert (decoded({"size": [5, 7], "counts": counts}) == mask).all()
 
 
+@pytest.mark.medium
 def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
     found = exported(swept / PARTS / "views", tmp_path / "out", "--all")
     assert found["categories"] == [{"id": k, "name": n, "supercategory": ""} for k, n in enumerate(["mug", "vase"])]
@@ -97,6 +98,7 @@ def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
     assert len(both) == 2 and not (both[0] & both[1]).any()
 
 
+@pytest.mark.medium
 def test_failures_alone_are_taken_by_default_and_parts_are_read(swept: Path, tmp_path: Path) -> None:
     found, rows = exported(swept, tmp_path / "out"), rows_of(swept / PARTS / "views")
     wrong = [f"views-{row.step:06d}.png" for row in rows if not row.correct]
@@ -104,6 +106,7 @@ def test_failures_alone_are_taken_by_default_and_parts_are_read(swept: Path, tmp
     assert sorted(one.name for one in (tmp_path / "out" / "images").iterdir()) == wrong
 
 
+@pytest.mark.medium
 def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
     grid: Any = {"camera.azimuth": [10.0, 130.0], "camera.elevation": [5.0, 40.0]}
     advsearch.sweep("mug", EASY, grid, spp=1, resolution=(48, 64), denoise="none", trials=0, run=tmp_path / "run")
@@ -133,6 +136,7 @@ def answered(path: Path, **more: Any) -> Path:
     return run
 
 
+@pytest.mark.medium
 def test_an_attack_has_its_adversarial_scene_and_the_clean_scene(tmp_path: Path) -> None:
     run = answered(tmp_path / "run")
     assert [one["file_name"] for one in exported(run, tmp_path / "a")["images"]] == ["verification-00.png"]
@@ -148,6 +152,7 @@ def test_an_attack_has_its_adversarial_scene_and_the_clean_scene(tmp_path: Path)
     assert len(over["images"]) == 3 and len({json.dumps(one["segmentation"]) for one in over["annotations"]}) == 3
 
 
+@pytest.mark.medium
 def test_yolo_has_a_line_for_each_box(swept: Path, tmp_path: Path) -> None:
     run = swept / PARTS / "views"
     found = exported(run, tmp_path / "coco")
@@ -162,6 +167,7 @@ def test_yolo_has_a_line_for_each_box(swept: Path, tmp_path: Path) -> None:
             assert label == one["category_id"] and box == pytest.approx(one["bbox"], abs=1e-4)
 
 
+@pytest.mark.medium
 def test_what_cannot_be_written_is_said(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(run: Path, *more: str) -> str:
         assert (
@@ -236,6 +242,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "run", folder / "out"
 
 
+@pytest.mark.medium
 def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -> None:
     written = json.loads((driven[1] / "annotations.json").read_text())
     scene = advsearch.load_scene("car", "street", things=BESIDE).description
@@ -269,6 +276,7 @@ def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -
     assert seen == {("object", False), ("oncoming", False), ("oncoming", True), ("person", False)}
 
 
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
 def test_pycocotools_reads_it(driven: tuple[Path, Path]) -> None:
     found = pytest.importorskip("pycocotools.coco").COCO(str(driven[1] / "annotations.json"))

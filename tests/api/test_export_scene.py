@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from samples import make_attacked
 from scipy.spatial import KDTree
 
 import advsearch
@@ -25,6 +24,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import HazePart
+from samples import make_attacked
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -40,6 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_attacked(tmp_path_factory.mktemp("runs") / "mug-all-001", config, u.numpy())
 
 
+@pytest.mark.medium
 def test_stock_mitsuba_renders_the_adversarial_scene(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +81,7 @@ def answered_by(controls: dict[str, Any], path: Path) -> Path:
 HAZE: dict[str, Any] = {"haze": {"density": [0.1, 0.3]}}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("controls", [HAZE, {"background": {}}], ids=["haze", "background"])
 def test_stock_mitsuba_renders_haze_and_a_plain_background(
     controls: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -114,6 +116,7 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
     assert np.abs(clean - ours).mean() > 1.5 * noise
 
 
+@pytest.mark.medium
 def test_haze_before_a_plain_background_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = answered_by({**HAZE, "background": {}}, tmp_path / "mug-001")
     assert main(["export", str(run), "--out", str(tmp_path / "scene.xml")]) == 2
@@ -129,6 +132,7 @@ def test_what_is_missing_is_said(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mug.glb"
     assert main(["export", str(run), "--out", str(out), "--json"]) == 0
@@ -161,6 +165,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     assert float((back.mesh.normals[at] * normals).sum(axis=1).mean()) > 0.99
 
 
+@pytest.mark.medium
 def test_the_object_to_turn_is_the_adversarial_scene_and_what_was_before(run: Path, tmp_path: Path) -> None:
     answer = AdversarialRun.load(run)
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "kept"))) as kept:

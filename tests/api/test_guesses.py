@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import easy
 from torch import Tensor, nn
 
 import advsearch
@@ -20,6 +19,7 @@ from advsearch.cli.main import main
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import FileFormatError, InputError
 from advsearch.tasks import Classification, Facts, make_task
+from small_models import easy
 
 SMALL: dict[str, Any] = {
     "resolution": 16, "steps": 4, "spp": 2, "trials": 6, "verify_spp": 4, "denoise": "none", "baseline": False,
@@ -108,6 +108,7 @@ def test_a_space_has_what_a_loss_can_ask_for(scene: advsearch.Scene) -> None:
     assert float(render.space.numbers(render.start)["pose.yaw"]) == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.medium
 def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
     """The network says how bright it is; right is a level near that of the yaw."""
     seen: list[Facts] = []
@@ -146,6 +147,7 @@ def test_a_function_that_says_yes_or_no_is_no_task() -> None:
     assert whole.truth_names(Facts("mug", None, "cup")) == ("cup",)
 
 
+@pytest.mark.medium
 def test_the_losses_at_hand_make_what_printable_makes(scene: advsearch.Scene) -> None:
     """By the same search: with the weight of its terms, the answer is the same."""
     assert advsearch.losses is losses and "losses" in dir(advsearch)
@@ -160,6 +162,7 @@ def test_the_losses_at_hand_make_what_printable_makes(scene: advsearch.Scene) ->
     assert ours.found and torch.allclose(ours.u, theirs.u, atol=1e-5)
 
 
+@pytest.mark.medium
 def test_controls_may_be_given_as_on_the_command_line(scene: advsearch.Scene) -> None:
     for controls in ("pose={yaw: [0, 90], pitch: 5},light:key", ["pose={yaw: [0, 90], pitch: 5}", "light:key"]):
         render = scene.renderer(controls, resolution=8)
@@ -172,6 +175,7 @@ def test_controls_may_be_given_as_on_the_command_line(scene: advsearch.Scene) ->
         scene.renderer("light,light")
 
 
+@pytest.mark.medium
 def test_names_that_are_guessed(scene: advsearch.Scene, tmp_path: Path) -> None:
     assert advsearch.controls.Texture is advsearch.controls.TextureControl
     with pytest.raises(

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from small_models import easy, hard
-from stand_ins import rows, shared
 from torch import Tensor
 
 import advsearch
@@ -29,6 +27,8 @@ from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
 from advsearch.tasks.together import Together, of_each, together
+from small_models import easy, hard
+from stand_ins import rows, shared
 
 BOTH = "small_models:easy,small_models:hard"
 SHORT: dict[str, Any] = {
@@ -49,6 +49,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> MatrixResult:
     return carried_out(tmp_path_factory.mktemp("matrix") / "run")
 
 
+@pytest.mark.medium
 def test_every_adversarial_scene_is_tried_on_every_model(
     whole: MatrixResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,6 +77,7 @@ def test_every_adversarial_scene_is_tried_on_every_model(
     assert (run / "images" / "attack.svg").is_file()
 
 
+@pytest.mark.medium
 def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,6 +99,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
 
 
+@pytest.mark.medium
 def test_workers_make_the_pictures_of_the_trials(
     whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +113,7 @@ def test_workers_make_the_pictures_of_the_trials(
     assert rows(run) == rows(Path(str(whole.run)))
 
 
+@pytest.mark.medium
 def test_one_configuration_for_all_models(tmp_path: Path) -> None:
     result = carried_out(tmp_path / "run", ensemble="worst")
     (row,) = result.table
@@ -119,6 +123,7 @@ def test_one_configuration_for_all_models(tmp_path: Path) -> None:
     assert part["clean"]["label"] == "mug; mug" and part["adversarial"]["label"] == "vase; vase"
 
 
+@pytest.mark.medium
 def test_models_are_attacked_together_from_python() -> None:
     result = advsearch.attack(
         "mug", [easy(), hard()], ensemble="mean", **{k: v for k, v in SHORT.items() if k != "object"}

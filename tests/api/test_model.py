@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_models import SIDE, Finder, Painter
 
 import advsearch
 from advsearch.errors import UnknownNameError
+from small_models import SIDE, Finder, Painter
 
 
 @pytest.mark.parametrize("task", ["detection", {"name": "detection", "confidence": 0.3}])

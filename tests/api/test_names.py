@@ -59,6 +59,7 @@ def test_a_slip_is_told_with_what_was_meant(
     assert [one.name for one in (tmp_path / "runs").iterdir()] == ["mug-sweep-001"]
 
 
+@pytest.mark.medium
 def test_nothing_heavy_is_imported_to_tell_it() -> None:
     code = (
         "import sys; from advsearch.cli.main import main; main(['attack', '--object', 'mug', '--control', 'textur']);"

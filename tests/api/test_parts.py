@@ -62,6 +62,7 @@ def rows(path: Path) -> list[Any]:
         return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
 
 
+@pytest.mark.medium
 def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
@@ -93,6 +94,7 @@ def test_a_study_is_an_attack_for_every_object() -> None:
     assert [part.config.average for part in found] == [6, 6]
 
 
+@pytest.mark.medium
 def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -132,6 +132,7 @@ def swept(model: advsearch.Model) -> advsearch.SweepResult:
     return advsearch.sweep("mug", model, {"pose.yaw": [0, 90], "camera.elevation": [10, 60]}, spp=1, trials=0)
 
 
+@pytest.mark.medium
 def test_texts_are_short(model: advsearch.Model, attacked: Any, swept: advsearch.SweepResult) -> None:
     scene = advsearch.load_scene("mug", environment="loft", settings={"camera.azimuth": 60.0})
     assert repr(scene) == "Scene('mug', 'loft', camera.azimuth=60.0)"
@@ -175,6 +176,7 @@ class Rounding(torch.nn.Module):
         return torch.stack([mean, 0.5 - mean], dim=1)
 
 
+@pytest.mark.medium
 def test_a_model_without_a_gradient_is_searched_without_one() -> None:
     with pytest.warns(ModelWarning, match="no gradient .* use `auto`"):
         model = advsearch.load_model(Rounding(), labels=["light", "dark"], input_size=16)

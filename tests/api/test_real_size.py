@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from mobilenet import MobileNetV2
 from torch import nn
 
 import advsearch
+from mobilenet import MobileNetV2
 
 
 def mobilenet() -> nn.Module:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-import samples
 import torch
 
 import advsearch
+import samples
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.report.figures import GAP, LINE, NARROWEST, columns_for, contact_sheet
@@ -39,6 +39,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return err
 
 
+@pytest.mark.medium
 def test_a_picture_and_the_five_first_predictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     png, exr = tmp_path / "new" / "a.png", tmp_path / "a.exr"
     found = render(capsys, "--object", "mug", "--out", str(png))
@@ -57,6 +58,7 @@ def test_a_picture_and_the_five_first_predictions(tmp_path: Path, capsys: pytest
     assert np.abs(linear_to_srgb(linear) - picture.numpy()).max() <= 0.5 / 255 + 1e-4
 
 
+@pytest.mark.medium
 def test_settings_and_fixed_values_of_controls_are_in_the_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,6 +73,7 @@ def test_settings_and_fixed_values_of_controls_are_in_the_picture(
     assert np.abs(plain - searched).max() <= 2 / 255  # a range stays where a search starts
 
 
+@pytest.mark.medium
 def test_around_is_one_sheet_at_one_exposure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sheet.png"
     found = render(capsys, "--object", "mug", "--out", str(out), "--around", "4", "--set", "camera.azimuth=130")
@@ -149,6 +152,7 @@ def test_a_sheet_has_few_holes_and_cuts_long_names() -> None:
     assert text[:, GAP : GAP + NARROWEST].any() and not text[:, GAP + NARROWEST : 2 * GAP + NARROWEST].any()
 
 
+@pytest.mark.medium
 def test_a_file_of_ones_own_with_a_network_of_ones_own(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,9 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from covering import only
-from samples import SUMMARY
-from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
@@ -46,6 +43,9 @@ from advsearch.runs.store import Store
 from advsearch.scene.settings import Parameter
 from advsearch.settings import settings
 from advsearch.tasks import make_task
+from covering import only
+from samples import SUMMARY
+from stand_ins import interrupted
 
 SIDE = 16
 FAST: dict[str, Any] = {
@@ -98,6 +98,7 @@ MODES: dict[str, Callable[[], Any]] = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("mode", only(["inference_mode"], MODES))
 def test_a_search_learns_whatever_is_switched_off_around_it(mode: str, scene: advsearch.Scene, level: float) -> None:
     with MODES[mode]():
@@ -107,6 +108,7 @@ def test_a_search_learns_whatever_is_switched_off_around_it(mode: str, scene: ad
     assert not result.u.is_inference()
 
 
+@pytest.mark.medium
 def test_a_renderer_and_a_model_that_were_made_in_inference_mode_are_differentiable(level: float) -> None:
     with torch.inference_mode():
         render = advsearch.load_scene("mug").renderer(["texture", "pose.yaw"], resolution=SIDE, denoise="none")
@@ -143,6 +145,7 @@ def interrupted_once() -> Callable[..., Tensor]:
     return objective
 
 
+@pytest.mark.medium
 def test_threads_are_given_back_after_answers_errors_and_interrupts(scene: advsearch.Scene, level: float) -> None:
     import drjit
 
@@ -166,6 +169,7 @@ def test_threads_are_given_back_after_answers_errors_and_interrupts(scene: advse
         torch.set_num_threads(before)
 
 
+@pytest.mark.medium
 def test_questions_and_renders_of_several_threads_come_out_as_they_do_alone(
     scene: advsearch.Scene, level: float
 ) -> None:
@@ -210,6 +214,7 @@ def holds(kept: Any, value: Any) -> bool:
     return any(one == value for one in inner) or (isinstance(kept, dict) and value in kept)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("command", CONFIGS)
 def test_every_setting_takes_each_value_that_it_is_given_or_none(command: str) -> None:
     """The same over all settings of all questions: nothing of a list is dropped, and a number is one of any library."""
@@ -241,6 +246,7 @@ def test_every_setting_takes_each_value_that_it_is_given_or_none(command: str) -
     assert taken > 10
 
 
+@pytest.mark.medium
 def test_several_epsilons_are_not_the_first_one(asked: Callable[..., Any], scene: advsearch.Scene) -> None:
     for several in ([0.1, 0.2], (0.1, 0.2), np.array([0.1, 0.2]), torch.tensor([0.5, 0.25]), "0.1,0.2"):
         with pytest.raises(InputError, match=r"^epsilon: expected one, got 0\.[15], 0\.2.*; attack with each, or have"):
@@ -249,6 +255,7 @@ def test_several_epsilons_are_not_the_first_one(asked: Callable[..., Any], scene
         assert asked(scene, epsilon=one).controls[0].chosen["epsilon"] == 0.5
 
 
+@pytest.mark.medium
 def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Callable[..., Any]) -> None:
     job = asked("mug", environment=["loft"], exposure=np.float32(1.0), set={"camera.azimuth": torch.tensor(3.0)})
     assert (job.scene.description.environment_name, job.scene.description.values["camera.azimuth"]) == ("loft", 3.0)
@@ -303,6 +310,7 @@ def test_settings_hold_the_objects_that_they_name_and_nothing_else_does(scene: a
     assert scene_of(AttackConfig(object="mug")) is not scene
 
 
+@pytest.mark.medium
 def test_instances_and_names_go_together_in_every_question(
     scene: advsearch.Scene, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -369,6 +377,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch, after: int = 2) -> Any:
     return patch
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("own", only([Loss], [brightness, Loss]))
 def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     own: Callable[[float], Any], scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -388,6 +397,7 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     assert len(noted["objective"]) == len(noted["model bright"]) == 64
 
 
+@pytest.mark.medium
 def test_a_model_that_answers_at_random_goes_on(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -404,6 +414,7 @@ def test_a_model_that_answers_at_random_goes_on(
     assert found.summary.ending != "interrupted"
 
 
+@pytest.mark.medium
 def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Scene, tmp_path: Path) -> None:
     class Stops(NullProgress):
         def advance(self, n: int = 1, **info: float | str) -> None:
@@ -423,6 +434,7 @@ def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Sc
         assert store.count("sweep") == 4
 
 
+@pytest.mark.medium
 def test_what_exists_only_here_is_no_command(
     scene: advsearch.Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -449,6 +461,7 @@ def test_what_exists_only_here_is_no_command(
     assert AttackConfig.from_yaml(tmp_path / "named" / "run.yaml").model == "reference"
 
 
+@pytest.mark.medium
 def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
     scene: advsearch.Scene, level: float, tmp_path: Path
 ) -> None:
@@ -495,6 +508,7 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
     assert not seen
 
 
+@pytest.mark.medium
 def test_a_run_that_was_killed_at_once_is_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     words = ["attack", "--object", "mug", "--run", str(run), "--resolution", str(SIDE), "--steps", "1", "--spp", "1"]
@@ -509,6 +523,7 @@ def test_a_run_that_was_killed_at_once_is_resumed(tmp_path: Path, capsys: pytest
     assert "mug" in capsys.readouterr().out
 
 
+@pytest.mark.medium
 def test_a_run_is_replaced_when_something_takes_its_place(scene: advsearch.Scene, tmp_path: Path) -> None:
     run = tmp_path / "run"
     advsearch.attack(scene, victim(0.9), run=run, **{**SMALL, "steps": 1})

@@ -11,11 +11,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import samples
-from samples import ATTACK, AVERAGE, rated
-from samples import attack as attacked
 
 import advsearch
+import samples
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as region_text
 from advsearch.cli.output import shown_text as text_of
@@ -32,6 +30,8 @@ from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.summary import read_result
+from samples import ATTACK, AVERAGE, rated
+from samples import attack as attacked
 
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
 """The epsilon at which each object flips; 0: it is wrong already."""
@@ -68,6 +68,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
     )
 
 
+@pytest.mark.medium
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
     summary = run_and_save(curve, RunContext(config))
@@ -108,6 +109,7 @@ def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConf
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
 
+@pytest.mark.medium
 def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +132,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     assert "45/50 (90 %)" in text_of(summary) and "20/20" in text_of(summary)
 
 
+@pytest.mark.medium
 def test_the_average_stands_beside_the_worst_case_of_each_object(asked: list[AttackConfig]) -> None:
     summary = run_and_save(curve, RunContext(AttackConfig(object="mug,bowl", average=50, run="study")))
     assert [one.average for one in asked] == [50, 50]
@@ -145,6 +148,7 @@ def test_the_average_stands_beside_the_worst_case_of_each_object(asked: list[Att
 SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 
 
+@pytest.mark.medium
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(boxes, "MAX_PROBED", 20)
     config = RegionConfig(
@@ -202,6 +206,7 @@ def test_a_region_refuses_what_does_not_fit(more: dict[str, Any], error: Any, me
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.medium
 def test_one_texture_for_many_conditions(tmp_path: Path) -> None:
     names = advsearch.load_model("reference").labels
     result = advsearch.attack(

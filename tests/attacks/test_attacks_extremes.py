@@ -161,6 +161,7 @@ def test_nothing_is_found_in_a_model_whose_prediction_never_changes(name: str) -
     assert name not in ("pgd", "adam") or result.ending is Ending.STALLED
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("rate", [0.1, 0.5, 0.9])
 def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: float) -> None:
     domain = box(0.5, 0.5)
@@ -229,6 +230,7 @@ def share_of_optimum(name: str, kind: str) -> float:
     return statistics.median(result.best_objective for result in reached) / best
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["pgd", "adam"])
 @pytest.mark.parametrize("kind", ["elements", "lengths", "spike"])
 def test_heavy_tails_make_a_search_little_worse_than_gaussian_noise(kind: str, name: str) -> None:
@@ -239,6 +241,7 @@ def test_heavy_tails_make_a_search_little_worse_than_gaussian_noise(kind: str, n
 # ---- single precision and many steps --------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_verdicts_in_single_and_double_precision_differ_only_on_the_boundary() -> None:
     """Between two pictures with different answers the boundary is found by bisection in single precision; there the two
     may disagree, and what matters is how far from the boundary they still do."""
@@ -305,6 +308,7 @@ def test_ten_thousand_steps_stay_inside_the_budget_and_at_the_peak(name: str) ->
     assert float(value(domain.project(target.float()).double())) - result.best_objective <= 1e-3
 
 
+@pytest.mark.medium
 def test_an_angle_that_goes_round_in_small_steps_does_not_drift_and_no_two_steps_have_one_seed() -> None:
     domain = Domain(torch.zeros(1), (Block(1, periodic=True, name="angle"),))
     u, exact, step = torch.zeros(1), 0.0, 0.000_731
@@ -460,11 +464,13 @@ def lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, box_domain([ranges[0].coordinate(watt), ranges[1].coordinate(10.0 * degree)]))
 
 
+@pytest.mark.medium
 def test_a_search_in_milliwatts_and_radians_goes_the_way_of_one_in_watts_and_degrees() -> None:
     toys = [lamp_and_rotation(*units) for units in ((1.0, 1.0), (1e3, math.pi / 180.0), (1e-6, 3600.0))]
     same_path(toys, "pgd", "adam", "cmaes", "auto", "nes", "sobol")
 
 
+@pytest.mark.medium
 def test_a_search_of_the_objective_times_a_million_goes_the_same_way() -> None:
     toys = [Toy(unequal([0.7, 0.4], [1.0, 30.0]), box_domain([0.1, 0.9]), scale) for scale in (1.0, 1e-6, 1e6)]
     same_path(toys, "pgd", "adam", "cmaes", "nes", "auto")

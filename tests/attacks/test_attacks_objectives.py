@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT
 from torch import Tensor, nn
 
 from advsearch import losses
@@ -36,6 +35,7 @@ from advsearch.models import load_model
 from advsearch.tasks import Classification
 from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS
+from conftest import ROOT
 
 IMAGES = torch.zeros(2, 4, 4, 3)
 LOGITS = torch.tensor([[3.0, 1.0, 2.0, -1.0], [0.0, 5.0, 1.0, 4.0]])

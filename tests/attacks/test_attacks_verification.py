@@ -183,6 +183,7 @@ def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("noise", [0.1, 1.0])
 def test_the_wrong_side_passes_in_about_one_case_of_twenty_at_most(noise: float) -> None:
     """Noise lifts a margin of zero over the decision, by half as much at four times the samples: the slowest that is
@@ -548,6 +549,7 @@ def test_trials_that_were_asked_for_are_all_made() -> None:
         assert (found.adversarial.trials, found.clean.trials, found.stopped) == (20, 20, "asked for")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("trials", "rule"), [(20, WORST_CASE), (6, WORST_CASE), (200, OVER_CONDITIONS)])
 def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int, rule: Rule) -> None:
     """Exactly, by the probability of every outcome: the failure too many comes at trial n, or never."""

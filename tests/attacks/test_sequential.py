@@ -67,6 +67,7 @@ def test_the_true_mean_is_excluded_at_any_time_less_often_than_the_error(share: 
     assert min(missed) > 0, "it is not merely the whole of [0, 1]"
 
 
+@pytest.mark.medium
 def test_a_claim_of_one_side_is_wrong_no_more_often_and_takes_fewer_draws() -> None:
     study = runpy.run_path(str(STUDY))
     given = {"runs": 300, "draws": 120, "confidence": 0.8, "seed": 2}

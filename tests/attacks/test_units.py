@@ -76,6 +76,7 @@ def test_copies_of_a_prediction_say_no_more_than_one() -> None:
     assert p >= mcnemar(int((one & ~other).sum()), int((~one & other).sum()))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("count", [3, 5, 10, 30])
 @pytest.mark.parametrize("alike", [0.3, 0.95])
 def test_two_models_that_are_as_good_are_told_apart_in_5_of_100_at_most(count: int, alike: float) -> None:
@@ -89,6 +90,7 @@ def test_two_models_that_are_as_good_are_told_apart_in_5_of_100_at_most(count: i
     assert told <= 12 and missed <= 12
 
 
+@pytest.mark.medium
 def test_a_small_loss_in_nearly_all_drives_is_no_gain_in_the_mean() -> None:
     """One model gains a little in nine drives of ten and loses all of the tenth: signs alone would tell it apart."""
     rng, told = np.random.default_rng(1), 0
@@ -114,6 +116,7 @@ def fewer(rng: np.random.Generator, side: str, count: int, less: float) -> float
     return fewer_by_chance(*(one.sum(axis=1) for one in (right & under, under, right & ~under, ~under)))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("side", SIDES)
 def test_a_rule_that_is_none_is_told_in_one_of_100_and_a_clear_one_always(side: str) -> None:
     rng = np.random.default_rng(2)

@@ -20,6 +20,7 @@ def study() -> dict[str, Any]:
     return runpy.run_path(str(Path(__file__).resolve().parents[2] / "benchmarks" / "verdict_flow.py"))
 
 
+@pytest.mark.medium
 def test_what_holds_too_seldom_is_seldom_found_whatever_chooses(study: dict[str, Any]) -> None:
     """At .5 and by 6 of 6, or by trials that the sample count has looked at, some of these would be found."""
     checks = [study["checked"](0.5, root, failures=4) for root in range(20)]
@@ -29,6 +30,7 @@ def test_what_holds_too_seldom_is_seldom_found_whatever_chooses(study: dict[str,
     assert np.mean([low <= 0.5 <= high for low, high in covered]) >= 0.85
 
 
+@pytest.mark.medium
 def test_a_configuration_that_is_chosen_by_its_trials_is_tried_in_others(study: dict[str, Any]) -> None:
     """The random search's answer is the run's only by trials that come after those by which it was chosen."""
     checks = [study["checked"](0.9, root) for root in range(20)]
@@ -40,6 +42,7 @@ def test_a_configuration_that_is_chosen_by_its_trials_is_tried_in_others(study: 
         assert len(one.verification.clean_trials) >= TRIAL_LOOKS[0] and one.baseline_verification is one.verification
 
 
+@pytest.mark.medium
 def test_a_configuration_that_wins_once_and_not_again_is_not_the_runs(study: dict[str, Any]) -> None:
     checks = [study["checked"](0.9, root) for root in range(20)]
     assert any(one.beaten is None and one.baseline_verification.begin > 0 for one in checks)

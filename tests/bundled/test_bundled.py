@@ -63,6 +63,7 @@ def test_every_class_of_the_library_is_registered() -> None:
     assert {family.label for family in HOUSEHOLD.values()} == {name.replace("-", " ") for name in CLASSES}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "seed"), INSTANCES)
 def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
     asset = instance(name, seed)
@@ -108,6 +109,7 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     assert len(owner) == len(np.unique(owner[:, :2], axis=0)), "two charts share a texel"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", sorted(OBJECTS))
 def test_charts_are_about_as_large_as_their_surface(name: str) -> None:
     patches = OBJECTS[name].make(Draw(None)).patches
@@ -119,6 +121,7 @@ def test_charts_are_about_as_large_as_their_surface(name: str) -> None:
     assert surface[fair].sum() > 0.9 * surface.sum(), "texels are much larger on some parts than on others"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", sorted(OBJECTS))
 def test_seeds_decide_everything(name: str) -> None:
     first, again, other = (OBJECTS[name].generate(np.random.default_rng(seed)) for seed in (7, 7, 8))

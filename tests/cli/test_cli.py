@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import samples
-from conftest import ROOT
-from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run, rated
 
 import advsearch
+import samples
 from advsearch import __version__
 from advsearch.cli import doctor
 from advsearch.cli import show as names
@@ -40,6 +38,8 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.settings import Parameter
 from advsearch.settings import Config, settings
+from conftest import ROOT
+from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run, rated
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL")
 
@@ -208,6 +208,7 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
     assert "error: --smallest: finds one epsilon by itself; give one --epsilon as" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
         "import sys, advsearch.experiment\n"
@@ -284,6 +285,7 @@ sys.exit(main())
 """
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("quiet", [[], ["--quiet"]])
 @pytest.mark.parametrize(
     "where",

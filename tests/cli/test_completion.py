@@ -69,6 +69,7 @@ zpty -d shell
 """
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="there is no zsh here")
 def test_tab_finishes_commands_flags_and_names_in_zsh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script("zsh", tmp_path, capsys).rename(tmp_path / "_advsearch")

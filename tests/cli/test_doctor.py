@@ -145,6 +145,7 @@ def test_little_disk_or_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.
     assert (doctor.disk(tmp_path).status, doctor.check_hardware().status) == (doctor.WARNING, doctor.WARNING)
 
 
+@pytest.mark.medium
 def test_every_part_really_works_here() -> None:
     """The only test that tries them: imports, a render with its gradient, a denoised picture."""
     tried = doctor.run_probe()
@@ -152,6 +153,7 @@ def test_every_part_really_works_here() -> None:
     assert set(tried) == set(ALL_WELL)
 
 
+@pytest.mark.medium
 def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the guard switched off, as a user has it who calls Mitsuba by hand."""
     old = [c.path for c in llvm.find() if c.version and c.version[0] in (15, 16)]

@@ -69,6 +69,7 @@ YAML = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", YAML)
 def test_yaml_files_are_refused_in_one_short_sentence(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -113,6 +114,7 @@ def test_what_is_wrong_with_yaml_is_one_sentence(text: str, message: str, tmp_pa
         read_yaml(path)
 
 
+@pytest.mark.medium
 def test_what_is_no_yaml_on_the_command_line_is_text() -> None:
     for value in ("!!int ''", "1" * 6000, "[" * 5000):
         assert parse_assignment(f"run={value}", "--set") == ("run", value)
@@ -216,6 +218,7 @@ def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "command, status, message",
     [
@@ -233,6 +236,7 @@ def test_an_output_that_cannot_be_written_is_no_bug(command: str, status: int, m
     assert "Traceback" not in result.stderr and "Exception ignored" not in result.stderr
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("delay", [0.0, 0.05])
 def test_two_quick_interrupts_leave_no_traceback(delay: float, tmp_path: Path) -> None:
     """While PyTorch is being imported, which makes other errors of an interrupt."""
@@ -276,6 +280,7 @@ sys.exit(__main__.start())
 """
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "where, status",
     [("main._status", 130), ("main._run_and_tell", 130), ("main.signal.signal", 2), ("main.end_output", 2)],

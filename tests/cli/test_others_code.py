@@ -14,8 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from samples import make_attacked
-from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import testing
@@ -31,6 +29,8 @@ from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
 from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
+from samples import make_attacked
+from stored_sweeps import make_sweep
 
 PLANTED = "open('imported', 'w').close()\nraise RuntimeError('planted')"
 NAME = "planted:make"
@@ -130,6 +130,7 @@ def test_every_command_is_tried_here() -> None:
     assert {*IMPORTING, *READING, *ALONE, "dashboard"} == {*list_commands()}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("line", [line for lines in IMPORTING.values() for line in lines])
 def test_a_command_imports_what_it_names_alone(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     quiet = [] if line.startswith("export") else ["--quiet"]
@@ -143,12 +144,14 @@ def test_a_command_imports_what_it_names_alone(line: str, capsys: pytest.Capture
     assert Path("imported").exists() and not allowed_code()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("line", [line for lines in READING.values() for line in lines])
 def test_who_looks_imports_nothing(line: str) -> None:
     assert main(shlex.split(line)) == 0
     assert not Path("imported").exists()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "settings",
     [
@@ -165,6 +168,7 @@ def test_any_setting_that_names_code_in_a_file(settings: str, capsys: pytest.Cap
     assert "names planted:" in capsys.readouterr().err and not Path("imported").exists()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("typed", ["model=planted:make", "model=planted:make@a.safetensors"])
 def test_what_is_typed_behind_a_file_is_imported(typed: str) -> None:
     assert main(["run", "runs/theirs/run.yaml", typed, "--quiet", "--run", "again"]) == 2
@@ -202,6 +206,7 @@ def photograph() -> bytes:
     return next(Path("runs/kept").rglob("*.jpg")).read_bytes()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", PYTHON)
 def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
     with pytest.raises(InputError, match=rf"a file names {NAME}, Python code from .*allow_code\('{NAME}'\)"):
@@ -213,6 +218,7 @@ def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
     assert Path("imported").exists()
 
 
+@pytest.mark.medium
 def test_the_dashboard_imports_nothing_for_a_photograph() -> None:
     with pytest.raises(InputError, match=NAME):
         PhotographPages()._photographs.add(Path("runs/kept"), "0", photograph())
@@ -243,6 +249,7 @@ def test_what_is_no_name_of_code_is_refused(name: str) -> None:
         advsearch.allow_code(name)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("module", ["io", "torch", "json", "ctypes", "advsearch"])
 def test_processes_that_we_start_look_for_no_modules_in_the_current_folder(module: str) -> None:
     import io

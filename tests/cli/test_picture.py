@@ -14,11 +14,11 @@ import time
 from pathlib import Path
 
 import pytest
-from samples import make_run
-from stored_sweeps import make_sweep
 
 from advsearch.cli.main import main
 from advsearch.cli.show import best_pictures
+from samples import make_run
+from stored_sweeps import make_sweep
 
 SIXEL, KITTY = b"\x1bP", b"\x1b_G"
 
@@ -55,21 +55,25 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("runs") / "attack", rows=False)
 
 
+@pytest.mark.medium
 def test_a_terminal_with_sixel_draws(run: Path) -> None:
     written = in_terminal(run, {b"\x1b[c": b"\x1b[?62;4c", b"\x1b[16t": b"\x1b[6;20;10t"})
     assert written.count(SIXEL) == 2 and b"adversarial.png" in written
 
 
+@pytest.mark.medium
 def test_a_terminal_with_kittys_protocol_draws(run: Path) -> None:
     answers = {b"\x1b[c": b"\x1b[?62;22c", b"\x1b_G": b"\x1b_Gi=1;OK\x1b\\", b"\x1b[16t": b"\x1b[6;20;10t"}
     assert in_terminal(run, answers).count(KITTY) > 2
 
 
+@pytest.mark.medium
 def test_a_terminal_without_a_size_is_no_error(run: Path) -> None:
     written = in_terminal(run, {b"\x1b[c": b"\x1b[?62;4c"}, (0, 0))
     assert b"could not be drawn" in written and b"adversarial.png" in written
 
 
+@pytest.mark.medium
 def test_a_terminal_without_graphics_says_where_they_are(run: Path) -> None:
     written = in_terminal(run, {b"\x1b[c": b"\x1b[?62;22c"})
     assert SIXEL not in written and b"clean.png" in written and b"neither kitty's protocol nor Sixel" in written

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import yaml
-from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import experiment
@@ -24,6 +23,7 @@ from advsearch.settings import HEADER, settings
 from advsearch.threads import cores
 from advsearch.trust import powers
 from advsearch.trust.code import allow_code
+from stored_sweeps import make_sweep
 
 MANY = 100_000
 POWERS: dict[str, Any] = {
@@ -121,6 +121,7 @@ def test_a_base_asks_in_vain_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"workers: starts 90000 processes on {cores()} processors" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_a_run_goes_on_without_and_says_what_to_type(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,6 +157,7 @@ def test_what_decides_numbers_is_not_left_out_but_refused(capsys: pytest.Capture
     assert "add: changes what is kept beside the suite, which a file can't ask for; type add=theirs" in error
 
 
+@pytest.mark.medium
 def test_resume_writes_none_of_the_files_that_a_run_names(capsys: pytest.CaptureFixture[str]) -> None:
     Path("runs/sent").mkdir(parents=True)
     Path("suite.yaml").write_text("settings: {object: nothing}\nclaims: {a: {claim: not_broken}}\n")
@@ -165,6 +167,7 @@ def test_resume_writes_none_of_the_files_that_a_run_names(capsys: pytest.Capture
     assert Path("precious").read_text() == "mine" and not Path("suite.counterexamples").exists()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("setting", ["log: wandb", "cluster: tcp://127.0.0.1:1", "run: x", "overwrite: true"])
 def test_a_suite_asks_in_vain(setting: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = f"claims: {{a: {{claim: not_broken, settings: {{object: mug, {setting}}}}}}}\n"
@@ -176,6 +179,7 @@ def test_a_suite_asks_in_vain(setting: str, capsys: pytest.CaptureFixture[str]) 
     assert "there is no such name in a suite" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("setting", ["log: mlflow", "cluster: tcp://127.0.0.1:1", f"workers: {MANY}", "run: x"])
 def test_a_recipe_asks_in_vain(setting: str, capsys: pytest.CaptureFixture[str]) -> None:
     part = f"{{command: sweep, settings: {{controls: {{pose: {{}}}}, {setting}}}}}"
@@ -184,6 +188,7 @@ def test_a_recipe_asks_in_vain(setting: str, capsys: pytest.CaptureFixture[str])
     assert setting.partition(":")[0] in capsys.readouterr().err and not Path("runs").exists()
 
 
+@pytest.mark.medium
 def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     path = make_sweep(Path("runs/part"), ended=False)
     text = (path / "run.yaml").read_text()

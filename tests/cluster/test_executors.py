@@ -17,7 +17,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from conftest import ROOT
 
 from advsearch.cluster import WorkerDiedError, Workers, WorkerStats, WorkerTask
 from advsearch.cluster.dask_executor import CLASSES, TRIES, DaskExecutor, site_of
@@ -25,6 +24,7 @@ from advsearch.cluster.local import LocalExecutor
 from advsearch.cluster.worker import Failure, Reply, run_batch, version
 from advsearch.cluster.workers import open_workers
 from advsearch.errors import ClusterError, FileFormatError, InputError
+from conftest import ROOT
 
 psutil: Any = import_module("psutil")  # which Dask brings along
 dask: Any = import_module("dask")
@@ -51,6 +51,7 @@ def own_workers() -> list[Any]:
     return [one for one in psutil.Process().children() if "serve()" in " ".join(one.cmdline())]
 
 
+@pytest.mark.medium
 def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.CaptureFixture[str]) -> None:
     """They listen nowhere, Ctrl-C in a terminal passes by them, and a number of which each dies is said."""
     work = WorkerTask("cluster_work:squares", {"seconds": 0.01, "deadly": [301], "prints": True})
@@ -72,6 +73,7 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.
     assert not own_workers() and "printed" not in capfd.readouterr().out
 
 
+@pytest.mark.medium
 def test_workers_end_with_the_process_that_started_them() -> None:
     """In the middle of a batch, though it was killed."""
     script = """
@@ -92,6 +94,7 @@ with open_workers(task, workers=1, cluster=None, tell=print) as executor:
     assert worker.wait(60.0) in (0, None)
 
 
+@pytest.mark.medium
 def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A module that asks as it is imported, here by a worker, is told what to do."""
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -103,6 +106,7 @@ def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             list(executor.results(pieces(4)))
 
 
+@pytest.mark.medium
 def test_a_worker_that_hangs_ends_itself_and_is_replaced(capfd: pytest.CaptureFixture[str]) -> None:
     """Of a call that always hangs, as many as may die; the next call finds a worker."""
     executor = LocalExecutor(1)
@@ -117,6 +121,7 @@ def test_a_worker_that_hangs_ends_itself_and_is_replaced(capfd: pytest.CaptureFi
     assert executor.stats.lost == 3 and "in call" in capfd.readouterr().err, "the error output says where it hung"
 
 
+@pytest.mark.medium
 def test_a_worker_imports_nothing_from_the_current_folder(tmp_path: Path) -> None:
     """Nor the script that asks for it."""
     for name in ("pickle", "runpy", "advsearch", "json"):
@@ -156,6 +161,7 @@ def free_port() -> str:
         return str(one.getsockname()[1])
 
 
+@pytest.mark.medium
 def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files come along; the scheduler is killed while a result is fetched from it, and comes back under its address."""
     port = free_port()

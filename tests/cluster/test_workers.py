@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from simulated_cluster import Simulated, SimulatedWorkers
 
 from advsearch import threads
 from advsearch.cluster import BatchResult, WorkerTask
@@ -25,6 +24,7 @@ from advsearch.cluster.worker import (
     write_files,
 )
 from advsearch.errors import ClusterError
+from simulated_cluster import Simulated, SimulatedWorkers
 
 COUNT, SIZE = 400, 16
 

@@ -111,6 +111,7 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.medium
 def test_the_default_environment_is_asked_for_only_where_it_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -147,6 +148,7 @@ MOVED: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", MOVED)
 def test_a_default_that_is_left_out_moves_and_is_said(name: str) -> None:
     controls, sentence = MOVED[name]
@@ -154,6 +156,7 @@ def test_a_default_that_is_left_out_moves_and_is_said(name: str) -> None:
     assert said.startswith("The clean scene has ") and said.endswith(" leaves out.") and sentence in said
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "controls",
     [
@@ -178,6 +181,7 @@ class Screen(NullProgress):
         self.said.append(text)
 
 
+@pytest.mark.medium
 def test_what_moved_is_in_the_summary_in_the_report_and_on_the_screen(tmp_path: Path) -> None:
     screen = Screen()
     result = advsearch.attack(
@@ -265,6 +269,7 @@ def test_a_sweep_of_a_loaded_scene_refuses_the_same() -> None:
         advsearch.sweep(scene, grid={"camera.azimuth": [130, 140]})
 
 
+@pytest.mark.medium
 def test_a_row_names_the_environment_that_lights_it() -> None:
     plain: dict[str, Any] = {"resolution": 8, "spp": 1, "trials": 0}
 

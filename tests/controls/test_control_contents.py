@@ -55,6 +55,7 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
 # ---- the inside of a vessel -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_vessels_and_nothing_else_are_found_among_the_bundled_objects() -> None:
     assert {name for name in list_objects() if interior(load_object(name)) is not None} == VESSELS
 
@@ -212,6 +213,7 @@ def test_the_colour_has_finite_derivatives_everywhere(corner: int) -> None:
 # ---- rendered -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_empty_leaves_the_scene_as_it_is_and_full_does_not() -> None:
     asset = advsearch.load_scene("mug", settings={"camera.elevation": 45.0})
     turning = PoseControl(yaw=[-10, 10])
@@ -225,6 +227,7 @@ def test_empty_leaves_the_scene_as_it_is_and_full_does_not() -> None:
     assert filled.non_finite == 0
 
 
+@pytest.mark.medium
 def test_the_gradient_of_a_rendered_mixture_agrees_with_differences() -> None:
     asset = advsearch.load_scene("mug", settings={"camera.elevation": 45.0})
     render = asset.renderer([ContentsControl()], resolution=32, denoise="none")

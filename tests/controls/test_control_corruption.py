@@ -66,6 +66,7 @@ def test_severity_0_is_the_picture_and_5_is_far_from_it(which: str) -> None:
         assert distances[1] < distances[2]
 
 
+@pytest.mark.medium
 @every_corruption
 def test_extreme_pictures_give_finite_pictures_and_derivatives(which: str) -> None:
     pictures = [torch.full((17, 24, 3), grey) for grey in (0.0, 0.5, 1.0)]

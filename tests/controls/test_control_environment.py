@@ -34,6 +34,7 @@ def shown(scene: advsearch.Scene, controls: object, u: list[float] | None = None
     return renderer(renderer.start if u is None else torch.tensor(u), 0, 16).detach()
 
 
+@pytest.mark.medium
 def test_each_looks_as_the_scene_in_it(maps: tuple[str, str]) -> None:
     """Floor and exposure too: the first of one's own files is the clean scene."""
     space = {"environment": {"which": list(maps)}}
@@ -86,6 +87,7 @@ def test_another_file_than_the_scene_was_asked_to_have_is_refused(maps: tuple[st
         scene.renderer({"environment": {"which": [maps[1], "noon"]}}, resolution=SIZE)
 
 
+@pytest.mark.medium
 def test_they_are_an_axis_of_a_sweep(maps: tuple[str, str]) -> None:
     found = advsearch.sweep(
         "mug", "reference", {"environment.which": [*maps, "noon"]}, resolution=SIZE, spp=1, trials=6, verify_spp=4
@@ -93,6 +95,7 @@ def test_they_are_an_axis_of_a_sweep(maps: tuple[str, str]) -> None:
     assert [row["environment.which"] for row in found.to_pandas().to_dict("records")] == [*maps, "noon"]
 
 
+@pytest.mark.medium
 def test_they_are_drawn_for_every_picture(maps: tuple[str, str]) -> None:
     found = advsearch.attack(
         advsearch.load_scene("mug"),

@@ -48,6 +48,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop("own_controls", None)
 
 
+@pytest.mark.medium
 def test_the_command_line_and_yaml_take_a_class(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sweep", "--object", "mug", "--control", "own_controls:Fade", "--samples", "2", *QUICK]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -119,6 +120,7 @@ def test_how_to_go_on_names_the_code_that_is_needed(
         assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_a_run_that_is_stopped_says_how_to_go_on_with_its_code(capsys: pytest.CaptureFixture[str]) -> None:
     words = (
         "check --object mug --control own_controls:Fade --loss linear --resolution 16 --spp 1 --seconds 1e-9 --quiet"

@@ -47,6 +47,7 @@ def face_normals(places: Tensor, faces: np.ndarray) -> Tensor:
     return found
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("form", FORMS)
 def test_it_starts_with_the_shape_as_it_is(scene: SceneDescription, form: str) -> None:
     control = bound(scene, form=form)
@@ -56,6 +57,7 @@ def test_it_starts_with_the_shape_as_it_is(scene: SceneDescription, form: str) -
     assert control.describe(control.start)["geometry.thinnest"]["value"] == pytest.approx(1.0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("epsilon", [0.03, 0.3])
 @pytest.mark.parametrize("name", ["mug", "wine-glass", "book"])
@@ -227,6 +229,7 @@ def test_what_cannot_be_is_refused(given: dict[str, object], message: str) -> No
         GeometryControl(**given)  # type: ignore[arg-type]
 
 
+@pytest.mark.medium
 def test_a_render_shows_the_shape_and_starts_with_the_old_one() -> None:
     scene = advsearch.load_scene("mug")
     render = scene.renderer([GeometryControl(epsilon=0.1)], resolution=32, denoise="none")

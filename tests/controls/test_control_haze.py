@@ -37,6 +37,7 @@ def haze(density: float, albedo: list[float]) -> dict[str, Tensor]:
     return {"haze.density": torch.tensor([density]), "haze.albedo": torch.tensor(albedo)}
 
 
+@pytest.mark.medium
 def test_density_0_is_the_scene_without_haze() -> None:
     without = MitsubaScene(plain(), (SIDE, SIDE))
     pairs = [(without.radiance({}, seed, 256), hazy().radiance(haze(0.0, WHITE), seed, 256)) for seed in range(4)]
@@ -46,6 +47,7 @@ def test_density_0_is_the_scene_without_haze() -> None:
     assert float((clear - seen).square().mean().sqrt()) < 1.3 * spread
 
 
+@pytest.mark.medium
 def test_black_haze_takes_light_out_as_beer_and_lambert_say() -> None:
     """An environment of radiance 1 seen past the object: exp(-density * length through the ball)."""
     white = EnvironmentAsset("white", np.ones((8, 16, 3), np.float32))
@@ -72,11 +74,13 @@ def test_white_haze_under_even_light_stays_white() -> None:
     assert float(furnace.radiance(haze(0.3, WHITE), 0, 64).mean()) == pytest.approx(0.985, abs=0.02)
 
 
+@pytest.mark.medium
 def test_dense_white_haze_hides_the_object() -> None:
     contrasts = [float(hazy().radiance(haze(density, WHITE), 0, 256).std()) for density in (0.0, 0.1, 0.3)]
     assert contrasts[0] > 1.3 * contrasts[1] > 1.5 * contrasts[2]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("density", "steps"),
     [

@@ -80,6 +80,7 @@ def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription
     assert power(x=[-1, 1], power=2) == 2.0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("type", ["area", "point"])
 def test_a_dark_lamp_changes_nothing_even_in_view(scene: SceneDescription, type: str) -> None:
     lamp = LightControl(type=type, x=[-1, 1], y=0.0, z=0.9, power=0)
@@ -98,6 +99,7 @@ def test_lamps_in_impossible_places_make_finite_pictures(
     assert bool(torch.isfinite(seen).all())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("type", ["area", "point"])
 def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDescription, type: str) -> None:
     control = LightControl(type=type, x=0.8, y=-0.8, z=2, power=[0, 10], red=[0.5, 1])

@@ -36,6 +36,7 @@ def scene() -> SceneDescription:
 # ---- patterns -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", PATTERNS)
 def test_a_tile_continues_across_its_edges(name: str) -> None:
     texels = tile(name)
@@ -108,6 +109,7 @@ def test_a_tint_multiplies_reflectance_and_lies_over_a_searched_texture(scene: S
     assert BASE_COLOR in bound.refines
 
 
+@pytest.mark.medium
 def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDescription) -> None:
     names = ["own", "steel"]
     bound = MaterialControl(which=names, roughness=0.77).bind(scene)
@@ -192,6 +194,7 @@ def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
     assert float((pictures[0] - pictures[1]).abs().max()) > 0.02
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -167,6 +167,7 @@ def test_zero_leaves_the_scene_as_it_is() -> None:
     assert occluded.space.describe(u)["occlusion.hidden"]["value"] == 0.0  # type: ignore[attr-defined]
 
 
+@pytest.mark.medium
 def test_it_comes_in_without_a_jump(scene: SceneDescription) -> None:
     control = OcclusionControl(coverage=[0, 0.4], direction=0.0)
     bound = control.bind(control.prepare(scene))
@@ -214,6 +215,7 @@ def test_an_object_out_of_the_frame_needs_no_occluder(scene: SceneDescription) -
     assert float(inputs["occlusion.to_world"][:3, 0].norm()) < 0.01
 
 
+@pytest.mark.medium
 def test_extremes_render_finite_with_finite_gradients() -> None:
     render = advsearch.load_scene("mug").renderer([OcclusionControl()], resolution=16)
     for share in (0.0, 1.0):

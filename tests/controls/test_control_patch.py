@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from covering import only
 from PIL import Image
 from torch import Tensor
 
@@ -22,6 +21,7 @@ from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
 from advsearch.scene.raster import MeshSurface, rasterised
+from covering import only
 
 SIDE = 512
 
@@ -101,6 +101,7 @@ def test_a_ray_meets_the_near_wall_and_a_ray_that_misses_the_nearest_corner(scen
 # ---- where it lies ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_the_patch_has_its_size_on_the_surface(scene: SceneDescription) -> None:
     for size in (0.1, 0.3, 0.5):
         control = bound(scene, azimuth=180.0, height=0.5, size=size)
@@ -109,6 +110,7 @@ def test_the_patch_has_its_size_on_the_surface(scene: SceneDescription) -> None:
         assert area == pytest.approx(size**2, rel=0.04)
 
 
+@pytest.mark.medium
 def test_it_bleeds_through_no_wall(scene: SceneDescription, surface: tuple[Floats, Floats, Floats]) -> None:
     positions, normals, _ = surface
     inside = covered(bound(scene, azimuth=180.0, height=0.5, size=0.5)) > 0.01
@@ -141,6 +143,7 @@ def test_its_top_is_up_and_its_left_is_left(scene: SceneDescription, surface: tu
         assert sign * trend > 0.9  # rows run downwards; seen from +x, y runs to the right
 
 
+@pytest.mark.medium
 def test_a_quarter_turn_is_a_turned_picture(scene: SceneDescription) -> None:
     generator = torch.Generator().manual_seed(0)
     pixels = torch.rand(8, 8, 3, generator=generator)
@@ -156,6 +159,7 @@ def test_it_faces_the_camera_by_default(scene: SceneDescription) -> None:
     assert towards_camera(turned)[0] == pytest.approx(azimuth - 30.0, abs=1e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_every_object_takes_a_patch_anywhere(name: str) -> None:
     scene = describe(name)
@@ -173,6 +177,7 @@ def test_every_object_takes_a_patch_anywhere(name: str) -> None:
 # ---- how it is painted -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_it_starts_as_what_is_underneath(scene: SceneDescription) -> None:
     control = bound(scene, resolution=64)
     start = control.inputs(control.start)[BASE_COLOR]
@@ -195,6 +200,7 @@ def test_it_is_painted_over_what_came_before(scene: SceneDescription) -> None:
     torch.testing.assert_close(found[share == 0.0], red[0, 0].expand(int((share == 0.0).sum()), 3))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("turn", [1, -1])
 def test_a_patch_lies_on_any_material(scene: SceneDescription, turn: int) -> None:
     """In whatever order the two are asked for."""
@@ -208,6 +214,7 @@ def test_a_patch_lies_on_any_material(scene: SceneDescription, turn: int) -> Non
     assert float(color.amin(dim=-1).max()) > 0.99 > float(alone.amin(dim=-1).max())
 
 
+@pytest.mark.medium
 def test_two_patches_and_a_texture_compose(scene: SceneDescription) -> None:
     controls = [
         PatchControl("left", azimuth=20, size=0.2),
@@ -226,6 +233,7 @@ def test_two_patches_and_a_texture_compose(scene: SceneDescription) -> None:
     assert float((after - before).abs().amax(dim=-1).gt(1e-6).float().mean()) < 0.2
 
 
+@pytest.mark.medium
 def test_derivatives_are_those_of_differences(scene: SceneDescription) -> None:
     control = bound(scene, size=[0.1, 0.5], rotation=[-180, 180], resolution=4)
     generator = torch.Generator().manual_seed(1)
@@ -257,6 +265,7 @@ def test_corners_of_the_box_are_finite(scene: SceneDescription) -> None:
 # ---- what may be asked for -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_groups_say_what_is_searched(scene: SceneDescription) -> None:
     pixels = bound(scene)
     assert [group.parameter for group in pixels.groups] == ["pixels"] and len(pixels.start) == 32 * 32 * 3
@@ -279,6 +288,7 @@ def test_a_printers_gamut_narrows_the_pixels(scene: SceneDescription) -> None:
     assert control.groups[0].budget.epsilon == pytest.approx(0.1 * math.sqrt(48) / 0.6)
 
 
+@pytest.mark.medium
 def test_what_is_kept_can_be_printed_and_stuck_on_again(scene: SceneDescription, tmp_path: Path) -> None:
     control = bound(scene, resolution=16)
     u = torch.rand(control.start.shape, generator=torch.Generator().manual_seed(2))
@@ -339,6 +349,7 @@ def test_names_and_files_that_do_not_exist_are_explained(scene: SceneDescription
         bound(scene, picture=str(tmp_path / "none.png"), azimuth=[0, 360])
 
 
+@pytest.mark.medium
 def test_a_render_shows_the_patch_and_changes_by_the_step_times_the_adjoint() -> None:
     render = advsearch.load_scene("mug").renderer([PatchControl(size=0.5, resolution=8)], resolution=32, denoise="none")
     u = torch.full_like(render.start, 0.5, requires_grad=True)

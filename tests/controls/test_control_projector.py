@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from samples import make_attacked
 from torch import Tensor, nn
 
 import advsearch
@@ -29,6 +28,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer, predicting, why_not
 from advsearch.scene.transport.matrix import LinearRenderer
+from samples import make_attacked
 
 DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
 SIDE = 32
@@ -80,6 +80,7 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     assert torch.allclose(under, torch.full_like(under, expected), rtol=0.02)
 
 
+@pytest.mark.medium
 def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
     lit = {
         name: space_of(renderer_of(object, name)) for object, name in (("stop-sign", "avenue-dusk"), ("mug", "studio"))
@@ -92,6 +93,7 @@ def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
     assert not any("lux" in note for note in lit["avenue-dusk"].notes(dusk.scene))
 
 
+@pytest.mark.medium
 def test_the_picture_without_light_is_that_without_a_projector_and_all_others_are_brighter() -> None:
     renderer = renderer_of()
     some = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(0))
@@ -102,6 +104,7 @@ def test_the_picture_without_light_is_that_without_a_projector_and_all_others_ar
     assert float((ours - plain).abs().mean()) < 0.01 * float(plain.mean())
 
 
+@pytest.mark.medium
 def test_the_adjoint_is_the_difference() -> None:
     renderer = renderer_of()
     scene, generator = renderer.scene, torch.Generator().manual_seed(2)
@@ -114,6 +117,7 @@ def test_the_adjoint_is_the_difference() -> None:
     assert float((gradient * change).sum()) == pytest.approx(after - before, rel=ROUNDING)
 
 
+@pytest.mark.medium
 def test_a_black_picture_is_checked_at_grey() -> None:
     """At black there is a bend, of which differences to both sides see the half."""
     renderer = renderer_of()
@@ -144,6 +148,7 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
     assert cosine > 0.99, (ours, theirs)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("object", ["mug", "stop-sign"])
 def test_the_matrix_predicts_what_is_traced(object: str) -> None:
     renderer = renderer_of(object, "studio", side=24)
@@ -158,6 +163,7 @@ def test_the_matrix_predicts_what_is_traced(object: str) -> None:
     assert float(told.sum()) == pytest.approx(float(traced.sum()), rel=0.03)
 
 
+@pytest.mark.medium
 def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
     scene = advsearch.load_scene("mug")
     controls = [
@@ -175,6 +181,7 @@ def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
     assert float((told - traced).abs().mean()) < 0.03 * float(traced.mean())
 
 
+@pytest.mark.medium
 def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_path: Path) -> None:
     renderer = renderer_of()
     u = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(3))
@@ -202,6 +209,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 ONE_TEXEL = 16 * 16 * 3 // 2
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", CASES)
 def test_pictures_and_gradients_are_finite_at_the_ends(case: str) -> None:
     settings, given = CASES[case]
@@ -217,6 +225,7 @@ def test_pictures_and_gradients_are_finite_at_the_ends(case: str) -> None:
         assert case == "no lumens" or (u.grad is not None and bool(torch.isfinite(u.grad).all()))
 
 
+@pytest.mark.medium
 def test_light_reaches_a_glass_and_its_gradient_is_finite() -> None:
     renderer = renderer_of("wine-glass", side=16)
     u = torch.full_like(renderer.start, 0.5).requires_grad_()
@@ -260,6 +269,7 @@ def glare() -> advsearch.Model:
     return advsearch.load_model(Glare(0.8), labels=("mug", "glare"), input_size=16, name="glare")
 
 
+@pytest.mark.medium
 def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, tmp_path: Path) -> None:
     result = advsearch.attack(
         "mug", glare, controls={"projector": {"resolution": 4}}, resolution=16, steps=16, trials=6,
@@ -278,6 +288,7 @@ def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, 
     assert any(kind.startswith("ambient ") for kind in kinds)
 
 
+@pytest.mark.medium
 def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"resolution": 4, "lumens": 10}
     config = AttackConfig(object="mug", controls={"projector": settings}, resolution=16)
@@ -296,6 +307,7 @@ def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> Non
         write_projection(run, tmp_path / "out")
 
 
+@pytest.mark.medium
 def test_one_picture_holds_over_cameras(glare: advsearch.Model) -> None:
     result = advsearch.attack(
         "mug", glare, controls={"projector": {"resolution": 4}},

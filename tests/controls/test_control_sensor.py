@@ -103,6 +103,7 @@ def test_compression_is_a_jpeg_file_and_its_derivative_that_of_the_picture() -> 
     assert image.grad is not None and float((image.grad - 1.0).abs().median()) < 1e-3
 
 
+@pytest.mark.medium
 def test_the_derivatives_are_those_of_differences() -> None:
     image = 0.3 + 0.4 * random_picture(6, 8).double()
     inside = [0.4, 0.003, 0.05, 0.02, 0.6, 0.2, -0.3]

@@ -32,6 +32,7 @@ def space_of(renderer: Renderer) -> Space:
     return renderer.space
 
 
+@pytest.mark.medium
 def test_there_is_none_at_the_start() -> None:
     renderer = renderer_of()
     without = advsearch.load_scene("mug", environment="noon").renderer(["lens"], resolution=SIDE)
@@ -39,6 +40,7 @@ def test_there_is_none_at_the_start() -> None:
     assert float((ours - theirs).abs().mean()) < 1e-3 * float(theirs.mean())
 
 
+@pytest.mark.medium
 def test_it_takes_light_away_and_the_camera_sees_no_card() -> None:
     renderer = renderer_of(size=[0, 1])
     low, high = (renderer.radiance(torch.tensor([u]), seed=1, spp=256) for u in (0.0, 0.6))
@@ -80,6 +82,7 @@ def test_the_card_is_a_polygon_that_faces_the_object() -> None:
     assert float((torch.from_numpy(camera_to_world(scene))[:3, 3].float() - pose[:3, 3]).norm()) > 0.5
 
 
+@pytest.mark.medium
 def test_it_is_searched_with_a_projector_and_differentiated_by_differences() -> None:
     scene = advsearch.load_scene("mug", environment="noon")
     controls = [make_control("shadow", {"size": [0, 1]}), make_control("projector", {"resolution": 4})]
@@ -100,6 +103,7 @@ class Sure(nn.Module):
         return torch.stack([5.0 - light, light], dim=1)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", ["projector", "shadow"])
 def test_light_is_searched_over_cameras_and_environments_and_along_a_path(control: str) -> None:
     given: dict[str, Any] = {"projector": {"resolution": 4}, "shadow": {"size": [0, 1]}}

@@ -195,6 +195,7 @@ def test_angles_are_right_and_differentiable_everywhere() -> None:
     assert towards.grad is not None and bool(torch.isfinite(towards.grad).all())
 
 
+@pytest.mark.medium
 def test_the_adjoint_of_turbidity_agrees_with_differences(scene: SceneDescription) -> None:
     control = SkyControl(turbidity=[2, 8], exposure="fixed")
     prepared = control.prepare(scene)

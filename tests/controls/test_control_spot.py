@@ -36,6 +36,7 @@ def raw(renderer: Renderer, u: Tensor) -> Tensor:
     return renderer.scene.radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, 16)
 
 
+@pytest.mark.medium
 def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
     control = spot_of(renderer_of(width=0.3, x=0.1, lumens=[0, 10]))
     thrown = control.thrown(control.values(torch.ones(1)))
@@ -47,6 +48,7 @@ def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
     assert float(thrown.detach().sum(dim=(0, 2)).argmax()) > control.part.sides[1] / 2  # to the right
 
 
+@pytest.mark.medium
 def test_it_only_adds_light_and_there_is_none_at_the_start() -> None:
     renderer = renderer_of()
     assert [group.parameter for group in renderer.plan.groups] == list(NUMBERS)
@@ -56,6 +58,7 @@ def test_it_only_adds_light_and_there_is_none_at_the_start() -> None:
     assert told["spot.lux"]["value"] == 0.0 and spot_of(renderer).moved == ()
 
 
+@pytest.mark.medium
 def test_the_adjoint_is_the_difference() -> None:
     renderer = renderer_of()
     assert {group.estimator for group in renderer.plan.groups} == {"adjoint"}
@@ -87,6 +90,7 @@ def test_out_of_focus_the_light_is_as_much_and_spreads() -> None:
     assert out_of_focus(light, torch.tensor(0.0)) is light
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["projector", "spot"])
 def test_a_flashing_light_is_on_in_half_of_each_period(kind: str) -> None:
     settings = {"lumens": 500} if kind == "spot" else {"resolution": 4, "start": "grey"}

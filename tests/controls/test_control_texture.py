@@ -174,6 +174,7 @@ def test_what_cannot_be_is_refused(given: dict[str, object], message: str) -> No
         TextureControl(**given)  # type: ignore[arg-type]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("form", ["palette", "waves"])
 def test_a_render_changes_by_the_step_times_the_adjoint(form: str) -> None:
     render = advsearch.load_scene("mug").renderer(

@@ -102,6 +102,7 @@ def test_where_it_stands_is_said_as_things_are_asked_for(scene: SceneDescription
     np.testing.assert_allclose(vertices(space, u, "chair"), placed, atol=5e-3)  # the car's middle is not its box's foot
 
 
+@pytest.mark.medium
 def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
     space = space_of(scene, {"x": [-7.0, 7.0], "y": [-3.0, 3.0], "heading": [-180.0, 180.0]})
     pushed = 0
@@ -124,6 +125,7 @@ def test_it_is_moved_no_farther_than_it_takes(scene: SceneDescription) -> None:
     assert overlapping(nearer, car) and not overlapping(placed, car)
 
 
+@pytest.mark.medium
 def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: SceneDescription) -> None:
     object_moves = {"x": [0.3, 0.9]}
     others: dict[str, Any] = {"pose": object_moves, "pose:chair": {"y": [-0.6, 0.6]}}
@@ -145,6 +147,7 @@ def test_nothing_stands_where_the_camera_is() -> None:
     assert placed.outline[:, 0].min() > 11.0 and np.abs(placed.outline[:, 1].mean()) < 0.2
 
 
+@pytest.mark.medium
 def test_on_a_pavement_it_stands_as_high_as_that() -> None:
     scene = describe("car", "avenue", things="person@6,-1")
     space = space_of(scene, {"y": [-3.0, 0.0]})
@@ -152,6 +155,7 @@ def test_on_a_pavement_it_stands_as_high_as_that() -> None:
     assert low == pytest.approx([0.0, 0.12], abs=CLOSE)
 
 
+@pytest.mark.medium
 def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> None:
     settings = {"camera.distance": 6.0, "camera.azimuth": 20.0, "camera.elevation": 25.0}
     pictures = []

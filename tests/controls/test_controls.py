@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import ROOT
-from hostile import SHORT, shown
 
 from advsearch import load_scene
 from advsearch.controls import CONTROLS, Control, TextureControl, make_control, make_space
@@ -17,6 +15,8 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
+from conftest import ROOT
+from hostile import SHORT, shown
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
 NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]}}
@@ -118,6 +118,7 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
         assert name.startswith(control.name + ".") and value["unit"] and isinstance(value["value"], (float, str))
 
 
+@pytest.mark.medium
 @every_control
 def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     control = make_control(kind, NEEDED.get(kind))
@@ -127,6 +128,7 @@ def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["light", "projector", "spot", "shadow", "occlusion", "patch"])
 def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
     space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], describe("mug"))

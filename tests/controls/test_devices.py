@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import ROOT
-from elsewhere import ELSEWHERE, Away, elsewhere
 
 import advsearch
 from advsearch.controls import CONTROLS, compose, make_control
 from advsearch.controls.corruption import NAMES
+from conftest import ROOT
+from elsewhere import ELSEWHERE, Away, elsewhere
 
 PICTURE = str(ROOT / "advsearch/bundled/data/objects/book/base_color.png")
 
@@ -47,6 +47,7 @@ CASES = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("kind", "given"), CASES)
 def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given: dict[str, Any]) -> None:
     beside = "bottle@0.4,0.1" if kind == "things" else None

@@ -37,6 +37,7 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> advsearch.Scene:
     return advsearch.load_scene(f"{path}#large-box")
 
 
+@pytest.mark.medium
 def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, tmp_path: Path) -> None:
     changed = mitsuba().cornell_box()
     changed["red"]["reflectance"]["value"] = [0.3] * 3
@@ -72,6 +73,7 @@ def test_the_start_is_the_scene_as_it_is(box: advsearch.Scene) -> None:
     np.testing.assert_allclose(renderer.start, [0.570068, 0.0430135, 0.0443706], rtol=1e-5)
 
 
+@pytest.mark.medium
 def test_adjoints_agree_with_differences(box: advsearch.Scene) -> None:
     controls, loss = {f"mitsuba:{RED}": [0.1, 0.9], f"mitsuba:{GLOW}": [1, 30]}, smooth_loss((SIZE, SIZE))
     found = []
@@ -90,6 +92,7 @@ def test_a_plain_number_changes_recorded_renders(box: advsearch.Scene) -> None:
     assert renderer.plan.groups[0].estimator == "differences"
 
 
+@pytest.mark.medium
 def test_bundled_scenes_have_such_names_too() -> None:
     scene = advsearch.load_scene("mug")
     ground = "ground.bsdf.brdf_0.reflectance.value"

@@ -190,6 +190,7 @@ def test_names_are_those_of_the_file(ending: str, names: set[str], tmp_path: Pat
         assert set(found) == names
 
 
+@pytest.mark.medium
 def test_a_baked_texture_says_how_much_finer_its_pictures_were(tmp_path: Path) -> None:
     names, size = ("a", "b", "c", "d"), 1024
     Image.new("RGB", (size, size), (10, 20, 30)).save(tmp_path / "p.png")
@@ -237,6 +238,7 @@ def test_import_lists_materials_and_says_what_is_slow(file: Path, capsys: pytest
 FORMS: list[dict[str, object]] = [{}, {"form": "palette"}, {"form": "waves", "epsilon": 0.3}]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("form", FORMS)
 def test_only_the_texels_of_the_materials_are_painted(scene: advsearch.Scene, form: dict[str, object]) -> None:
     control = make_control("texture", {"materials": ["Body Paint", "roof"], **form})
@@ -338,6 +340,7 @@ def levels(one: Tensor, other: Tensor) -> float:
     return 255.0 * float(((one - other) ** 2).mean().sqrt())
 
 
+@pytest.mark.medium
 def test_a_matrix_predicts_what_is_painted_beside_and_behind_glass(scene: advsearch.Scene) -> None:
     """Half of the light passes through the glass, which lets the matrix see what is behind it."""
     renderer = scene.renderer({"texture": {"materials": ["Body Paint", "glass"]}}, resolution=32)
@@ -361,6 +364,7 @@ class Red(torch.nn.Module):
         return torch.stack([car, -car], dim=1)
 
 
+@pytest.mark.medium
 def test_a_search_over_the_paint_of_a_car_with_glass_renders_nothing(file: Path, tmp_path: Path) -> None:
     """All other texels are those of the file, also in what is kept; what is printed is the paint."""
     model = advsearch.load_model(Red(), labels=["car", "van"], input_size=32, name="red")
@@ -414,6 +418,7 @@ def test_what_could_be_done_so_that_steps_are_predicted(
     assert remark(too_large).startswith("Each step of the search is rendered, which takes several times")
 
 
+@pytest.mark.medium
 def test_a_search_that_needlessly_renders_each_step_says_so() -> None:
     model = advsearch.load_model(Red(), labels=["vase", "mug"], input_size=32, name="red")
     settings: Any = {"resolution": 16, "steps": 16, "trials": 6, "baseline": False, "verify_spp": 1, "spp": 1}

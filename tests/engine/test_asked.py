@@ -55,6 +55,7 @@ def pinker(logits: Tensor, images: Tensor, labels: Tensor, texture: Tensor) -> T
     return -(texture - PINK).abs().mean(dim=(1, 2, 3))
 
 
+@pytest.mark.medium
 def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
     """Nearly every texel ends where its budget lets it be next to the colour that is sought."""
     settings: dict[str, Any] = {**SMALL, "steps": 16, "denoise": "oidn", "policy": "pgd"}
@@ -68,6 +69,7 @@ def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
     assert tried.answer.mean == pytest.approx(float(pinker(PINK, PINK, PINK, found[None])), abs=1e-5)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("over", [{}, {"camera": {}}], ids=["alone", "over conditions"])
 def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
     over: dict[str, Any], scene: advsearch.Scene, monkeypatch: pytest.MonkeyPatch
@@ -130,6 +132,7 @@ def test_what_is_asked_for_is_of_every_picture(scene: advsearch.Scene) -> None:
         asked("configuration").get("camera.azimut")
 
 
+@pytest.mark.medium
 def test_a_texture_that_is_not_there_is_refused_before_anything_is_rendered(scene: advsearch.Scene) -> None:
     with pytest.raises(InputError, match=r"asks for `texture`, .* got camera; add `texture` or `patch`"):
         advsearch.attack(scene, sure(), controls="camera", objective=pinker, **SMALL)

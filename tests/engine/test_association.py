@@ -41,6 +41,7 @@ def test_wrong_predictions_are_shared_out_to_the_last() -> None:
     assert counts.chance[:, 1].mean() == pytest.approx(4 * 3 / 9, abs=0.2)
 
 
+@pytest.mark.medium
 def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
     random, told = np.random.default_rng(3), 0
     for trial in range(60):
@@ -74,6 +75,7 @@ def test_predictions_of_a_drive_are_exchanged_whole() -> None:
     assert len({tuple(one) for one in shared.tolist()}) == 6, "in all orders"
 
 
+@pytest.mark.medium
 def test_parts_that_some_drives_show_are_told_from_chance_by_drive() -> None:
     """Six drives of ten frames, each all wrong or all right: row by row, a part that three show would be told."""
     told = 0

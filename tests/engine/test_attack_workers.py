@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import shared
 
 import advsearch
 from advsearch.cli.output import shown_text as text_of
@@ -17,6 +16,7 @@ from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import Row, Store
+from stand_ins import shared
 
 SMALL: dict[str, Any] = {
     "object": "mug", "controls": {"pose": {}}, "policy": "cmaes", "steps": 9, "trials": 6, "average": 3,
@@ -37,6 +37,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> AttackResult:
     return attack_once(AttackConfig(**SMALL, run=str(tmp_path_factory.mktemp("alone") / "run")))
 
 
+@pytest.mark.medium
 def test_workers_have_the_rows_of_none(alone: AttackResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is done beforehand: populations, the random search, both rankings, the trials of all groups, the average."""
     ready = shared(monkeypatch, SMALL)
@@ -54,6 +55,7 @@ def test_workers_have_the_rows_of_none(alone: AttackResult, tmp_path: Path, monk
     assert alone.summary.shared is None
 
 
+@pytest.mark.medium
 def test_a_picture_of_which_every_worker_dies_is_a_row_that_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,6 +76,7 @@ class Impatient(advsearch.progress.NullProgress):
             raise KeyboardInterrupt
 
 
+@pytest.mark.medium
 def test_what_is_stored_is_not_asked_of_workers(
     alone: AttackResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,6 +89,7 @@ def test_what_is_stored_is_not_asked_of_workers(
     assert 0 < len(rest.given) < 9 + 9 + 2 * 6 + 6 + 3 and whole.given
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", ["projector", "shadow"])
 def test_light_is_searched_by_workers_and_goes_on(
     control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -104,6 +108,7 @@ def test_light_is_searched_by_workers_and_goes_on(
 RESTARTS = {"name": "restarts", "times": 3}
 
 
+@pytest.mark.medium
 def test_searches_side_by_side_have_the_rows_of_one_after_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +135,7 @@ def test_what_is_loaded_already_is_not_shared() -> None:
         advsearch.attack(advsearch.load_scene("mug"), workers=2)
 
 
+@pytest.mark.medium
 def test_workers_try_a_picture_in_other_ambient_light(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings: dict[str, Any] = {
         "object": "mug", "controls": {"projector": {"resolution": 4}}, "model": "small_models:easy", "label": "mug",

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import Impatient, rows, shared
 
 import advsearch
 from advsearch.attacks.domain import Block, Domain
@@ -21,6 +20,7 @@ from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.surface import renderer as surface_renderer
+from stand_ins import Impatient, rows, shared
 
 SMALL: dict[str, Any] = {
     "resolution": 48,
@@ -79,6 +79,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackResult]
         return run, advsearch.attack("mug", run=run, **SMALL)
 
 
+@pytest.mark.medium
 def test_a_search_says_what_its_bank_was(whole: tuple[Path, AttackResult]) -> None:
     """Six conditions, and another one every second evaluation of the first half: three until the comparison at 6, and
     one after it. That at 12 comes when it grows no more."""
@@ -90,6 +91,7 @@ def test_a_search_says_what_its_bank_was(whole: tuple[Path, AttackResult]) -> No
     assert renders["products"] == 18 * 2 and renders["gradient"] == 0
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("growing")
 def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(14), **SMALL)
@@ -98,6 +100,7 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Attack
     assert rows(tmp_path / "parts") == rows(whole[0])
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 @pytest.mark.usefixtures("growing")
 def test_workers_make_the_matrices_and_the_rows_stay(
@@ -114,6 +117,7 @@ def test_workers_make_the_matrices_and_the_rows_stay(
         attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "lost")))
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 @pytest.mark.usefixtures("growing")
 def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
@@ -136,6 +140,7 @@ def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
     assert found.summary.transport.conditions.grown == 2
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("growing")
 def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is memory for two or three, the newest are kept and nothing fails."""
@@ -154,6 +159,7 @@ def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> Non
     assert kept[-1] == list(range(10 - len(kept[-1]), 10))
 
 
+@pytest.mark.medium
 def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Under each condition, but for noise and what a matrix leaves out; and the derivative is the weighted mean."""
     seen: list[Bank] = []
@@ -184,6 +190,7 @@ def test_conditions_that_are_all_alike_count_the_same() -> None:
         assert hard_first(values).tolist() == [1.0] * len(values)
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("growing")
 def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where unseen conditions are no better for the model, there are no more after the first comparison."""

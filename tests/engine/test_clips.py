@@ -56,6 +56,7 @@ def network(kind: str) -> Any:
     return made.eval()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["VideoMAE", "Timesformer", "Vivit"])
 def test_a_clip_is_classified_as_by_the_network_itself(kind: str) -> None:
     """And its gradient is that of central differences, for all frames."""
@@ -85,6 +86,7 @@ def test_a_clip_is_classified_as_by_the_network_itself(kind: str) -> None:
     assert float((slope * along).sum()) == pytest.approx((above - below) / 2e-4, rel=1e-3)
 
 
+@pytest.mark.medium
 def test_a_folder_with_a_processor_is_read_by_measurement(tmp_path: Path) -> None:
     given, processor = network("VideoMAE"), transformers.VideoMAEImageProcessor
     try:
@@ -105,6 +107,7 @@ def test_a_folder_with_a_processor_is_read_by_measurement(tmp_path: Path) -> Non
     assert float((own[0] - asked).abs().max()) < 1e-4
 
 
+@pytest.mark.medium
 def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     """The first bit for bit, the others with noise of their own, as in stills at these times."""
     scene = advsearch.load_scene("mug", camera=clip(tmp_path)).description
@@ -123,6 +126,7 @@ def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     assert float((pictures[3] - pictures[0]).abs().mean()) > 0.02
 
 
+@pytest.mark.medium
 def test_an_attack_on_a_video_classifier_is_carried_out(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
@@ -136,6 +140,7 @@ def test_an_attack_on_a_video_classifier_is_carried_out(tmp_path: Path) -> None:
     assert tuple(found.clean.shape) == (SIDE, FRAMES * SIDE, 3)
 
 
+@pytest.mark.medium
 def test_clips_of_nothing_that_moves_and_with_times_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing knows a time"):
         advsearch.load_scene("mug", camera=clip(tmp_path)).renderer("light", resolution=16)

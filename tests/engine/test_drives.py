@@ -97,6 +97,7 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
     assert (said.first_seen and said.first_seen.mean) == (None if first is None else pytest.approx(first, abs=1e-3))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("workers", [False, True])
 def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_same(
     tmp_path: Path, workers: bool
@@ -114,6 +115,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
     assert away == pytest.approx({0.0: 14.0, 1.0: 11.0, 2.0: 8.0, 3.0: 5.0, 4.0: 2.0}, abs=1e-4)
 
 
+@pytest.mark.medium
 def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
     path = tmp_path / "run"
@@ -147,6 +149,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     assert "Whole drives" in (path / "report.html").read_text()
 
 
+@pytest.mark.medium
 def test_two_models_are_compared_and_explained_by_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One is right in the last frames of each drive, the other in the first: as often, and row by row far apart."""
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
@@ -166,6 +169,7 @@ def test_two_models_are_compared_and_explained_by_drive(tmp_path: Path, monkeypa
     assert "few show little" in told.warnings[0]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("grid", [{}, {"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, {"pose.yaw": [0, 90]}])
 @pytest.mark.parametrize("samples", [1, 3])
 def test_frames_of_a_drive_share_their_draws_and_drives_do_not(grid: dict[str, Any], samples: int) -> None:
@@ -191,6 +195,7 @@ CONFIG = SweepConfig(
 )  # fmt: skip
 
 
+@pytest.mark.medium
 def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
         alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
@@ -335,6 +340,7 @@ def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
         advsearch.attack("mug", controls="texture", path="orbit")
 
 
+@pytest.mark.medium
 def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
     size: dict[str, Any] = {
@@ -387,6 +393,7 @@ class Along(FakeRenderer):
         return torch.full((*self.size, 3), (round(float(str(values["path.time"]["value"]))) + further) / 25.5)
 
 
+@pytest.mark.medium
 def test_drives_on_several_paths_have_numbers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Right in two of five frames of `approach` and in all of `orbit`, whose distance is always one."""
     monkeypatch.setattr(swept_scene, "make_renderer", Along)
@@ -402,6 +409,7 @@ def test_drives_on_several_paths_have_numbers_of_their_own(tmp_path: Path, monke
     assert "path.way" in (text := text_of(result.summary)) and "2 of 5" in text
 
 
+@pytest.mark.medium
 def test_drawn_paths_are_the_same_with_the_same_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(swept_scene, "make_renderer", Along)
     given = {**DRIVE, "path": "approach,orbit", "samples": 12, "sampler": "random"}

@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from samples import attack, make_run, written_page
-from stand_ins import StandInProblem
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
@@ -24,6 +22,8 @@ from advsearch.questions.attack.display import failures_part, failures_text
 from advsearch.questions.attack.outcome import described_failures
 from advsearch.questions.attack.stages import TRIED, check_failures
 from advsearch.questions.attack.summary import DifferentFailures
+from samples import attack, make_run, written_page
+from stand_ins import StandInProblem
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
 

@@ -99,6 +99,7 @@ def test_every_estimator_that_a_control_names_exists() -> None:
 # ---- what estimators compute ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_differences_are_central_differences_of_the_picture_with_one_seed() -> None:
     render = renderer(["camera"], estimators={"*": "differences"})
     weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(1))
@@ -215,6 +216,7 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
     assert bool(gradient[:-1].any()) and float(gradient[-1]) != 0.0
 
 
+@pytest.mark.medium
 def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     """Mitsuba's own derivative of `to_world` has the wrong sign (docs/gradients.md); texels have the right one."""
     render = renderer(["environment.rotation"])
@@ -245,6 +247,7 @@ def test_the_adjoint_of_a_surface_agrees_with_differences_to_a_twentieth(paramet
 # ---- nothing stays behind -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("others", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_configuration_after_many_others_is_bitwise_that_of_a_fresh_scene(others: int) -> None:
     controls = {"pose": {}, "camera": {}, "environment": {}, "material": {"roughness": [0.1, 0.9]}}
@@ -259,6 +262,7 @@ def test_a_configuration_after_many_others_is_bitwise_that_of_a_fresh_scene(othe
         assert torch.equal(after, fresh(probe, seed=7, spp=4))
 
 
+@pytest.mark.medium
 def test_recordings_live_on_over_moves_and_gradients() -> None:
     """Mitsuba's recordings hold on to the memory of vertices, so that it has to stay theirs."""
     controls = {"pose": {"yaw": [0, 360], "x": [-0.2, 0.2]}}
@@ -378,6 +382,7 @@ def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
     assert max(steps) == pytest.approx(3.0 * before.groups[0].step)
 
 
+@pytest.mark.medium
 def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
     render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
     plan = measured_plan(Bench(render, smooth_loss((SIZE, SIZE)), interior_point(render), seed=0, spp=4), repeats=2)
@@ -563,6 +568,7 @@ def test_naming_one_parameter_searches_only_that() -> None:
         scene.renderer(["pose.yow"], resolution=16)
 
 
+@pytest.mark.medium
 def test_the_start_is_the_scene_as_it_is() -> None:
     scene = load_scene("mug")
     plain = scene.renderer({"texture": {"resolution": 256}}, resolution=32, denoise="none")
@@ -597,6 +603,7 @@ def test_a_lens_keeps_what_it_frames() -> None:
         assert float(reach) == pytest.approx(0.86, rel=1e-3)
 
 
+@pytest.mark.medium
 def test_the_start_is_the_scene_as_it_is_in_a_picture_that_is_not_square() -> None:
     scene = load_scene("mug")
     for size in ((32, 48), (48, 32)):
@@ -642,6 +649,7 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 # ---- the whole check ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
     config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
     checked = check.run(config)

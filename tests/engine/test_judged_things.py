@@ -38,6 +38,7 @@ def model() -> Any:
     return advsearch.load_model(Half(), input_size=48, task="segmentation", labels=["car", "stop sign"])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("judge", ["object", "stop-sign", "all"])
 def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: str, tmp_path: Path) -> None:
     found = advsearch.sweep(
@@ -57,6 +58,7 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
     assert all(row.correct for row in rows)
 
 
+@pytest.mark.medium
 def test_names_of_what_is_judged_are_checked_before_anything_is_rendered() -> None:
     for judge, error, said in (
         ("stop-sine", UnknownNameError, "Did you mean 'stop-sign'"),

@@ -57,6 +57,7 @@ def test_every_row_is_exposed_around_its_own_time_and_as_long(shutter: float, ro
     assert not rows[~within].any()
 
 
+@pytest.mark.medium
 def test_motion_blur_is_the_mean_of_64_stills(stills: Callable[[float, int, int], Tensor]) -> None:
     """With the same noise: every value, within two levels."""
     blurred = renderer([PathControl(**DRIVE, shutter=0.15)])
@@ -80,6 +81,7 @@ def test_motion_blur_is_the_mean_of_many_stills(stills: Callable[[float, int, in
     assert float(off.mean()) < LEVELS / 2 and float(off.flatten().quantile(0.95)) < LEVELS
 
 
+@pytest.mark.medium
 def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     stills: Callable[[float, int, int], Tensor],
 ) -> None:
@@ -120,6 +122,7 @@ def test_fewer_moments_than_rows_are_close_to_it(stills: Callable[[float, int, i
     assert float(blocks.abs().mean()) < LEVELS
 
 
+@pytest.mark.medium
 def test_a_derivative_of_a_texture_is_that_of_the_mean() -> None:
     moving = renderer([PathControl(**DRIVE, shutter=0.05), *as_controls({"texture": {}})])
     weight = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)).double()

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import samples
 import torch
 from torch import Tensor, nn
 
 import advsearch
+import samples
 from advsearch.attacks import Trials
 from advsearch.engine.record import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
@@ -88,6 +88,7 @@ class Broken(nn.Module):
         return torch.where((bright < 0.1)[:, None], logits * math.nan, logits)
 
 
+@pytest.mark.medium
 def test_a_region_has_no_verdict_where_the_model_says_nothing(tmp_path: Path) -> None:
     labels = tmp_path / "labels.txt"
     labels.write_text("mug\nbowl\nvase\n")
@@ -100,6 +101,7 @@ def test_a_region_has_no_verdict_where_the_model_says_nothing(tmp_path: Path) ->
         )
 
 
+@pytest.mark.medium
 def test_an_attack_keeps_what_the_model_could_not_say(tmp_path: Path) -> None:
     labels = ["mug", "bowl", "vase"]
     model = advsearch.load_model(Broken(), input_size=16, labels=labels)

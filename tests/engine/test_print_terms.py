@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from covering import only
-from small_models import easy
 
 import advsearch
 from advsearch.cli.output import shown_text as text_of
@@ -18,6 +16,8 @@ from advsearch.progress import Stages
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import method_facts, print_cost_text, renders_text
+from covering import only
+from small_models import easy
 
 SHORT: dict[str, Any] = {
     "controls": {"texture": {"epsilon": 0.3}}, "steps": 30, "trials": 6, "verify_spp": 4, "spp": 2, "denoise": "none",
@@ -33,6 +33,7 @@ def test_one_colour_is_smooth_and_the_set_is_printable() -> None:
     assert float(variation(board)) == pytest.approx(0.5)  # half of the pixels have a neighbour of another colour
 
 
+@pytest.mark.medium
 def test_predictions_are_nearer_to_ink() -> None:
     with_terms = advsearch.attack("mug", easy(), printable=True, **SHORT)
     without = advsearch.attack("mug", easy(), **SHORT)
@@ -62,6 +63,7 @@ def test_predictions_are_nearer_to_ink() -> None:
     assert found.clean.variation == pytest.approx(float(variation(clean)), rel=1e-4)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "stage", only(["searching without print terms"], ["searching without print terms", "checking what was found"])
 )

@@ -17,9 +17,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
-from covering import only
-from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
 from advsearch.engine.journal import Journal, Shared
@@ -33,6 +30,9 @@ from advsearch.runs.directory import RunDirectory, read_python_only
 from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import Config, PythonOnly
+from conftest import ROOT
+from covering import only
+from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
 
@@ -62,6 +62,7 @@ def kill_and_resume(folder: Path, policy: str) -> int:
     raise AssertionError("it does not get on")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("policy", only(["pgd"], POLICIES))
 def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, policy: str) -> None:
     code = "import sys, test_resume as t; print(t.kill_and_resume(t.Path(sys.argv[1]), sys.argv[2]))"
@@ -230,6 +231,7 @@ def test_what_a_search_was_told_comes_back_bit_for_bit_until_the_run_is_done(tmp
     assert not can_resume(tmp_path)
 
 
+@pytest.mark.medium
 def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:
     code = (
         "import sys; from advsearch.runs.directory import RunDirectory\n"

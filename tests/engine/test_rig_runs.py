@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from conftest import ROOT
 from test_rigs import RING, rig
 from torch import Tensor, nn
 
@@ -26,6 +25,7 @@ from advsearch.models import load_model
 from advsearch.runs.store import NAME, Store
 from advsearch.scene.geometry import camera_to_world, middle, object_to_world
 from advsearch.tasks import make_task
+from conftest import ROOT
 
 PAIR = "cameras: [{name: left}, {name: right, place: [0.6, 0, 0], turn: [-10, 2, 15], fov: 50}]"
 SWEEP = ["sweep", "--grid", "pose.yaw=0:360:4", "--batch", "1", "--trials", "0"]
@@ -54,6 +54,7 @@ def rows(run: Path) -> list[dict[str, Any]]:
         return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("words", "last"), [(SWEEP, 6), (ATTACK, 14)])
 def test_killed_between_two_cameras_it_ends_with_the_same_rows(tmp_path: Path, words: list[str], last: int) -> None:
     words = [*words, *RIG, "--camera", rig(tmp_path, PAIR)]
@@ -66,6 +67,7 @@ def test_killed_between_two_cameras_it_ends_with_the_same_rows(tmp_path: Path, w
     assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
 
 
+@pytest.mark.medium
 def test_two_workers_have_the_rows_of_none(tmp_path: Path) -> None:
     words = [*SWEEP, *RIG, "--camera", rig(tmp_path, PAIR)]
     assert main([*words, "--run", str(tmp_path / "alone")]) == 0
@@ -93,6 +95,7 @@ def projected(points: npt.NDArray[Any], pose: npt.NDArray[Any], fov: float, side
     return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("text", [RING, "cameras: [{}, {place: [0.02, 0, 0], turn: [-3, 2, 15], fov: 60}]"])
 def test_every_picture_has_the_box_of_an_independent_projection(tmp_path: Path, text: str) -> None:
     side, file = 64, rig(tmp_path, text)
@@ -182,6 +185,7 @@ def test_a_gradient_keeps_no_more_of_sixteen_cameras_than_of_four() -> None:
     assert more <= 16 * side * side * 3 * 4 < less, (less, more)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("layout", ["NKCHW", "NKHWC"])
 def test_a_program_that_takes_all_pictures_at_once_is_loaded_from_its_file(tmp_path: Path, layout: str) -> None:
     class Last(nn.Module):

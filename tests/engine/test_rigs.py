@@ -61,6 +61,7 @@ def camchain(folder: Path) -> str:
     return rig(folder, text)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["list", "camchain"])
 def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind: str) -> None:
     """The first bit for bit; the second as a camera of the same pose in a scene of its own."""
@@ -81,6 +82,7 @@ def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind:
     torch.testing.assert_close(pose[:3, :3], base[:3, :3], atol=1e-6, rtol=0.0)
 
 
+@pytest.mark.medium
 def test_cameras_around_the_object_are_those_of_as_many_azimuths(tmp_path: Path) -> None:
     ring = advsearch.load_scene("car", "street", camera=rig(tmp_path, RING)).description
     base = torch.from_numpy(camera_to_world(ring)).float()
@@ -91,6 +93,7 @@ def test_cameras_around_the_object_are_those_of_as_many_azimuths(tmp_path: Path)
         np.testing.assert_allclose(pose.numpy(), camera_to_world(turned), atol=1e-4)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("rule", "right"), [("any", [1, 1, 1, 0]), ("all", [1, 0, 0, 0]), ("vote", [1, 1, 0, 0]), ("mean", [1, 1, 0, 0])]
 )
@@ -108,6 +111,7 @@ def test_rules_are_those_worked_out_by_hand(rule: str, right: list[int]) -> None
     assert reached == right[::-1]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("text", [STEREO, RING])
 def test_an_attack_on_a_network_that_takes_all_pictures_is_found_and_verified(tmp_path: Path, text: str) -> None:
     file = rig(tmp_path, text)
@@ -125,6 +129,7 @@ def test_an_attack_on_a_network_that_takes_all_pictures_is_found_and_verified(tm
     assert len(cast("list[object]", kept.payload["pictures"])) == cameras
 
 
+@pytest.mark.medium
 def test_a_sweep_judges_each_picture_and_the_rig_by_its_rule(tmp_path: Path) -> None:
     model = advsearch.load_model(EachBlue(), labels=("car", "road"), input_size=24, name="blue")
     file, rights = rig(tmp_path, "cameras: [{}, {turn: [180, 0, 0]}]"), {}
@@ -158,6 +163,7 @@ def test_files_that_are_no_rig_are_refused(tmp_path: Path, text: str, message: s
         advsearch.load_scene("car", "street", camera=rig(tmp_path, text))
 
 
+@pytest.mark.medium
 def test_a_rig_and_its_task_belong_together(tmp_path: Path) -> None:
     model = advsearch.load_model(EachBlue(), labels=("car", "road"), input_size=24)
     with pytest.raises(InputError, match="has 2 cameras"):

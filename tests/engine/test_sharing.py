@@ -10,8 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import ROOT
-from stand_ins import StandInProblem, StandInWorkers
 
 from advsearch.attacks import Query
 from advsearch.cluster import InProcess
@@ -19,6 +17,8 @@ from advsearch.engine.journal import Journal, Shared, lost, worker_call
 from advsearch.errors import ClusterError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
+from conftest import ROOT
+from stand_ins import StandInProblem, StandInWorkers
 
 
 def queries(count: int, **more: Any) -> list[Query]:

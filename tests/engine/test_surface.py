@@ -116,6 +116,7 @@ def is_the_patch(table: SurfaceTable, run: Path) -> None:
     assert worse.sum() == table.worse and worse[round(0.28 * CELLS) : round(0.52 * CELLS)].sum() > 0.9 * table.worse
 
 
+@pytest.mark.medium
 def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path: Path) -> None:
     run = tmp_path / "run"
     summary = swept(run, Startled(), Never())
@@ -147,6 +148,7 @@ def test_tasks_beside_classification_have_such_a_map(tmp_path: Path, task: str, 
     is_the_patch(summary.surface.tables[0], tmp_path / "run")
 
 
+@pytest.mark.medium
 def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

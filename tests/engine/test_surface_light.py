@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import Impatient, rows, shared
 from torch import Tensor
 
 import advsearch
@@ -25,6 +24,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
+from stand_ins import Impatient, rows, shared
 
 SMALL: dict[str, Any] = {
     "resolution": 32,
@@ -73,6 +73,7 @@ def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
     monkeypatch.setattr(SurfaceLight, "_compare", found)
 
 
+@pytest.mark.medium
 def test_a_search_says_that_light_on_surfaces_predicted_it(whole: tuple[Path, AttackResult]) -> None:
     """All of its pictures, under three lights; a comparison before it, and two within, of two pictures each."""
     told, renders = whole[1].summary.transport, whole[1].summary.renders
@@ -82,6 +83,7 @@ def test_a_search_says_that_light_on_surfaces_predicted_it(whole: tuple[Path, At
     assert (renders["products"], renders["gradient"]) == (18 * 2, 0)
 
 
+@pytest.mark.medium
 def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     """Light and comparisons are found again."""
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **SMALL)
@@ -90,6 +92,7 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Attack
     assert rows(tmp_path / "parts") == rows(whole[0])
 
 
+@pytest.mark.medium
 def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two comparisons in a row are too far off: the first finds light anew, after the second pictures are traced."""
     off(monkeypatch, 1.0, 9.0, 9.0)
@@ -99,6 +102,7 @@ def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> 
     assert summary.renders["products"] == 12 * 2
 
 
+@pytest.mark.medium
 def test_matrices_predict_what_light_on_surfaces_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is too far off before the search."""
     off(monkeypatch, 9.0)
@@ -116,6 +120,7 @@ def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackRe
     return run, advsearch.attack("mug", run=run, **CAMERA)
 
 
+@pytest.mark.medium
 def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoints: tuple[Path, AttackResult]) -> None:
     """Two searches of 40 pictures, eight traced ones of each ranking; comparisons of two places after 0, 6, 12 and 24
     pictures. Rows say which were traced."""
@@ -128,6 +133,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     assert spp == {("search", None, 0), ("ranking", 8, 1)}
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
     viewpoints: tuple[Path, AttackResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -142,6 +148,7 @@ def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
     assert ready.given and rows(folder) == rows(viewpoints[0])
 
 
+@pytest.mark.medium
 def test_a_viewpoint_is_rendered_once_predictions_are_too_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """After two comparisons in a row: nothing is to be found anew. The random search is rendered, too."""
     off(monkeypatch, 1.0, 9.0, 9.0)
@@ -170,6 +177,7 @@ def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any]
     assert reason in str(against)
 
 
+@pytest.mark.medium
 def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
     """The derivative of the texture is predicted, too; the camera is found without one."""
     summary = advsearch.attack("mug", **CAMERA | {"controls": {"texture": {"resolution": 8}, "camera": {}}}).summary
@@ -195,6 +203,7 @@ def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytes
     assert len(before) == 2 * acceptance.FIRST and all(one is not None for one in before[acceptance.FIRST :])
 
 
+@pytest.mark.medium
 def test_a_random_search_looks_through_the_same_cameras_again() -> None:
     """Every fourth time, where a search that learns sees new ones and other exposures each time."""
     problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **SMALL)))

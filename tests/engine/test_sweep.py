@@ -18,18 +18,14 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-import small_models
 import torch
-from conftest import ROOT
-from covering import once_each
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
-from samples import attack as attack_result
-from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
+import small_models
 from advsearch.attacks.domain import NET, Draws, Product, Seeds, batches
 from advsearch.cli.flags import help_text, with_flags
 from advsearch.cli.main import ExperimentCommand, main
@@ -57,6 +53,10 @@ from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import GradientPlan
 from advsearch.settings import settings
 from advsearch.statistics.intervals import clopper_pearson
+from conftest import ROOT
+from covering import once_each
+from samples import attack as attack_result
+from samples import sweep as swept
 
 SIZE = 16
 LABELS = ("mug", "vase")
@@ -357,6 +357,7 @@ def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
             assert rendered == (value if isinstance(value, str) else float(np.float32(value)))
 
 
+@pytest.mark.medium
 def test_a_long_axis_is_exact(scene: advsearch.Scene) -> None:
     points = points_of(scene, {"camera.elevation": "-80:80:99991"})
     space = make_space(
@@ -379,6 +380,7 @@ def test_what_is_not_in_the_grid_stays_or_is_drawn(scene: advsearch.Scene) -> No
     assert all(-15.0 <= float(one["pose.pitch"]["value"]) <= 15.0 for one in said)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "control",
     ["pose", "camera", "light", "lens", "corruption", "background", "material", "occlusion", "environment", "haze"],
@@ -413,6 +415,7 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(
     assert found == [] if said is None else len(found) == 1 and said in found[0]
 
 
+@pytest.mark.medium
 def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
     grid = {"camera.sizes": [2, 4], "occlusion.coverage": [0.3]}
     found = advsearch.sweep("mug", model(), grid, trials=0, resolution=SIZE)
@@ -493,6 +496,7 @@ def test_a_pair_of_parts_has_several_draws(pictures: int, parts: int) -> None:
     assert pictures / parts**2 >= 5 or parts == 2
 
 
+@pytest.mark.medium
 def test_each_room_has_its_own_gain_and_ranges_are_the_declared_ones() -> None:
     drawn = {"camera": {"azimuth": [0, 90]}}
     rooms = advsearch.sweep("mug", model(), environment="studio,noon", controls=drawn, samples=3).summary
@@ -508,6 +512,7 @@ def test_each_room_has_its_own_gain_and_ranges_are_the_declared_ones() -> None:
     assert (azimuth.low, azimuth.high) == pytest.approx((0.0, 90.0)) and azimuth.unit == "degrees"
 
 
+@pytest.mark.medium
 def test_page_and_table_cut_the_declared_range_at_the_same_places(tmp_path: Path) -> None:
     """Of a logarithmic parameter too, and where a part has no draw: not the range of what happened to be drawn."""
     drawn = {"camera": {"azimuth": [0, 90], "distance": [1.0, 100.0]}}
@@ -523,6 +528,7 @@ def test_page_and_table_cut_the_declared_range_at_the_same_places(tmp_path: Path
         assert [row.configurations for row in rows] == np.bincount(place, minlength=3).tolist()
 
 
+@pytest.mark.medium
 def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, controls="camera.azimuth", samples=10, run=tmp_path / "run")
     summary = result.summary
@@ -554,6 +560,7 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()
 
 
+@pytest.mark.medium
 def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=36)
     rows = list(result.rows())
@@ -575,6 +582,7 @@ def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) 
     assert result.summary.renders == {"sweep": 18, "verification": 7}
 
 
+@pytest.mark.medium
 def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     models = [model(0.5, "strict"), model(0.9, "easy")]
     result = advsearch.sweep(
@@ -603,6 +611,7 @@ def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     assert {row.axis for row in result.summary.axes} == {"object", "environment", "model", "pose.yaw"}
 
 
+@pytest.mark.medium
 def test_a_grid_is_drawn_as_a_map_of_its_cells(tmp_path: Path) -> None:
     grid = {"pose.yaw": "0:360:12", "camera.elevation": "5:60:4"}
     result = advsearch.sweep("mug", model(), grid, trials=0, run=tmp_path / "run")
@@ -621,6 +630,7 @@ def test_a_grid_is_drawn_as_a_map_of_its_cells(tmp_path: Path) -> None:
         assert f">{text}</text>" in drawn
 
 
+@pytest.mark.medium
 def test_cells_with_several_configurations_show_their_accuracy(tmp_path: Path) -> None:
     grid = {"pose.yaw": [0, 90], "camera.elevation": [5, 60]}
     names = "mug,bowl"
@@ -634,6 +644,7 @@ def test_cells_with_several_configurations_show_their_accuracy(tmp_path: Path) -
     assert ">accuracy</text>" in drawn and "over 1 more axis</text>" in drawn
 
 
+@pytest.mark.medium
 def test_one_axis_is_drawn_with_its_intervals(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, controls="camera", trials=0, run=tmp_path / "run")
     assert result.summary.cells is None
@@ -717,6 +728,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[li
     yield rows_of(path), timeless(summary)
 
 
+@pytest.mark.medium
 @once_each("stops_at, kind", [1, 5, 54, 107, 109, 121], [KeyboardInterrupt, MemoryError])
 def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     tmp_path: Path, uninterrupted: Any, stops_at: int, kind: type[BaseException]
@@ -740,6 +752,7 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
+@pytest.mark.medium
 def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "run"
     FakeRenderer.stops_at = 10
@@ -752,6 +765,7 @@ def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path
         advsearch.sweep("mug", model(), run=path, **SURVIVES)
 
 
+@pytest.mark.medium
 def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     config = SweepConfig(object="mug", grid={"pose.yaw": "0:360:40"}, resolution=32, run="mine", trials=6)
@@ -837,6 +851,7 @@ def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, 
     return status, out, err
 
 
+@pytest.mark.medium
 def test_the_command_prints_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -851,6 +866,7 @@ def test_the_command_prints_json(
     assert wanted <= set(summary) and summary["run"] == "runs/mug-sweep-001"
 
 
+@pytest.mark.medium
 def test_the_command_prints_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -916,6 +932,7 @@ EXAMPLES = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
 def test_every_example_of_the_documentation_is_a_sweep(
     words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -938,6 +955,7 @@ def test_every_flag_of_its_own_is_documented() -> None:
             assert f"| `{one.flag}` | {what} | {values or 'no value'} | {default.removesuffix(')')} |" in page
 
 
+@pytest.mark.medium
 def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     FakeRenderer.stops_at = 20
@@ -956,6 +974,7 @@ def test_the_table_of_nothing() -> None:
 # ---- with the renderer ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
     """Bit for bit, and each picture is that of `render` at the listed values."""
     grid = {"pose.yaw": [0, 180], "camera.elevation": [10, 60]}
@@ -974,6 +993,7 @@ def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
     assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].score, abs=0.2)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("keep", ["all", "wrong", "none"])
 def test_pictures_are_kept_as_asked(tmp_path: Path, keep: Literal["all", "wrong", "none"]) -> None:
     models = [model(0.65, "strict"), model(0.9, "easy")]
@@ -1001,6 +1021,7 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return kept_configuration(tmp_path_factory.mktemp("runs") / "turned", controls, [0.5, 0.25])
 
 
+@pytest.mark.medium
 def test_an_adversarial_scene_has_the_draws_and_the_noise_of_the_clean_scene(attacked: Path, tmp_path: Path) -> None:
     result = advsearch.sweep(
         model=model(), adversarial_of=attacked, grid={"camera.azimuth": [0, 90]}, controls="corruption", samples=3,
@@ -1025,6 +1046,7 @@ class Turned(FakeRenderer):
         return 0.6 * super().__call__(u, seed, spp) + yaw / 400.0
 
 
+@pytest.mark.medium
 def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
     attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1056,6 +1078,7 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
     assert again.summary.beside == beside and rows_of(tmp_path / "stopped") == rows_of(tmp_path / "run")
 
 
+@pytest.mark.medium
 def test_what_is_rendered_with_an_adversarial_scene_is_the_adversarial_scene_really_rendered(attacked: Path) -> None:
     grid = {"camera.azimuth": [20, 110]}
     small: dict[str, Any] = {"resolution": SIZE, "spp": 4, "trials": 0, "denoise": "none"}
@@ -1113,6 +1136,7 @@ def test_an_adversarial_scene_needs_a_run_that_has_one(tmp_path: Path, attacked:
 CHANGES: dict[str, Any] = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}
 
 
+@pytest.mark.medium
 def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_path: Path) -> None:
     advsearch.allow_code("small_models:blind")
     swept = advsearch.sweep(
@@ -1149,6 +1173,7 @@ def test_changes_that_are_none_and_objects_that_come_back_are_refused() -> None:
         advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, must_not_change="shift,shift")
 
 
+@pytest.mark.medium
 def test_an_object_is_taken_away_however_it_is_posed_really_rendered() -> None:
     """Where the controls move it, too; its shadow goes with it."""
     cases: list[Any] = [{"pose": {"y": [-0.1, 0.1], "yaw": [0.0, 360.0]}}, {"light": {}}]
@@ -1165,6 +1190,7 @@ def check_away(render: Any) -> None:
     assert seen == 0 < int(render.mask(u).sum()) and float((gone - there).abs().mean()) > 0.02
 
 
+@pytest.mark.medium
 def test_rows_are_the_same_with_and_without_changed_pictures_really_rendered() -> None:
     asked: dict[str, Any] = {"trials": 0, "resolution": 24, "spp": 2, "denoise": "none", "batch": 1}
     plain = advsearch.sweep("mug", "reference", {"pose.yaw": "0:360:4"}, **asked)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.domain import Product
@@ -16,6 +15,7 @@ from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.job import SweptScene
 from advsearch.questions.sweep.predicting import Groups, combined
 from advsearch.runs.results import LinearTransport, PredictionError
+from stand_ins import rows
 
 SMALL: dict[str, Any] = {"resolution": 48, "trials": 0}
 GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
@@ -47,6 +47,7 @@ def test_light_as_the_last_axes_needs_one_group_at_a_time() -> None:
     assert Groups(Product((5, 3)), 2, (False, True), False).size == 1
 
 
+@pytest.mark.medium
 def test_verdicts_are_those_of_rendering_each() -> None:
     """From a picture that is nearly black to one that is nearly white."""
     predicted = advsearch.sweep("mug", "reference", GRID, **SMALL)
@@ -63,6 +64,7 @@ def test_verdicts_are_those_of_rendering_each() -> None:
     assert rendered.summary.renders["sweep"] == 24
 
 
+@pytest.mark.medium
 def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_ends_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -88,6 +90,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
 
 
+@pytest.mark.medium
 def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predicting, "compared", lambda view: Deviation(9.0, 0.0, 2.0, pictures=6))
     found = advsearch.sweep("mug", "reference", GRID, **SMALL)
@@ -97,12 +100,14 @@ def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyP
     assert all(one.seed is not None for one in found.rows())
 
 
+@pytest.mark.medium
 def test_draws_of_light_share_one_basis() -> None:
     controls = {"environment": {"exposure": [-1, 1], "tint_red": [0, 2]}}
     found = advsearch.sweep("mug", "reference", controls=controls, samples=32, **SMALL).summary
     assert found.renders == {"sweep": 1 + 3 * 2, "verification": 0, "products": 32}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [

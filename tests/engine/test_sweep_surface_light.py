@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.domain import Product
@@ -28,6 +27,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import LinearTransport
 from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer
+from stand_ins import rows
 
 SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
 GRID: dict[str, Any] = {"pose.yaw": [0, 90], "camera.azimuth": "0:360:4", "camera.sizes": [2, 3]}
@@ -69,6 +69,7 @@ def test_all_frames_of_a_drive_are_a_group_and_draws_tell_drives_apart() -> None
         assert [groups.member(members[-1], place) for place in range(5)] == members
 
 
+@pytest.mark.medium
 def test_pictures_are_those_that_are_rendered() -> None:
     """Each nearer to its own traced picture than to that of any other row."""
     scene = SweptScene(
@@ -82,6 +83,7 @@ def test_pictures_are_those_that_are_rendered() -> None:
     assert float(apart.diagonal().mean()) < 9.0
 
 
+@pytest.mark.medium
 def test_rows_say_how_they_came_and_each_pose_has_light_of_its_own(coarse: list[SurfaceRenderer]) -> None:
     found = swept(grid=GRID)
     told, renders = found.summary.transport, found.summary.renders
@@ -92,6 +94,7 @@ def test_rows_say_how_they_came_and_each_pose_has_light_of_its_own(coarse: list[
     assert [row.renders for row in found.rows()] == [6, *[0] * 7] * 2
 
 
+@pytest.mark.medium
 def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> None:
     """Whichever varies faster; pictures are the same."""
     first, second = swept(grid=KITCHEN_TOO), swept(grid=dict(reversed(KITCHEN_TOO.items())))
@@ -115,6 +118,7 @@ class Two:
             yield BatchResult(items, worker_call(self.scenes[number % 2].named)(items), f"worker {number % 2}")
 
 
+@pytest.mark.medium
 def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -137,6 +141,7 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
 
 
+@pytest.mark.medium
 def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRenderer]) -> None:
     """Light turns from drive to drive; what is done to finished pictures comes on top."""
     drive: dict[str, Any] = {"path": "approach", "fps": 0.5, "samples": 2}
@@ -146,6 +151,7 @@ def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRen
     assert found.summary.renders["products"] == 12 and found.summary.renders["sweep"] == 2 * 2 * 3
 
 
+@pytest.mark.medium
 def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = iter([9.0, 1.0])
     monkeypatch.setattr(predicting, "compared", lambda view: Deviation(next(levels), 0.0, 2.0, pictures=6))
@@ -156,6 +162,7 @@ def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.
     assert [row.renders for row in found.rows()][:9] == [7, *[1] * 7, 6]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
@@ -176,6 +183,7 @@ def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> No
         assert not told.used and str(reason) in str(told.reason)
 
 
+@pytest.mark.medium
 def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predicting, "PAYS", 2.0)
     told = swept(grid=GRID, resolution=128).summary.transport

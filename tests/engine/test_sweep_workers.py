@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from samples import sweep as swept
 from test_sweep import FakeRenderer
 
 import advsearch
@@ -28,6 +27,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import SharedWork
 from advsearch.runs.store import NAME, Store
+from samples import sweep as swept
 
 SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}
 CONFIG = SweepConfig(**SMALL, batch=2, resolution=16, spp=1, trials=0)
@@ -84,6 +84,7 @@ def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
         return Sweep(job, run, NullProgress(), executor).carry_out()
 
 
+@pytest.mark.medium
 def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_path: Path) -> None:
     job = job_of(CONFIG)
     with RunDirectory.create(tmp_path / "alone") as run:
@@ -96,12 +97,14 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
     assert rows(path) == rows(tmp_path / "alone") and summary(again) == summary(alone)
 
 
+@pytest.mark.medium
 def test_what_comes_in_any_order_is_counted_as_in_order(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
         alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
     assert summary(shared(tmp_path / "shared", seed=3)) == summary(alone)
 
 
+@pytest.mark.medium
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
     result = shared(tmp_path / "run", lose=7)
     (lost,) = [row for row in result.rows() if row.label == LOST]
@@ -114,6 +117,7 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
     assert any("every worker that took it died" in text for text in again.summary.warnings)
 
 
+@pytest.mark.medium
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
         def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
@@ -145,6 +149,7 @@ def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:
         advsearch.sweep("mug", advsearch.load_model("reference"), {"pose.yaw": [0, 90]}, workers=2)
 
 
+@pytest.mark.medium
 def test_two_workers_have_the_rows_of_none(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Really rendered, by processes of their own."""
     words = ["sweep", "--object", "mug", "--grid", "pose.yaw=0:360:4", "--grid", "camera.elevation=5:60:2"]

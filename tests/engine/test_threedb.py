@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from stored_sweeps import make_sweep
 
 from advsearch.cli.exporters.threedb import write_threedb
 from advsearch.cli.main import main
@@ -20,6 +19,7 @@ from advsearch.questions.sweep.result import import_threedb
 from advsearch.runs.exporters import EXPORTERS, Exported, Exporter
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import kept_pictures
+from stored_sweeps import make_sweep
 
 
 def lines_of(folder: Path) -> list[dict[str, Any]]:
@@ -156,6 +156,7 @@ def test_an_id_leads_nowhere_else(tmp_path: Path) -> None:
     assert kept_pictures(run) is None
 
 
+@pytest.mark.medium
 def test_a_large_picture_is_refused(tmp_path: Path) -> None:
     from PIL import Image
 

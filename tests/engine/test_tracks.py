@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from small_models import SIDE, Finder
 from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import ModelWarning
 from advsearch.questions.sweep.tracks import ConstantVelocity, DetectedFrame, overlaps, tracked
+from small_models import SIDE, Finder
 
 Doubles = npt.NDArray[np.float64]
 NEAR: dict[str, Any] = {"path": "approach", "reach": 1.3}
@@ -89,6 +89,7 @@ def detector(boxes: Sequence[Sequence[float]], blind: Sequence[int]) -> Any:
     return model
 
 
+@pytest.mark.medium
 def test_a_sweep_says_of_a_drive_whose_detector_is_blind_for_three_frames_what_becomes_of_the_track(
     tmp_path: Path,
 ) -> None:
@@ -123,6 +124,7 @@ def test_a_sweep_says_of_a_drive_whose_detector_is_blind_for_three_frames_what_b
     assert theirs[0].tracks.tracker == "Forgets" and theirs[0].tracks.switches.mean == 1.0
 
 
+@pytest.mark.medium
 def test_paint_that_fools_a_detector_along_a_drive_breaks_the_track(tmp_path: Path) -> None:
     """The objective is of detections in single frames, the verdict of tracks: of the clean mug and the painted one."""
     model = advsearch.load_model(

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stand_ins import StandInProblem, carry_out, configuration, rows
 
 from advsearch.attacks import Ending, Evaluation, Query
 from advsearch.attacks.verification import TRIAL_LOOKS
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
+from stand_ins import StandInProblem, carry_out, configuration, rows
 
 UNASKED: AttackConfig = configuration().model_copy(update={"verify_spp": None, "trials": None, "average": 0})
 
@@ -49,6 +49,7 @@ def test_the_pictures_that_choose_the_sample_count_are_no_trials(
     assert chosen and tried and not chosen & tried
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("after", [3, 9, 21, 30])
 def test_stopped_anywhere_it_goes_on_to_the_same_rows_and_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int

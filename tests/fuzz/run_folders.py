@@ -13,8 +13,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
-from samples import attack, curve, keep_object, make_run
-from stored_sweeps import make_sweep
 
 from advsearch.options import Value
 from advsearch.questions.attack.settings import AttackConfig
@@ -25,6 +23,8 @@ from advsearch.viewer.pages import write_page
 from fuzz import pictures
 from fuzz.case import Case, Maker, Random
 from fuzz.mutations import VALUES, as_json, confused, damaged
+from samples import attack, curve, keep_object, make_run
+from stored_sweeps import make_sweep
 
 BOXES = {"box": [1.0, 2.0, 9.0, 9.0], "found": [{"label": "mug", "box": [1.0, 2.0, 8.0, 9.0], "score": 0.5}]}
 TYPES: tuple[Any, ...] = (

@@ -111,6 +111,7 @@ def chat(text: str, **more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
 # ---- the protocols --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_the_server_of_the_page_is_the_model_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logits are those of the model that it asks, of a picture of 8 bits, up to a constant of each picture."""
     (block,) = blocks(DOCS / "addresses.md", "python")
@@ -449,6 +450,7 @@ def test_tokens_that_are_not_told_cannot_be_limited(server: Server) -> None:
         advsearch.load_model(server.chat, task="answer", ask={"tokens": 5})(torch.zeros((8, 8, 3)))
 
 
+@pytest.mark.medium
 def test_a_policy_with_gradients_is_refused_before_anything_is_asked(
     server: Server, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -461,6 +463,7 @@ def test_a_policy_with_gradients_is_refused_before_anything_is_asked(
     assert not server.came
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", ["light", "texture={resolution: 4}", "light,texture={resolution: 4}"])
 def test_an_attack_that_is_stopped_by_a_limit_goes_on_and_asks_nothing_twice(
     server: Server, control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -487,6 +490,7 @@ def test_an_attack_that_is_stopped_by_a_limit_goes_on_and_asks_nothing_twice(
         assert not file.is_file() or SECRET.encode() not in file.read_bytes(), file
 
 
+@pytest.mark.medium
 def test_a_sweep_keeps_its_answers_too(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

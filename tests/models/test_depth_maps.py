@@ -70,6 +70,7 @@ def published(folder: Path, family: str) -> str:
     return f"hf:{folder}"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("family", "kind"),
     [("DepthAnything", DISPARITY), ("DepthAnything metric", METRIC), ("DPT", DISPARITY), ("GLPN", METRIC)],
@@ -92,6 +93,7 @@ def test_maps_are_the_librarys(tmp_path: Path, family: str, kind: str) -> None:
     assert float((at_size - asked).abs().max()) < 1e-4 * max(1.0, float(asked.abs().max()))
 
 
+@pytest.mark.medium
 def test_the_border_of_zoedepth_is_the_librarys(tmp_path: Path) -> None:
     """Its post-processing needs torchvision, so what it does is done here: bring to the size with a border, and cut."""
     model = load_model(published(tmp_path, "ZoeDepth"), task="depth")

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import conftest
 import pytest
 import torch
 from torch import Tensor, nn
 
+import conftest
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, Preprocessing, load_model
@@ -150,6 +150,7 @@ def test_the_bundled_model_has_the_features_before_its_head() -> None:
 # ---- programs -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("lower", [lambda p: p, lambda p: p.run_decompositions()], ids=["linear", "addmm"])
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: Callable[[Any], Any]) -> None:
@@ -159,6 +160,7 @@ def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: C
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("lower", [lambda p: p, lambda p: p.run_decompositions()], ids=["conv2d", "convolution"])
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_an_exported_convolution_at_the_end(tmp_path: Path, lower: Callable[[Any], Any]) -> None:
@@ -176,6 +178,7 @@ def test_an_exported_program_of_a_fixed_batch_is_padded_and_cut(tmp_path: Path) 
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(not MOBILENET.is_file(), reason=f"real model {MOBILENET} is absent")
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_a_real_program_has_its_1280_features() -> None:

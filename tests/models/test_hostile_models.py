@@ -266,6 +266,7 @@ class Strided(nn.Module):
         return {"logits": small.mean((2, 3)) + x.mean((2, 3))}["logits"]
 
 
+@pytest.mark.medium
 def test_sizes_that_depend_on_each_other_are_loaded(tmp_path: Path) -> None:
     batch, side = torch.export.Dim("batch", min=1, max=8), torch.export.Dim("side", min=4, max=32)
     sizes = ({0: batch, 2: 2 * side, 3: 2 * side},)
@@ -462,6 +463,7 @@ def exported_program(module: nn.Module, path: Path) -> Path:
     return path
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("module", "save"),
     [
@@ -483,6 +485,7 @@ def test_a_model_without_an_end_ends_with_one_sentence(
     assert "no answer within 1 seconds; if you trust it, ADVSEARCH_LIMITS=10 in the environment" in said[0]
 
 
+@pytest.mark.medium
 def test_torchscript_that_runs_a_part_of_itself_while_it_loads_is_loaded(tmp_path: Path) -> None:
     images = torch.rand((1, 8, 8, 3), generator=torch.Generator().manual_seed(0))
     expected = Scripted()(images.permute(0, 3, 1, 2))

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from fuzz import onnx_files
 from torch import Tensor, nn
 
 from advsearch.config import SceneConfig
@@ -16,6 +15,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.model import tensors_in
 from advsearch.tasks.detection import Detection
+from fuzz import onnx_files
 
 HEIGHT = 32
 WIDTH = 64

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import SMALL_ATTACK
 from torch import Tensor
 
 import advsearch
@@ -23,6 +22,7 @@ from advsearch.models.zoo import transformers as own
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks.answers import FreeAnswer
+from small_models import SMALL_ATTACK
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -156,6 +156,7 @@ def loaded(folder: Path, family: str, **more: Any) -> Model:
     return load_model(published(folder, made[family]()), labels=NAMES, prompt=QUESTION, **more)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", ["llava", "qwen", "no template"])
 def test_scores_are_the_librarys_log_likelihoods(tmp_path: Path, family: str) -> None:
     model = loaded(tmp_path, family)
@@ -286,6 +287,7 @@ def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch:
         load_model(spec, labels=NAMES)
 
 
+@pytest.mark.medium
 def test_it_is_attacked_by_name(tmp_path: Path) -> None:
     result = advsearch.attack(
         "mug",
@@ -314,6 +316,7 @@ def spoken(folder: Path, picture: Any, count: int) -> str:
     return said
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", ["llava", "qwen"])
 def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     if family == "qwen" and not TORCHVISION:
@@ -327,6 +330,7 @@ def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     assert said["logits"].shape[1:] == (READS["vocab_size"],) and said["begins"]("mug") == [KNOWN["mug"]]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("word", "right"), [("coffee", False), ("tea", True)])
 def test_the_margin_of_a_free_answer_has_the_gradient_of_differences(tmp_path: Path, word: str, right: bool) -> None:
     model = advsearch.load_model(published(tmp_path, llava()), task="answer", prompt=QUESTION)
@@ -343,6 +347,7 @@ def test_the_margin_of_a_free_answer_has_the_gradient_of_differences(tmp_path: P
     assert seen == pytest.approx(float((gradient * way).sum()), rel=0.02)
 
 
+@pytest.mark.medium
 def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, run = published(tmp_path / "llava", llava()), tmp_path / "run"
     asked = ["--task", "answer={tokens: 3}", "--prompt", QUESTION, "--label", ",".join(WORDS[:-1])]
@@ -357,6 +362,7 @@ def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert [row.label for row in rows[:4]] == [text or "(nothing)" for text in told] and any(told)
 
 
+@pytest.mark.medium
 def test_an_answer_that_goes_on_otherwise_is_no_masked_gradient(tmp_path: Path) -> None:
     """After a small step it may say another word, and then all logits after it are others."""
     with warnings.catch_warnings():

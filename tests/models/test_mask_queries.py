@@ -86,6 +86,7 @@ def published(folder: Path, family: str) -> str:
     return f"hf:{folder}"
 
 
+@pytest.mark.medium
 @WARNED
 @ROUNDED
 @pytest.mark.parametrize("family", SIZES)

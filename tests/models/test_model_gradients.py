@@ -92,6 +92,7 @@ def test_what_must_be_detached_is_left_so() -> None:
     assert _told(model) != pytest.approx(_seen(model), rel=0.05)
 
 
+@pytest.mark.medium
 def test_rt_detr_has_its_gradient() -> None:
     """It chooses queries by the scores of its encoder, which come from a batch norm and a transformer, and detaches
     them."""

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import conftest
 import numpy as np
 import pytest
 import reference_training as training
@@ -21,6 +20,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+import conftest
 from advsearch import load_model
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.models import (
@@ -850,6 +850,7 @@ def test_callables_that_are_errors(nets: Path, spec: str, error: type[Exception]
 # the real ImageNet classifier
 
 
+@pytest.mark.medium
 @needs_data
 def test_mobilenet_from_the_data_folder() -> None:
     model = load_model(MOBILENET, labels=DATA / "imagenet_labels.json")

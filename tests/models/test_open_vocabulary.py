@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 from PIL import Image
-from small_models import SMALL_ATTACK
 from torch import Tensor, nn
 
 import advsearch
@@ -17,6 +16,7 @@ from advsearch import load_model
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
 from advsearch.tasks import Detection
+from small_models import SMALL_ATTACK
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -121,6 +121,7 @@ def both(model: Model, image: Tensor) -> tuple[Tensor, Tensor]:
     return answer["boxes"], answer["scores"]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", GROUNDED)
 def test_a_grounded_one_says_what_its_library_says(tmp_path: Path, family: str) -> None:
     """The library's score of a box is the largest of all tokens, full stops and ends too; a name's is of its own."""
@@ -143,6 +144,7 @@ def test_a_grounded_one_says_what_its_library_says(tmp_path: Path, family: str) 
     assert float((scores.amax(dim=1) - asked["scores"])[of_names].abs().max()) < 1e-4
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", OWLS)
 def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     spec, prompts = published(tmp_path, family), ["a photo of a {}", "this is the {}"]
@@ -163,6 +165,7 @@ def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     assert float((alone - asked).abs().max()) > 1e-3, "one prompt says something else"
 
 
+@pytest.mark.medium
 def test_a_prompt_goes_round_each_name_of_one_text(tmp_path: Path) -> None:
     spec = published(tmp_path, "GroundingDino")
     picture, image = picture_of(SIDES["GroundingDino"], tmp_path)
@@ -173,6 +176,7 @@ def test_a_prompt_goes_round_each_name_of_one_text(tmp_path: Path) -> None:
     assert float((scores - torch.stack([each[:, 1:3].amax(1), each[:, 4:7].amax(1)], dim=1)).abs().max()) < 1e-4
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", [*OWLS, *GROUNDED])
 def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> None:
     """Of scores and boxes; Grounding DINO is kept from cutting its queries off from the picture."""
@@ -258,6 +262,7 @@ def test_names_that_are_the_same_text_are_said(tmp_path: Path) -> None:
         load_model(published(tmp_path, "Owlv2"), labels=["mug", "Mug"], task="detection")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", ["Owlv2", "GroundingDino"])
 def test_it_is_attacked_by_name(tmp_path: Path, family: str) -> None:
     result = advsearch.attack(

@@ -88,6 +88,7 @@ def test_networks_in_other_types_are_warned_of_by_nothing(dtype: torch.dtype) ->
     assert model.dtype == dtype and model.differentiable and model(torch.zeros(2, 32, 32, 3)).dtype == torch.float32
 
 
+@pytest.mark.medium
 def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
     TURNED["all"].turn()
     network = OfItsType()

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import SMALL_ATTACK
 from torch import Tensor, nn
 
 import advsearch
@@ -17,6 +16,7 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelE
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.labels import read_labels
 from advsearch.tasks.depth import Depth
+from small_models import SMALL_ATTACK
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -101,6 +101,7 @@ def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
     assert not [key for key in model.module.state_dict() if "text" in key], "the half for texts is not kept"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("family", ["AltCLIP", "ChineseCLIP", "Align"])
 def test_other_pairs_are_read_likewise(tmp_path: Path, family: str) -> None:
     """Whatever has two such halves is compared with the library's own score when it is loaded."""
@@ -125,6 +126,7 @@ def test_other_pairs_are_read_likewise(tmp_path: Path, family: str) -> None:
     assert float((model(PICTURES) - asked).abs().max()) < 1e-4
 
 
+@pytest.mark.medium
 @SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
@@ -252,6 +254,7 @@ def test_scores_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.
         load_model(spec, labels=NAMES)
 
 
+@pytest.mark.medium
 def test_it_is_attacked_by_name(tmp_path: Path) -> None:
     given: dict[str, Any] = {"labels": list(NAMES), "prompt": ["a photo of a {}", "the {}"], "label": "mug,cup"}
     result = advsearch.attack(

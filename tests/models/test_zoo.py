@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 import torch
-from fuzz import onnx_files
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -23,6 +22,7 @@ from advsearch.models import ModelWarning, load_model
 from advsearch.models.zoo.library import reading
 from advsearch.tasks import Detection
 from advsearch.trust.code import allow_named, nothing_allowed
+from fuzz import onnx_files
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
 
@@ -360,6 +360,7 @@ def test_an_onnxruntime_that_reads_elsewhere_is_refused(
         load_model(onnx_file(tmp_path, b"\x08\x09"))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "content", [onnx_files.endless(), onnx_files.multiplied(3_000, 1_000)], ids=["loop", "products"]
 )

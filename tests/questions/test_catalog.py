@@ -12,6 +12,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import advsearch
 from advsearch import registry
 from advsearch.catalog import BUILT_INS, is_present
@@ -57,6 +59,7 @@ def run_python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.medium
 def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> None:
     names = tuple(part.name for part in REMOVABLE)
     copy_package(tmp_path, names)
@@ -126,6 +129,7 @@ for removed in sys.argv[1:]:
 """
 
 
+@pytest.mark.medium
 def test_without_any_one_experiment_all_others_can_be_imported() -> None:
     removable = [part.name for part in REMOVABLE]
     done = run_python(PACKAGE.parent, "-c", IMPORT_WITHOUT_EACH, *removable)
@@ -198,6 +202,7 @@ setup(
 """
 
 
+@pytest.mark.medium
 def test_the_experiment_of_the_docs_is_a_package_of_its_own(tmp_path: Path) -> None:
     """The package is installed in a folder of the Python path; command, page and Python know the experiment."""
     design = (Path(__file__).parents[2] / "docs" / "design.md").read_text()

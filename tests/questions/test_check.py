@@ -64,6 +64,7 @@ def kept(folder: Path) -> CheckResult:
     return result
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     tmp_path: Path, whole: CheckResult, capfd: pytest.CaptureFixture[str]
@@ -105,6 +106,7 @@ def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: CheckResul
     assert 1 <= len(killed.rows) < len(whole.rows) and values(killed) == values(whole)[: len(killed.rows)]
 
 
+@pytest.mark.medium
 def test_a_summary_never_forgets_what_an_earlier_one_had(
     tmp_path: Path, whole: CheckResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,6 +135,7 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
     assert told == [2 * count]
 
 
+@pytest.mark.medium
 def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     tmp_path: Path, whole: CheckResult, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,6 +233,7 @@ def timeless(result: CheckResult) -> dict[str, Any]:
     return cleaned
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("quick")
 def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -253,6 +257,7 @@ def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
     assert "How a search gets its derivatives" in text and "What that saves" in text
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("quick")
 def test_a_summary_keeps_its_rows_when_reading_them_back_is_interrupted(tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import make_run, sweep
-from stored_sweeps import described
 
 import advsearch
 from advsearch.cli.main import main
@@ -30,6 +28,8 @@ from advsearch.runs.summary import read_result
 from advsearch.runs.tables import EDGES
 from advsearch.statistics.paired import mcnemar, paired_difference
 from advsearch.viewer import thumbnails
+from samples import make_run, sweep
+from stored_sweeps import described
 
 PICTURES = 400
 EDGES_OF_ELEVATION = (5.0, 25.0, 45.0, 65.0, 85.0)
@@ -110,6 +110,7 @@ def compared(*runs: Path, **asked: Any) -> tuple[CompareResult, ComparedPair]:
 # ---- what it says ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_one_sweep_of_two_models_is_counted_pair_by_pair(tmp_path: Path) -> None:
     result, pair = compared(stored(tmp_path / "both", {"good": good, "low": low}))
     draws = np.random.default_rng(0).uniform(size=(PICTURES, 2))
@@ -161,6 +162,7 @@ def test_two_sweeps_of_the_same_draws_are_a_pair(
     assert ("of all of that together" in " ".join(result.warnings)) == (len(differ) > 1)
 
 
+@pytest.mark.medium
 def test_a_sweep_with_an_adversarial_scene_is_compared_without_it_and_beside_others_only_with_it(
     tmp_path: Path,
 ) -> None:
@@ -175,6 +177,7 @@ def test_a_sweep_with_an_adversarial_scene_is_compared_without_it_and_beside_oth
     assert [pair.first_only > 0 for pair in result.pairs] == [True, True] and result.pairs[0].second_only == 0
 
 
+@pytest.mark.medium
 def test_pictures_that_sweeps_kept_are_shown_and_nothing_is_rendered(tmp_path: Path) -> None:
     two = [stored(tmp_path / name, {"net": net}, keep=True, object=name) for name, net in (("mug", good), ("cup", bad))]
     result, pair = compared(*two, pictures=2)
@@ -199,6 +202,7 @@ def test_what_cannot_be_shown_is_said(tmp_path: Path) -> None:
 # ---- what it refuses ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_sweeps_that_are_no_pairs_are_refused(tmp_path: Path) -> None:
     one = stored(tmp_path / "one", {"net": good})
     attack = make_run(tmp_path / "attack")
@@ -270,6 +274,7 @@ def test_p_value_and_interval_err_no_more_often_than_they_say(shares: Sequence[f
 # ---- as it is typed -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_models_are_shown_the_same_pictures_from_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -311,6 +316,7 @@ def test_a_comparison_that_was_stopped_goes_on(
     assert said["ending"] == "done" and said["pairs"][0]["first_only"] > 0 and parts == ["a,b", "a,b"]
 
 
+@pytest.mark.medium
 def test_stored_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one, two = stored(tmp_path / "one", {"net": good}), stored(tmp_path / "two", {"net": low}, object="bowl")
     assert main(["compare", str(one), str(two), "--pictures", "0", "--run", str(tmp_path / "run")]) == 0

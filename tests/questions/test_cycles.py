@@ -68,6 +68,7 @@ def by_cycles(scene: SceneDescription) -> Cycles:
     return Cycles(scene, (8, 12), max_depth=6, denoise=False)
 
 
+@pytest.mark.medium
 def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> None:
     u = torch.full_like(renderer.start, 0.7)
     made = by_cycles(renderer.scene.made[0])

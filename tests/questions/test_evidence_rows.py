@@ -7,12 +7,11 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import samples
-import small_models
 from PIL import Image
-from stored_sweeps import make_sweep
 
 import advsearch
+import samples
+import small_models
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.explain.result import ExplainResult
@@ -26,10 +25,12 @@ from advsearch.questions.report.evidence import (
 from advsearch.report.wording import interval_text, percent
 from advsearch.runs.store import NAME, Store
 from advsearch.statistics.intervals import clopper_pearson
+from stored_sweeps import make_sweep
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 
+@pytest.mark.medium
 def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     advsearch.sweep(
         "mug", small_models.easy(), {"camera.azimuth": [20.0, 140.0], "camera.elevation": [10.0, 50.0]},
@@ -94,6 +95,7 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
         assert triggering_conditions(told)[0].startswith(said)
 
 
+@pytest.mark.medium
 def test_photographs_from_a_folder_agree_by_condition(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, photographs = make_sweep(tmp_path / "run", keep="all"), tmp_path / "photographs"
     photographs.mkdir()

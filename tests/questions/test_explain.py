@@ -12,8 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from samples import sweep
-from stored_sweeps import described, make_sweep, seen
 
 import advsearch
 from advsearch.cli.main import main
@@ -39,6 +37,8 @@ from advsearch.rules import (
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
+from samples import sweep
+from stored_sweeps import described, make_sweep, seen
 
 HIGH = 60.0
 
@@ -86,6 +86,7 @@ def test_a_rule_is_found_in_stored_rows(swept: Path, tmp_path: Path) -> None:
     assert f"camera.elevation over {over:g} degrees" in page and "<script" not in page.split("<main")[1]
 
 
+@pytest.mark.medium
 def test_json_says_right_of_and_interval(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = [
         "explain",
@@ -130,6 +131,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
     assert asked[0].samples == 10 and asked[0].seed != 0 and asked[0].trials == 0
 
 
+@pytest.mark.medium
 def test_a_rule_about_the_distance_is_confirmed_by_fresh_pictures(tmp_path: Path) -> None:
     """As docs/explain.md has it: the distance on a grid, the direction drawn beside it, by the same control."""
     advsearch.sweep(
@@ -147,6 +149,7 @@ def test_a_rule_about_the_distance_is_confirmed_by_fresh_pictures(tmp_path: Path
     assert "Fresh renders inside it" in text and "; confirmed." in text
 
 
+@pytest.mark.medium
 def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +188,7 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
     assert second is not None and (second.right, second.total, second.held) == (13, 13, False), "not those of the first"
 
 
+@pytest.mark.medium
 def test_the_nearest_right_prediction_differs_in_one_value(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +240,7 @@ def test_typical_failures_take_turns_between_rules_and_those_under_none() -> Non
     )
 
 
+@pytest.mark.medium
 def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     few = make_sweep(tmp_path / "few")
     with pytest.raises(InputError, match="expected at least 100 rows, got 24"):
@@ -339,6 +344,7 @@ class Read:
         return sides + torch.randn(sides.shape, generator=torch.Generator().manual_seed(0))
 
 
+@pytest.mark.medium
 def test_failures_are_grouped_by_what_the_model_decides_by(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -367,6 +373,7 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     assert "images/cluster-1.png" in capsys.readouterr().out
 
 
+@pytest.mark.medium
 def test_failures_of_all_sweeps_of_a_model_are_grouped_together(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

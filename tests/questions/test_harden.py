@@ -63,6 +63,7 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
     return done
 
 
+@pytest.mark.medium
 def test_a_run_trains_measures_and_goes_on(
     attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,6 +120,7 @@ def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> Class
     return ClassifierCourse(work, Trainable(net or torch.nn.Linear(2, 3), load()))
 
 
+@pytest.mark.medium
 def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
     course = course_of(config)
@@ -135,6 +137,7 @@ def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks
     shutil.rmtree(run.path)
 
 
+@pytest.mark.medium
 def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
     attacks: list[tuple[str, int | None]],
 ) -> None:
@@ -151,6 +154,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
     assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
 
 
+@pytest.mark.medium
 def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
     """Its searches are those of `attack`; a quick one looks at too few pictures."""
     config = HardenConfig(**{**SMALL, "object": "mug", "model": "reference", "controls": "camera", "epsilon": None})
@@ -184,6 +188,7 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]
                 torch.testing.assert_close(one.picture(one.texture), other.picture(other.texture))
 
 
+@pytest.mark.medium
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**SMALL, labels="labels.json")
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
@@ -196,6 +201,7 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     shutil.rmtree(run.path)
 
 
+@pytest.mark.medium
 def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,6 +257,7 @@ def test_what_cannot_be_hardened_is_refused_in_words(
     assert not list(Path("runs").glob("*/*"))
 
 
+@pytest.mark.medium
 def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     given: list[HardenConfig] = []
 

@@ -72,6 +72,7 @@ def example(seed: int) -> Example:
     return Example(levels, boxes, labels, task, Place((label,), box, (48, 48)))
 
 
+@pytest.mark.medium
 def test_a_copy_learns_by_the_networks_own_loss_and_keeps_its_statistics() -> None:
     course, seen = course_of(epochs=60, rate=0.02), [example(k) for k in range(24)]
     course.round(1, seen)
@@ -159,6 +160,7 @@ def test_a_coco_folder_is_read_by_the_names_of_its_categories(tmp_path: Path) ->
         read_coco(coco(tmp_path / "size", images=[{**image, "file_name": "a.png", "width": 9}]), model())
 
 
+@pytest.mark.medium
 def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -58,6 +58,7 @@ def example(label: int, left: int) -> Example:
     return Example(levels, torch.zeros((0, 4)), torch.zeros(0), task, Region((label,), mask))
 
 
+@pytest.mark.medium
 def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -> None:
     course, seen = course_of(epochs=80, rate=0.1), [example(1 + k % 2, k) for k in range(8)]
     course.round(1, seen)
@@ -70,6 +71,7 @@ def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -
         assert (said[~region.mask] == 0).all()
 
 
+@pytest.mark.medium
 def test_a_mirrored_picture_has_a_mirrored_mask() -> None:
     course, one = course_of(), example(2, 3)
     (plain, target), (mirrored, other) = (course.shown(one, which) for which in (False, True))
@@ -102,6 +104,7 @@ def test_the_loss_is_transformers_or_the_callers_or_that_of_the_pixels() -> None
     assert own.loss(own.student.net, torch.zeros(1), target) == 1.0
 
 
+@pytest.mark.medium
 def test_a_segmenter_is_hardened_as_a_whole(tmp_path: Path) -> None:
     found = advsearch.harden(
         model(), task="segmentation", object="mug", controls="light", scenes=1,

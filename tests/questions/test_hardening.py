@@ -16,7 +16,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from small_models import Colours
 from torch import Tensor, nn
 
 from advsearch.attacks import Block, Domain
@@ -55,6 +54,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.scene.color import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 from advsearch.statistics.intervals import clopper_pearson
+from small_models import Colours
 
 LABELS = [f"class {number}" for number in range(14)]
 
@@ -100,6 +100,7 @@ def test_of_several_controls_each_is_tried_alone_and_all_together() -> None:
     assert moved.tolist() == [pose, light, both] * 3
 
 
+@pytest.mark.medium
 def test_a_scene_to_train_on_is_rendered_with_one_control_moved_and_with_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -161,6 +162,7 @@ def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
 # ---- the split ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     bundled = Path(str(resources.files("advsearch.bundled")))
     training = SceneSide(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
@@ -192,6 +194,7 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
         check_disjoint(SceneSide(HELD_OUT, ("ball",), ("noon",), 2), [training])
 
 
+@pytest.mark.medium
 def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None:
     """Colours between those of 2,700 and 10,000 K, in half of the scenes; the rest of the map stays as it is."""
     given, rng = load_environment("noon"), np.random.default_rng(0)
@@ -238,6 +241,7 @@ def test_programs_and_probabilities_are_refused() -> None:
         trainable(model)
 
 
+@pytest.mark.medium
 def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from covering import only
 
 from advsearch import attack, load_scene
 from advsearch.attacks import Query
@@ -24,6 +23,7 @@ from advsearch.questions.check.leaving_out import ALL, WHAT, measure_gains, meas
 from advsearch.questions.check.result import CheckConfig
 from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
+from covering import only
 
 SIZE = 40
 
@@ -32,6 +32,7 @@ def made(controls: Any, object: str = "mug", environment: str = "studio", denois
     return load_scene(object, environment).renderer(controls, resolution=SIZE, denoise=denoiser)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", only(["texture"], ["texture", "haze"]))
 def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
     renderer = made(control)
@@ -46,6 +47,7 @@ def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) 
     assert (mine - theirs).norm() <= 0.01 * mine.norm()
 
 
+@pytest.mark.medium
 def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = made("texture")
     written: list[str] = []
@@ -84,6 +86,7 @@ def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
     assert all(row.time_gain > 0.0 and row.safe for row in rows)
 
 
+@pytest.mark.medium
 def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("advsearch.questions.check.leaving_out.ITEMS", {"tracing": ""})
     monkeypatch.setattr("advsearch.questions.check.leaving_out.NOTHING", EVERYTHING)
@@ -95,6 +98,7 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
     assert bounces.item == "bounces" and bounces.picture_difference > 1.0 and not bounces.safe
 
 
+@pytest.mark.medium
 def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:
     dark, light = made("texture", "bottle", "noon"), made("texture", "mug", "studio")
     cut = measured_bounces(dark, [dark.start], seed=0, spp=4)
@@ -107,6 +111,7 @@ def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> No
     assert dark.scene.depth == dark.scene.max_depth
 
 
+@pytest.mark.medium
 def test_the_measured_bias_does_not_depend_on_the_noise() -> None:
     renderer = made("texture")
     few, many = (measured_bounces(renderer, [renderer.start], seed=3, spp=spp, bound=1e9).cuts[-1] for spp in (4, 256))
@@ -120,6 +125,7 @@ def test_a_black_scene_needs_no_bounces() -> None:
     assert cut.depth == 2 and cut.cuts[-1].levels <= BOUND
 
 
+@pytest.mark.medium
 def test_searches_cut_paths_and_verifications_do_not() -> None:
     config = AttackConfig(object="bowl", controls={"texture": {}}, denoise="none", resolution=(SIZE, SIZE))
     problem, _ = problem_from_config(config)
@@ -136,6 +142,7 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
     assert problem.evaluate(tried).said == trial.said
 
 
+@pytest.mark.medium
 def test_a_long_search_says_what_paths_it_rendered() -> None:
     options: dict[str, Any] = {"controls": "camera.exposure", "steps": 1, "trials": 6, "verify_spp": 4}
     options |= {"resolution": SIZE}
@@ -147,6 +154,7 @@ def test_a_long_search_says_what_paths_it_rendered() -> None:
     assert whole.summary.light_path_segments.to_dict() == {"search": 6, "verification": 6}
 
 
+@pytest.mark.medium
 def test_texels_beyond_what_a_pixel_shows_are_counted() -> None:
     fine = made({"texture": {"resolution": 512}})
     (found,) = measure_texels(fine, fine.start, seed=0, spp=64)
@@ -203,6 +211,7 @@ def two_lamps(power: float) -> Renderer:
     return load_scene("mug").renderer([TextureControl(resolution=16), *lamps], resolution=SIZE, denoise="none")
 
 
+@pytest.mark.medium
 def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
     renderer = two_lamps(0.0)
     full = renderer.like(renderer.scene.like(leave_out=EVERYTHING - {"emitters"}))
@@ -226,6 +235,7 @@ ENDS = [dict(zip(NUMBERS, values, strict=True)) for values in product((0.0, 1.0)
 QUICK = [ENDS[int("".join(map(str, ends)), 2)] for ends in ((1, 1, 0, 0), (0, 0, 1, 1), (1, 0, 0, 1))]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("ends", only(QUICK, ENDS), ids=lambda one: "".join(f"{end:g}" for end in one.values()))
 def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(ends: dict[str, float]) -> None:
     """Fixed, searched, and searched from the other ends, at both ends of every number."""
@@ -241,6 +251,7 @@ def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left
     assert max(float((one - pictures[0]).abs().mean()) for one in pictures) < 1e-3
 
 
+@pytest.mark.medium
 def test_a_metal_looks_the_same_whatever_reflection_paint_would_have() -> None:
     """Mitsuba's own metal is black at a specular of exactly 0."""
     pictures = []

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import small_models
 
 import advsearch
+import small_models
 from advsearch.errors import InputError
 from advsearch.questions.report.evidence import conditions_of
 from advsearch.questions.sweep.display import distance_of
@@ -36,6 +36,7 @@ def test_the_worst_is_a_picture_that_shows_it() -> None:
     assert found.worst == 0
 
 
+@pytest.mark.medium
 def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
     """Shifted far to the side, the mug is out of view, which a detector cannot get wrong."""
     found = advsearch.sweep(
@@ -63,6 +64,7 @@ def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
     assert read_result(tmp_path / "run") == found
 
 
+@pytest.mark.medium
 def test_pairs_of_a_comparison_are_of_pictures_that_show_it(tmp_path: Path) -> None:
     for name in ("one", "other"):
         advsearch.sweep(
@@ -77,6 +79,7 @@ DETECTED: dict[str, Any] = {"task": "detection", "label": "car", "verify_spp": 1
 BESIDE = {"pose": {"y": [40.0, 60.0]}}  # never in the picture
 
 
+@pytest.mark.medium
 def test_claims_count_pictures_that_show_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model that is "right" where there is nothing to see would be shown to be no worse, and to be steady."""
     monkeypatch.chdir(tmp_path)
@@ -94,6 +97,7 @@ def test_claims_count_pictures_that_show_it(tmp_path: Path, monkeypatch: pytest.
         assert_suite("suite.yaml")
 
 
+@pytest.mark.medium
 def test_a_region_ends_where_the_object_leaves_the_picture(tmp_path: Path) -> None:
     """A detector that is right about the object cannot be wrong where it is not, and the box would take all of that."""
     small: dict[str, Any] = {"samples": 20, "set": {"camera.distance": 0.4}, "exposure": -3.0, **DETECTED}

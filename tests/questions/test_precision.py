@@ -299,6 +299,7 @@ def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)
 
 
+@pytest.mark.medium
 def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_measured_again() -> None:
     """Three lines of the same true error, root mean squares of four: the promise of the cheapest is too good."""
     rng = np.random.default_rng(5)
@@ -454,6 +455,7 @@ def test_every_count_that_is_measured_is_one_that_its_sampler_takes() -> None:
             assert count >= wanted and sampler.sample_count() == count, name
 
 
+@pytest.mark.medium
 def test_theory_and_counts_are_those_of_the_sampler() -> None:
     """A line of the picture is named after its sampler; a gradient is taken with that of the run."""
 
@@ -489,6 +491,7 @@ def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> N
     assert "secant" in list_gradient_parts(secant, linear=False)[0].estimators
 
 
+@pytest.mark.medium
 def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_confirm() -> None:
     renderer = load_scene("mug").renderer({"texture": {"resolution": 8}}, resolution=24, denoise="none")
     renderer = renderer.like(transfer="linear")
@@ -529,6 +532,7 @@ def test_settings_go_through_yaml(tmp_path: Path) -> None:
     assert (shared.steps, shared.seconds) == (None, None), "what only has the same name is not shared"
 
 
+@pytest.mark.medium
 def test_a_tiny_scene_from_end_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -576,6 +580,7 @@ class Stop(NullProgress):
             raise KeyboardInterrupt
 
 
+@pytest.mark.medium
 def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -161,6 +161,7 @@ def test_a_hostile_recipe_is_refused_in_one_sentence(text: str, message: str, tm
     assert message in str(error.value) and str(error.value).isprintable() and len(str(error.value)) < 500
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("change", "kind", "message"),
     [
@@ -202,6 +203,7 @@ def test_a_figure_that_cannot_be_made_is_refused(
         figure(described, rows({"noon": (1, 2)}))
 
 
+@pytest.mark.medium
 def test_the_sweeps_of_a_recipe_are_explained(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(TINY)
@@ -210,6 +212,7 @@ def test_the_sweeps_of_a_recipe_are_explained(tmp_path: Path) -> None:
         advsearch.explain(tmp_path / "run")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("further", "message"),
     [
@@ -228,6 +231,7 @@ def test_a_later_object_is_checked_before_anything_is_rendered(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("figure", "message"),
     [
@@ -256,6 +260,7 @@ def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: s
     check_figures(described, carrying_out.check_runs(planned(described, config)), name)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, name: str) -> None:
     room = tmp_path / "room.exr"
@@ -318,6 +323,7 @@ def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects()
     assert all(one.config.model == "m.pt2" for one in runs)
 
 
+@pytest.mark.medium
 def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -355,6 +361,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert json.loads(capsys.readouterr().out)["figures"][1]["columns"][0] == "environment"
 
 
+@pytest.mark.medium
 def test_frames_of_a_drive_count_as_one_draw(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("""
@@ -374,6 +381,7 @@ figures: [{figure: rates, by: object}]
     assert high - low > alone[1] - alone[0]
 
 
+@pytest.mark.medium
 def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -523,6 +531,7 @@ def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
     )
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("shapes", "textures"), [(2, 13), (13, 2), (6, 13)])
 def test_many_textures_of_few_objects_favour_neither_cue(shapes: int, textures: int) -> None:
     """Models that answer by one cue in 6 of 10 pictures and else by chance, and models that answer by chance alone."""
@@ -719,6 +728,7 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
     assert made.text[0].startswith("Lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_every_figure_is_drawn_and_is_a_table(name: str, tmp_path: Path) -> None:
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))

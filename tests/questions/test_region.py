@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stand_ins import Impatient, rows
 
 from advsearch.engine import acceptance
 from advsearch.questions.region import boxes, growing, region
@@ -16,6 +15,7 @@ from advsearch.questions.sweep import predicting
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
+from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
     "object": "mug", "resolution": 32, "controls": "camera", "vary": "camera.azimuth,camera.elevation", "samples": 8,
@@ -44,6 +44,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]
     return run, region.run(RegionConfig(**SMALL, run=str(run)))
 
 
+@pytest.mark.medium
 def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
     """Rows say which: a predicted one has the four rays of a pixel, and no seed."""
     run, result = whole
@@ -65,6 +66,7 @@ class Stopping(Impatient):
         self._searching = name == "growing the box"
 
 
+@pytest.mark.medium
 def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, RegionResult], tmp_path: Path) -> None:
     """Light is found again; pictures that were predicted are counted as such."""
     config = RegionConfig(**SMALL, run=str(tmp_path / "run"))
@@ -73,6 +75,7 @@ def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Region
     assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("more", "reason"),
     [

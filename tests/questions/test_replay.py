@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import samples
 import torch
 
 import advsearch
+import samples
 from advsearch.cli.main import main
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import RetrialCondition, Retrials
@@ -43,6 +43,7 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.medium
 def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +77,7 @@ def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     assert "quality 50" in (run / "report.html").read_text("utf-8")
 
 
+@pytest.mark.medium
 def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = ReplayConfig(attack=attacked, ways="jpeg", trials=6, run=str(tmp_path / "run"))
     real, done = Problem.judge, 0
@@ -95,6 +97,7 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
     assert again.table[0] == first.table[0]
 
 
+@pytest.mark.medium
 def test_a_file_that_has_changed_since_is_said(tmp_path: Path) -> None:
     names = tmp_path / "names.json"
     names.write_text('["mug", "vase"]')
@@ -106,6 +109,7 @@ def test_a_file_that_has_changed_since_is_said(tmp_path: Path) -> None:
     assert any("names.json is not what it was when the run was made" in one for one in other.warnings)
 
 
+@pytest.mark.medium
 def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_path: Path) -> None:
     together = advsearch.replay(
         attacked, ways="curve,jpeg,sensor,sampler", model="small_models:hard", trials=6, run=tmp_path / "together"

@@ -9,8 +9,8 @@ from itertools import product
 from typing import Any
 
 import pytest
-import samples
 
+import samples
 from advsearch.controls import CONTROLS
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig

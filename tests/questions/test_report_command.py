@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import attack, make_run
 
 import advsearch
 from advsearch.cli.main import main
@@ -19,6 +18,7 @@ from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import write_png
 from advsearch.runs.summary import MADE_WITH, file_digests
+from samples import attack, make_run
 
 
 def test_runs_become_a_page_markdown_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import fisher_exact
-from stored_sweeps import seen
 
 from advsearch.errors import InputError
 from advsearch.questions.explain.clusters import find_clusters
@@ -23,6 +22,7 @@ from advsearch.rules import (
     import_library,
     split_in_halves,
 )
+from stored_sweeps import seen
 
 NOISE = 0.05
 """Share of the answers that are turned round."""
@@ -54,6 +54,7 @@ def counts(rule: CountedRule) -> tuple[int, int, int, int]:
     return int(inside.sum()), len(inside), int(elsewhere.sum()), len(elsewhere)
 
 
+@pytest.mark.medium
 def test_a_planted_rule_is_told() -> None:
     (rule,) = find_rules(*split_in_halves(planted("dim from above"), 0), seed=0).accepted
     elevation, power = rule.conditions
@@ -68,6 +69,7 @@ def test_a_rule_names_options() -> None:
     assert told(find_rules(*split_in_halves(planted("red"), 0), seed=0).accepted) == ["colour red"]
 
 
+@pytest.mark.medium
 def test_two_parameters_that_matter_only_together_are_told_as_two_rules() -> None:
     first, second = find_rules(*split_in_halves(planted("either but not both"), 1), seed=0).accepted
     assert (
@@ -108,6 +110,7 @@ def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
     return seen(values, ~(wrong ^ (generator.random(rows) < NOISE)), of={"camera.azimuth": "degrees"})
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("seed", range(2))
 def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int) -> None:
     front, end_on, far = (
@@ -133,6 +136,7 @@ def test_where_an_arc_holds() -> None:
     assert front.arcs == ((350.0, 370.0),) and front.row.turn == 360.0
 
 
+@pytest.mark.medium
 def test_few_rows_tell_a_clear_rule_and_say_how_many_a_faint_one_takes() -> None:
     """Right in 28 % end-on and in 71 % from the side, as a detector of cars is."""
 
@@ -196,6 +200,7 @@ def test_what_explains_nothing_is_not_shown_to() -> None:
     assert len(found) == 5 and all(one.interval[0] < 0.003 and one.interval[1] < 0.03 for one in found)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("accuracy", "rows"), [((0.05, 0.12, 0.22), 120), ((0.1, 0.5, 0.9), 120), ((0.7, 0.72), 600)])
 def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) -> None:
     """In 95 of 100 samples the interval has the true share, where steps of the accuracy are steps of the parts."""
@@ -247,6 +252,7 @@ def of_drives(seed: int, drives: int = 40, frames: int = 10, twice: bool = False
     return seen(values, answers.ravel(), np.repeat(np.arange(drives), frames))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("twice", [False, True])
 def test_where_drives_differ_by_themselves_nothing_is_told(twice: bool) -> None:
     """Counted row by row, a rule is told in about a half of these and a parameter decides in nearly all."""
@@ -304,6 +310,7 @@ def test_a_library_that_is_missing_is_named_with_the_command(monkeypatch: pytest
         import_library("sklearn.tree")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kinds", [2, 3])
 def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
     generator = np.random.default_rng(kinds)
@@ -317,6 +324,7 @@ def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
     assert [members[0] for members in found.members] == list(np.cumsum(sizes) - 1)
 
 
+@pytest.mark.medium
 def test_groups_of_a_cloud_are_not_called_apart() -> None:
     told = [
         find_clusters(np.random.default_rng(seed).standard_normal((60, 30)) + 1.0, seed).apart for seed in range(10)

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import torch
-from covering import only
 
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
@@ -31,6 +30,7 @@ from advsearch.questions.stability.result import (
 from advsearch.questions.stability.scenes import chosen, condition_number, hessian
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
+from covering import only
 
 WANTED = {
     "radiometric": "hdri black lamp negative infinite nan camera-exposure environment-exposure saturated",
@@ -74,6 +74,7 @@ def test_the_cheap_cases_cover_every_group() -> None:
 # ---- the cases ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("case", only(FEW, CHEAP), ids=lambda case: case.name)
 def test_a_cheap_case_holds(case: Case) -> None:
     row = case.run()

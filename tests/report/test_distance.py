@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import sweep
-from stored_sweeps import make_sweep
 
 from advsearch.errors import InputError
 from advsearch.questions.sweep.display import distance_of, distance_sentence, seen_from
@@ -17,6 +15,8 @@ from advsearch.questions.sweep.page import SweepSource, sweep_page_html
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.statistics.monotone import find_dips
+from samples import sweep
+from stored_sweeps import make_sweep
 
 DISTANCES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

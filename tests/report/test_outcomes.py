@@ -8,7 +8,6 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 import pytest
-from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.questions.attack.outcome import name_objective
@@ -28,6 +27,7 @@ from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
+from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
 COUNTS = {"missed": 2, "loose": 3}
 SAID = "2 missed, 3 in a loose box"

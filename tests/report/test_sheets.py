@@ -71,6 +71,7 @@ def test_a_piece_is_its_size_and_its_picture(tmp_path: Path) -> None:
     assert (width, height) == pytest.approx((45.0, 20.0), abs=1e-3)
 
 
+@pytest.mark.medium
 def test_what_is_larger_than_a_page_is_put_together_again(tmp_path: Path) -> None:
     picture = noise(330, 410)
     piece = Piece("wall", picture, (1.0, 1.0), (3, 3))
@@ -137,6 +138,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / name for name in ("texture", "patch")}
 
 
+@pytest.mark.medium
 def test_a_texture_is_printed_in_pieces_of_their_real_size(runs: dict[str, Path]) -> None:
     pieces = printable(runs["texture"], 95.0)
     wall = pieces[0]

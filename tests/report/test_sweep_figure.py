@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 
 import imageio.v3 as iio
-from samples import sweep
 
 from advsearch.questions.sweep.display import sweep_figure
+from samples import sweep
 
 
 def test_the_names_of_files_fit_the_map_of_a_sweep() -> None:

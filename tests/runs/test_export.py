@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from samples import attack, rated
 
 from advsearch.cli.main import main
 from advsearch.errors import StorageError, UnknownNameError
@@ -24,6 +23,7 @@ from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.pages import keep_result
+from samples import attack, rated
 
 TWO: Any = {"light.place": {"value": [1.0, 2.0], "unit": ""}}
 """A value of two numbers; our own controls have none such."""

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from covering import once_each
-from samples import CURVE, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError
@@ -28,6 +26,8 @@ from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
 from advsearch.trust.writing import write_text
 from advsearch.viewer import thumbnails
+from covering import once_each
+from samples import CURVE, REGION, SWEEP, attack, rated
 
 SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()
 
@@ -166,6 +166,7 @@ def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.
 OTHERS = [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
 
 
+@pytest.mark.medium
 @once_each("summary, value", [SUMMARY, SWEEP, CURVE, REGION], OTHERS)
 def test_summaries_of_other_types_are_named(
     summary: dict[str, Any], value: Any, run: Path, capsys: pytest.CaptureFixture[str]
@@ -194,6 +195,7 @@ DAMAGED = [
 ]
 
 
+@pytest.mark.medium
 @once_each("command, text", [["resume", "it"], ["run", "runs/it/run.yaml"], ["region", "--around", "it"]], DAMAGED)
 def test_damaged_configurations_are_refused(
     command: list[str], text: str, run: Path, capsys: pytest.CaptureFixture[str]
@@ -239,6 +241,7 @@ def inside(link: Path, _: Path) -> None:
     link.symlink_to(link.parent / "run.yaml")
 
 
+@pytest.mark.medium
 @once_each("name, how", KEPT, [away, chain, above, inside])
 def test_a_link_in_a_run_is_followed_by_nobody(
     name: str, how: Callable[[Path, Path], None], run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -26,7 +26,6 @@ import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import attack, exr, rated, sweep
 
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
@@ -41,6 +40,7 @@ from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import PART, RunLock, replacing, write_bytes, write_text
+from samples import attack, exr, rated, sweep
 
 WRITER = """
 import sys
@@ -71,6 +71,7 @@ def run(tmp_path: Path) -> Iterator[RunDirectory]:
 # ---- what survives ----
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("acknowledged", [1, 20, 137])
 def test_every_acknowledged_row_survives_sigkill(tmp_path: Path, acknowledged: int) -> None:
     path = tmp_path / "run"

@@ -163,6 +163,7 @@ def objectives(told: Told) -> list[tuple[str, int, float]]:
     return found
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "name", ["mlflow", *(pytest.param(one, marks=pytest.mark.slow) for one in ("tensorboard", "wandb"))]
 )

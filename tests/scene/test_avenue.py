@@ -28,6 +28,7 @@ def test_kerbs_are_as_high_as_the_page_says() -> None:
     assert heights == pytest.approx([0.0, 0.12, 0.12], abs=1e-4)
 
 
+@pytest.mark.medium
 def test_an_avenue_comes_and_goes_with_its_ground() -> None:
     scene = load_scene("car", "avenue")
     assert {"road", "houses", "trees", "posts"} <= laid(scene.description)
@@ -39,6 +40,7 @@ def test_an_avenue_comes_and_goes_with_its_ground() -> None:
     assert enclosed(describe("mug", "noon", given={"ground.kind": "avenue"}))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["car", "stop-sign"])
 def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> None:
     scene = describe(name, "avenue")
@@ -55,6 +57,7 @@ def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> No
     assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 10.0).all(), "a lamp in the way of a camera around the object"
 
 
+@pytest.mark.medium
 def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> None:
     for part in describe("car", "avenue").around.values():
         corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
@@ -64,6 +67,7 @@ def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> No
         np.testing.assert_allclose(np.linalg.norm(part.mesh.normals, axis=1), 1.0, atol=1e-4)
 
 
+@pytest.mark.medium
 def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
     dry, snow = (describe("car", name).around for name in ("avenue", "avenue-snow"))
     assert set(snow) - set(dry) == {"snow"}
@@ -88,6 +92,7 @@ def test_boxes_at_a_wall_face_outwards() -> None:
     assert ((mesh.normals[mesh.faces[:, 0]] * away).sum(axis=1) > 0.0).all()
 
 
+@pytest.mark.medium
 def test_the_horizon_is_closed_and_the_road_reaches_far() -> None:
     given = {"camera.azimuth": 0.0, "camera.elevation": 0.5, "camera.distance": 100.0}
     renderer = load_scene("car", "avenue", settings=given).renderer(["pose"], resolution=33, denoise="none")

@@ -474,6 +474,7 @@ def test_outside_the_circle_all_is_black_in_pictures_guides_and_predictions(thro
     assert float(off) < 0.1, "the predicted picture is seen along the same rays"
 
 
+@pytest.mark.medium
 def test_a_searched_lens_is_the_fixed_one_and_has_a_derivative() -> None:
     scene = advsearch.load_scene("mug")
     searched = scene.renderer({"camera": {"k1": [-0.4, 0.4], "fov": 60}}, resolution=24, denoise="none")

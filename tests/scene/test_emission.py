@@ -140,6 +140,7 @@ WAYS = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("way", WAYS)
 def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Path) -> None:
     """Next-event estimation of a texture counts on coordinates that no two faces share."""
@@ -152,6 +153,7 @@ def test_light_arrives_as_by_paths_that_find_it_by_chance(way: str, tmp_path: Pa
     np.testing.assert_allclose(found, chance, rtol=0.02, atol=1e-4)
 
 
+@pytest.mark.medium
 def test_several_parts_are_lit_in_one_map(tmp_path: Path) -> None:
     """The dark parts of an object stay dark, and the light of the other one is all there."""
     seen = {**SEEN, "camera.azimuth": 30.0, "camera.elevation": 20.0}
@@ -248,6 +250,7 @@ def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark
     MitsubaScene(described, (SIZE, SIZE))
 
 
+@pytest.mark.medium
 def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     """Whatever Mitsuba kept of the place where it was."""
     scene = describe(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", given=SEEN)
@@ -264,6 +267,7 @@ def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(made.radiance({}, 2, 64), again, atol=1e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("picture", [None, stripes()])
 def test_a_matrix_of_transport_has_it_once(picture: np.ndarray | None, tmp_path: Path) -> None:
     """Light that nobody moves is in the base picture, under each light that moves only one time."""
@@ -342,6 +346,7 @@ def test_derivatives_of_poses_are_differences_and_of_textures_adjoints(tmp_path:
     assert math.isfinite(made.description.gain)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("picture", [None, stripes()])
 def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray | None, tmp_path: Path) -> None:
     """Central differences of all texels, and of the radiance itself; the wall and the square light each other."""
@@ -356,6 +361,7 @@ def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray |
         assert float(gradient.sum()) == pytest.approx(float(up - down) / (2.0 * step), rel=0.03)
 
 
+@pytest.mark.medium
 def test_many_dim_surfaces_do_not_take_the_samples_of_the_environment(tmp_path: Path) -> None:
     """Thirty of them: the picture hardly has more noise than without."""
     scene = trimesh.Scene()

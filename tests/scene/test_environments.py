@@ -6,11 +6,11 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import conftest
 import numpy as np
 import OpenEXR
 import pytest
 
+import conftest
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.library import import_environment
 
@@ -106,6 +106,7 @@ def test_radiance_encodings(tmp_path: Path, encode: Callable[[np.ndarray], bytes
     assert got.radiance[0, 0].tolist() == [0.0, 0.0, 0.0]
 
 
+@pytest.mark.medium
 def test_radiance_long_repeat(tmp_path: Path) -> None:
     pixels = np.tile(np.array([50, 60, 70, 130], np.uint8), (200, 400, 1))
     assert len(repeats(pixels)) <= 200 * 20
@@ -286,6 +287,7 @@ def energy(radiance: np.ndarray) -> np.ndarray:
     return found
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("height", "width"), [(1024, 2048), (700, 1400)])
 def test_large_maps_keep_their_energy(tmp_path: Path, height: int, width: int) -> None:
     image = np.full((height, width, 3), 0.5, np.float32)

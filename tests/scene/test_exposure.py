@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from covering import once_each
 from torch import Tensor
 
 from advsearch.controls import EnvironmentControl, make_space
@@ -26,6 +25,7 @@ from advsearch.scene.formation import (
 )
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
+from covering import once_each
 
 GREY = 0.214
 """Reflectance of display-referred 0.5."""
@@ -109,6 +109,7 @@ CHANGED = {
 }  # fmt: skip
 
 
+@pytest.mark.medium
 @once_each("parameter, size", CHANGED, [16, (12, 20)])
 def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
     parameter: str, size: int | tuple[int, int]
@@ -168,6 +169,7 @@ def test_another_environment_keeps_the_exposure_it_would_be_loaded_with() -> Non
     torch.testing.assert_close(noon, torch.from_numpy(loaded.environment.radiance) * loaded.gain, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.medium
 def test_in_real_rooms_a_grey_mug_is_neither_charcoal_nor_burnt(real_data: Path) -> None:
     for environment in sorted((real_data / "environments").glob("*.hdr")):
         render = load_scene(real_data / "objects" / "mug.obj", environment).renderer("texture", resolution=16)

@@ -44,6 +44,7 @@ EXTREME: dict[str, tuple[dict[str, Any], float]] = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", EXTREME)
 def test_extremes_are_finite(name: str) -> None:
     controls, share = EXTREME[name]

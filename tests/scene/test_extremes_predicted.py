@@ -87,6 +87,7 @@ PREDICTED: list[tuple[str, str, dict[str, Any]]] = [
 # fmt: on
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "holds", "data"),
     [pytest.param(*row, marks=[pytest.mark.slow] * row[2].pop("slow", False), id=row[0]) for row in PREDICTED],
@@ -95,11 +96,13 @@ def test_changes_are_predicted(name: str, holds: str, data: dict[str, Any]) -> N
     right(predicted(**data))
 
 
+@pytest.mark.medium
 def test_a_texture_behind_glass_is_predicted() -> None:
     """Changes of a texture behind clear glass are predicted texel by texel."""
     right(predicted({"texture": {"resolution": 32}}, plugins=make_glass_ball()))
 
 
+@pytest.mark.medium
 def test_a_lamp_that_goes_out_is_predicted() -> None:
     """A lamp that goes out is predicted, to darkness."""
     lamp: ControlSettings = {"light": {"power": [0.0, 12.0]}}
@@ -197,6 +200,7 @@ LIT: list[tuple[str, str, dict[str, Any]]] = [
 # fmt: on
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "holds", "data"), LIT, ids=[row[0] for row in LIT])
 def test_pictures_and_derivatives_by_light_on_surfaces_are_right(name: str, holds: str, data: dict[str, Any]) -> None:
     right(lit(**data))
@@ -218,6 +222,7 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
     right(Outcome(checks))
 
 
+@pytest.mark.medium
 def test_what_stands_behind_glass_is_refused() -> None:
     """An object behind clear glass is refused in words."""
     reason = why_not(make_renderer(PAINTED, plugins=make_glass_ball()), ["camera"])

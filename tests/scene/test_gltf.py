@@ -461,6 +461,7 @@ NAMED = {
 EVENLY = some.floats(0.0, 1.0, width=32)
 
 
+@pytest.mark.medium
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(data=some.data())
 def test_whatever_a_file_has_is_read_right_or_named(data: some.DataObject) -> None:

@@ -64,6 +64,7 @@ def test_a_high_beam_has_what_a_regulation_asks_for() -> None:
     assert intensity("high", 2.6, 0.0) >= 20300.0 and intensity("high", -5.2, 0.0) >= 5100.0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["low", "high"])
 def test_a_wall_is_lit_by_the_beam_as_its_formula_says(kind: str) -> None:
     """A wall 25 m ahead of one lamp, 0.5 white: radiance = 0.5 / pi I cos / d^2, and the cut-off 25 cm below."""
@@ -113,6 +114,7 @@ def rendered(made: Scene, side: int) -> Renderer:
     return make_renderer(framed(made.description, side), Space(()), side, "none", 0)
 
 
+@pytest.mark.medium
 def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
     """A matt floor before the camera's car, by what two lamps put there: radiance = albedo / pi sum I cos / d^2."""
     floor = {"ground.size": 40.0, "ground.red": 0.5, "ground.green": 0.5, "ground.blue": 0.5}
@@ -145,6 +147,7 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
     assert measured.sum() == pytest.approx(float((albedo / np.pi * lux).sum()), rel=0.02)
 
 
+@pytest.mark.medium
 def test_lamps_off_leave_the_scene_as_it_was() -> None:
     plain, off = scene(things="car@12,3.5"), scene(things="car@12,3.5,lamps=off", **{"object.lamps": "off"})
     assert [one.name for one in plain.description.parts] == [one.name for one in off.description.parts]
@@ -154,6 +157,7 @@ def test_lamps_off_leave_the_scene_as_it_was() -> None:
     assert {one.name for one in plain.description.parts} == {one.name for one in again.description.parts}
 
 
+@pytest.mark.medium
 def test_lamps_sit_where_the_car_has_its_glass() -> None:
     described = scene(things="car@12,3.5,heading=180,lamps=high", **LOW).description
     own = {lamp.name: lamp for lamp in beams(described)}
@@ -166,6 +170,7 @@ def test_lamps_sit_where_the_car_has_its_glass() -> None:
     assert other.to_world[:3, 2] == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
 
 
+@pytest.mark.medium
 def test_glass_shines_as_many_candela_as_it_says_and_rear_lamps_are_red() -> None:
     described = scene(**LOW).description
     assert described.environment is not None and described.environment.candelas is not None
@@ -180,6 +185,7 @@ def test_glass_shines_as_many_candela_as_it_says_and_rear_lamps_are_red() -> Non
     assert red > 0.0 and green == blue == 0.0
 
 
+@pytest.mark.medium
 def test_rear_lamps_are_seen_red_and_headlamps_white() -> None:
     for azimuth, glass in ((180.0, "object-taillamps"), (0.0, "object-headlamps")):
         lit = scene(**{**FRONT, **LOW, "camera.azimuth": azimuth})
@@ -192,6 +198,7 @@ def test_rear_lamps_are_seen_red_and_headlamps_white() -> None:
         assert red > 0.9 and (max(green, blue) < 0.35 if azimuth else min(green, blue) > 0.9), glass
 
 
+@pytest.mark.medium
 def test_glass_belongs_to_its_car() -> None:
     lit, dark = (rendered(scene(**FRONT, **one), 100) for one in (LOW, {}))
     seen, plain = lit.surfaces(lit.start), dark.surfaces(dark.start)
@@ -202,6 +209,7 @@ def test_glass_belongs_to_its_car() -> None:
     assert float((seen.uv - plain.uv).abs().amax(dim=2)[there].quantile(0.99)) < 0.02
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("control", ["pose", "camera"])
 def test_lamps_go_with_what_carries_them(control: str) -> None:
     """A picture of a control's configuration is that of a scene that has it from the start, recorded or not."""
@@ -230,6 +238,7 @@ def test_a_texture_in_a_beam_has_the_gradient_of_differences() -> None:
     assert float(slope.sum()) == pytest.approx(float(high - low) / 0.1, rel=0.1)
 
 
+@pytest.mark.medium
 def test_a_car_whose_file_names_no_lamps_has_two_before_it_and_two_behind(tmp_path: Path) -> None:
     vertices = [(x, y, z) for x in (-2.0, 2.0) for y in (-0.9, 0.9) for z in (0.0, 1.4)]
     quads = [(1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6)]
@@ -245,6 +254,7 @@ def test_a_car_whose_file_names_no_lamps_has_two_before_it_and_two_behind(tmp_pa
         assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 0] * x > 0.0).all()
 
 
+@pytest.mark.medium
 def test_a_meter_sees_headlamps() -> None:
     """Of the car behind the camera: metered exposure goes down where they light the object."""
     view = {"camera.distance": 12.0, "camera.height": 1.3}
@@ -272,6 +282,7 @@ def test_an_object_without_metres_has_no_lamps() -> None:
         describe(replace(load_object("mug"), metres=None), "avenue-night", given={"camera.lamps": "low"})
 
 
+@pytest.mark.medium
 def test_an_exported_scene_has_the_same_lamps(tmp_path: Path) -> None:
     mi = mitsuba()
     renderer = rendered(scene(**FRONT, **LOW, **{"camera.lamps": "low"}), 32)

@@ -13,14 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import conftest
 import numpy as np
 import pytest
 import trimesh
-from fuzz.pictures import plain_png
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
+import conftest
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import library, surface_parts
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
@@ -29,6 +28,7 @@ from advsearch.scene.importing import objects
 from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.pictures import area_average, display_image
 from advsearch.scene.importing.texture import filtered, sampled
+from fuzz.pictures import plain_png
 
 DATA = conftest.DATA / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -183,6 +183,7 @@ def test_every_bundled_object_is_recovered_from_a_file_with_either_axis_up(name:
         assert guess_up(moved, "thing.obj").axis == axis
 
 
+@pytest.mark.medium
 @real_data
 @pytest.mark.parametrize("name", ["mug.obj", "teapot.obj", "banana.obj", "bowl.obj", "cow.obj"])
 def test_real_objects_stand_upright(name: str) -> None:
@@ -488,6 +489,7 @@ def test_unwrap_of_a_curved_object_does_not_overlap(
     assert (area > 0.0).all() and 0.3 < area.sum() < 1.0
 
 
+@pytest.mark.medium
 def test_unwrap_of_a_fine_smooth_object(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=6)  # so fine that xatlas by itself crashes the process
     mesh = import_object(exported(tmp_path, "ball.stl", ball)).mesh
@@ -893,6 +895,7 @@ def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str])
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl"])
 def test_damage_anywhere_is_the_inputs_fault(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
     box = trimesh.creation.box()
@@ -1087,6 +1090,7 @@ def test_messages_show_what_a_file_holds_briefly_and_plainly(tmp_path: Path, lin
     assert str(caught.value).isprintable() and len(str(caught.value)) < 400 + len(str(tmp_path))
 
 
+@pytest.mark.medium
 def test_warnings_have_an_end(tmp_path: Path) -> None:
     written(tmp_path, "thing.mtl", MTL)
     faces = "".join(f"usemtl none{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(22))
@@ -1323,6 +1327,7 @@ def test_lights_and_cameras_beside_a_whole_object_are_named(tmp_path: Path) -> N
     assert note.startswith("changed.glb: 1 light and 2 cameras are left out of the object; name one node as the object")
 
 
+@pytest.mark.medium
 def test_importing_does_not_pull_in_the_renderer() -> None:
     code = "import sys, advsearch.scene.importing.objects, advsearch.scene.library as e\n"
     code += "print({'mitsuba', 'torch'} & set(sys.modules))"
@@ -1333,6 +1338,7 @@ def test_importing_does_not_pull_in_the_renderer() -> None:
 # --- objects that nobody here made ----------------------------------------
 
 
+@pytest.mark.medium
 @real_data
 @pytest.mark.parametrize(
     ("name", "up", "faces"),
@@ -1350,6 +1356,7 @@ def test_real_objects(name: str, up: Any, faces: int) -> None:
         assert (asset.base_color == 0.5).all()
 
 
+@pytest.mark.medium
 @real_data
 def test_real_banana_is_yellow_all_over() -> None:
     asset = import_object(DATA / "banana.obj")
@@ -1361,6 +1368,7 @@ def test_real_banana_is_yellow_all_over() -> None:
     assert (np.minimum(red, green) > blue + 0.15).mean() > 0.95
 
 
+@pytest.mark.medium
 @real_data
 def test_real_cow_is_the_same_from_both_formats() -> None:
     one, other = import_object(DATA / "cow.obj", up="y", facing="+z"), import_object(DATA / "cow.glb")

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
@@ -17,6 +16,7 @@ from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport.lights import BasisRenderer, Span, lighting
+from stand_ins import Impatient, rows
 
 SIZE = 32
 LAMP: dict[str, Any] = {"light": {"power": [0, 12], "red": [0.5, 1.0]}, "environment": {"exposure": [-1, 1]}}
@@ -48,6 +48,7 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
         return levels(predicted(u), (one + other) / 2.0), levels(one, other)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("controls", "light", "more"),
     [
@@ -74,6 +75,7 @@ def test_what_is_light(controls: Any, light: set[str], more: set[str]) -> None:
     assert bool(found.harmonic) == ("environment.harmonics" in light)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("place", [(0.5, 0.6, 0.5), (0.0, 1.0, 0.9), (1.0, 0.4, 0.1)])
 def test_a_sum_of_basis_pictures_is_the_traced_picture(
     renderer: Renderer, predicted: BasisRenderer, place: tuple[float, ...]
@@ -114,6 +116,7 @@ def test_weights_are_those_of_the_nearest_map() -> None:
     assert torch.allclose(span.weights(span.map(weights)), weights, atol=1e-4)
 
 
+@pytest.mark.medium
 def test_harmonics_are_predicted_while_the_map_is_above_zero() -> None:
     made = rendered_by({"environment": {"harmonics": [-1, 1]}})
     basis = BasisRenderer(made, made.start, seed=1)
@@ -124,6 +127,7 @@ def test_harmonics_are_predicted_while_the_map_is_above_zero() -> None:
     assert levels(basis(brighter), basis(made.start)) > 3.0 * noise
 
 
+@pytest.mark.medium
 def test_texture_and_light_are_predicted_together() -> None:
     """To first order in the texture under any light: the lamp that goes on shows the change that was made in its
     dark."""
@@ -174,6 +178,7 @@ SEARCH: dict[str, Any] = {
 }
 
 
+@pytest.mark.medium
 def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "EVERY", 8)
     for name in ("BOUND", "MARGIN"):
@@ -185,6 +190,7 @@ def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: 
     assert renders["products"] == 18 and renders["search"] == 2 + 2 * 2 * 3 + 8  # basis, comparisons, ranking
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -203,6 +209,7 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("options", "reason"),
     [

@@ -110,6 +110,7 @@ def _stock(path: Path) -> np.ndarray:
     return np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 6}), spp=512))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("shape", ["largebox", "floor"])
 def test_the_picture_is_mitsubas_own(box: Path, shape: str) -> None:
     scene = advsearch.load_scene(f"{box}#{shape}")
@@ -123,6 +124,7 @@ def test_the_picture_is_mitsubas_own(box: Path, shape: str) -> None:
     assert abs(float((ours - theirs).mean())) < 0.001
 
 
+@pytest.mark.medium
 def test_cornell_box_is_attacked_by_id() -> None:
     found = advsearch.attack(
         mitsuba().cornell_box(),
@@ -201,6 +203,7 @@ WRONG = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("inside", "message"), WRONG.items())
 def test_a_text_or_nothing_in_the_place_of_a_number_is_told(tmp_path: Path, inside: str, message: str) -> None:
     path = tmp_path / "a.xml"
@@ -299,6 +302,7 @@ def test_a_medium_is_scaled_with_the_object_wherever_it_stands(inside: bool) -> 
     assert medium["scale"] == 2.0  # the cube is 2 wide
 
 
+@pytest.mark.medium
 def test_import_says_on_standard_output_what_a_scene_has(box: Path) -> None:
     """In a process of its own, as standard output is kept clean of Mitsuba's by the descriptor."""
     code = "import sys\nfrom advsearch.cli.main import main\nw = sys.argv[1:]\nsys.exit(main([*w, '--json']) | main(w))"

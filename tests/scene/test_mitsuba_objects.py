@@ -10,7 +10,6 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
-from covering import once_each
 from PIL import Image
 
 import advsearch
@@ -22,6 +21,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.scene_files import import_plugins
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
+from covering import once_each
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -238,6 +238,7 @@ def off(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs((one - other).reshape(sides, PATCH, sides, PATCH, 3).mean(axis=(1, 3))).mean())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", SHAPES)
 def test_an_object_looks_as_in_mitsuba(folder: Path, name: str) -> None:
     path = written(folder, name, SHAPES[name])
@@ -248,6 +249,7 @@ def test_an_object_looks_as_in_mitsuba(folder: Path, name: str) -> None:
     assert not any("turned over" in one for one in scene.description.notes)
 
 
+@pytest.mark.medium
 def test_it_still_does_when_it_is_written_again(folder: Path, tmp_path: Path) -> None:
     for name in ("vertex colours", "mirrored", "normals and a turned picture"):
         path = written(folder, name, SHAPES[name])

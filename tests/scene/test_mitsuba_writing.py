@@ -57,6 +57,7 @@ write_xml(Path(sys.argv[1]), {"type": "scene", **pictures}, {}, "")
 """
 
 
+@pytest.mark.medium
 def test_pictures_are_written_in_a_pool_of_one_thread_too(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITER, str(tmp_path / "scene.xml")]
     subprocess.run(command, check=True, timeout=600)

@@ -148,6 +148,7 @@ def wanted(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[float, float]
     return [sides(scene, x, z) for x, z in LAMPS]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("way", WAYS)
 def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     way: str, wanted: list[tuple[float, float]], tmp_path: Path
@@ -266,6 +267,7 @@ def test_gltf_out_has_the_same_normals(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.mesh.uvs, part.mesh.uvs, atol=1e-5)
 
 
+@pytest.mark.medium
 def test_stock_mitsuba_renders_the_normals_that_are_written(tmp_path: Path) -> None:
     file = written(card(), tmp_path)
     renderer = advsearch.load_scene(file, settings=SEEN).renderer("pose", resolution=SIZE, denoise="none")

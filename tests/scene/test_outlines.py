@@ -29,6 +29,7 @@ def seen(one: Renderer) -> SeenThing:
     return found
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("shift", [[0.0, 0.0], [0.45, -0.3]])
 def test_the_share_is_that_of_a_larger_picture(shift: list[float]) -> None:
     wide = math.degrees(2.0 * math.atan(2.0 * math.tan(math.radians(15.0))))
@@ -41,12 +42,14 @@ def test_the_share_is_that_of_a_larger_picture(shift: list[float]) -> None:
     assert around.truncated is False and around.share == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.medium
 def test_a_lens_bends_the_outline() -> None:
     scene = advsearch.load_scene("mug", camera="fisheye")
     found = seen(scene.renderer({"pose": {}}, resolution=SIDE, denoise="none"))
     assert found.truncated is False and found.share == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.medium
 def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     places = projected
     one = renderer({"pose": {}}, 60.0, SIDE)

@@ -104,6 +104,7 @@ def loss(scene: Scene, controls: dict[str, dict[str, object]]) -> tuple[float, f
     return float(adjoint.sum()), float(difference)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "controls",
     [

@@ -24,6 +24,7 @@ def metres(scene: SceneDescription) -> dict[str, np.ndarray]:
     return {name: standing(part) * scene.metres for name, part in scene.around.items()}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: str) -> None:
     scene = describe(PLACES[place], place)
@@ -37,6 +38,7 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
         assert np.isfinite(part.mesh.uvs).all() and part.base_color.min() >= 0.0 and part.base_color.max() <= 1.0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_nothing_stands_where_the_object_is(place: str) -> None:
     scene = describe(PLACES[place], place)
@@ -54,6 +56,7 @@ def test_nothing_stands_where_the_object_is(place: str) -> None:
     assert low < thing.low < 0.01
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
     given = {"camera.height": 0.3 if place == "room" else 1.6, "camera.distance": 0.5 if place == "room" else 8.0}
@@ -77,6 +80,7 @@ def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: StreetPlan) ->
             assert not in_street, (x, y)
 
 
+@pytest.mark.medium
 def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -> None:
     scene = describe("car", "crossing")
     parts = {name: part for name, part in metres(scene).items() if name in ("sign", "sign-metal", "sign-tube")}
@@ -112,6 +116,7 @@ def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
     assert describe("mug", "room").meshes["furniture"].laid
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("environment", "shining", "luminance"), [("room", "window", None), ("room-evening", "lamp", room.SHADE)]
 )
@@ -135,6 +140,7 @@ def test_by_day_the_window_lights_the_room_and_in_the_evening_the_lamp(
     assert 0.15 < float(picture.mean()) < 0.75 and float((picture > 0.99).float().mean()) < 0.1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("place", ["crossing", "car-park"])
 def test_other_lights_of_a_place_have_the_maps_of_the_avenue(place: str) -> None:
     for light in ("", "-dusk", "-night"):

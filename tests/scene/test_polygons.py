@@ -26,6 +26,7 @@ def outline(points: np.ndarray) -> float:
     return float((points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]).sum())
 
 
+@pytest.mark.medium
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(3, 30), min_size=1, max_size=12), st.integers(0, 2**32 - 1), st.booleans())
 def test_star_shaped_polygons_are_covered_once(counts: list[int], seed: int, clockwise: bool) -> None:

@@ -66,6 +66,7 @@ def expected(ahead: np.ndarray, lens: np.ndarray, drops: np.ndarray) -> tuple[np
     return (ahead, 0.0) if outer is None or outer[2] <= 0.0 else (outer, first * second)
 
 
+@pytest.mark.medium
 def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     renderer = renderer_of(25)
     sensor = renderer.scene._scene.sensors()[0]
@@ -97,6 +98,7 @@ def test_a_drop_shows_the_scene_upside_down() -> None:
         assert turned == pytest.approx(-sign * up * (WATER - 1.0) / curve, rel=0.1)
 
 
+@pytest.mark.medium
 def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     wet, dry = renderer_of(40), renderer_of(0)
     ours, theirs = (one.surfaces(one.start).seen("object") for one in (wet, dry))
@@ -106,6 +108,7 @@ def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     assert wet.scene.made[0].gain == dry.scene.made[0].gain
 
 
+@pytest.mark.medium
 def test_a_textures_derivative_goes_through_the_drops() -> None:
     renderer = renderer_of(40, {"texture": {"resolution": 4, "epsilon": 0.5}}, distance=0.35)
     weights = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(2))

@@ -74,6 +74,7 @@ def nodes(folder: Path) -> None:
     assert len(node_names(path)) == count + 15_000
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("what", [notes, names, numbers, material_files, shapes, nodes])
 def test_reading_takes_time_in_proportion(tmp_path: Path, what: Callable[[Path], None]) -> None:
     begun = time.process_time()

@@ -97,6 +97,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str]] = {
 """Ending, content, and words of the warning about what is not kept."""
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", CASES)
 def test_a_mesh_stands_upright_in_the_frame_and_is_lit(name: str, tmp_path: Path) -> None:
     suffix, content, words = CASES[name]
@@ -160,6 +161,7 @@ def two_maps(used: int) -> str:
     })  # fmt: skip
 
 
+@pytest.mark.medium
 def test_a_texture_is_looked_up_by_the_coordinates_that_its_material_names(tmp_path: Path) -> None:
     file = tmp_path / "square.gltf"
     file.write_text(two_maps(1))

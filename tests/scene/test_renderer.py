@@ -109,6 +109,7 @@ def test_a_tensor_changed_in_place_is_uploaded_again(raw: Renderer) -> None:
     assert float(raw.scene.radiance({BASE_COLOR: texture}, 5, 4).mean()) > 1.1 * float(dark.mean())
 
 
+@pytest.mark.medium
 def test_a_recording_survives_the_birth_and_death_of_other_scenes(raw: Renderer) -> None:
     """Dr.Jit leaves undefined what happens when a recording is replayed after the scenes in memory have changed."""
     before = raw.scene.radiance({}, 1, 4)
@@ -120,6 +121,7 @@ def test_a_recording_survives_the_birth_and_death_of_other_scenes(raw: Renderer)
         assert torch.equal(raw.scene.radiance({}, 1, 4), before)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("size, spp, texels", [(16, 1, 16), (32, 4, 32), (32, 2, 4), (24, 3, 64)])
 def test_recording_kernels_changes_no_byte(size: int, spp: int, texels: int) -> None:
     description = describe("mug")
@@ -132,6 +134,7 @@ def test_recording_kernels_changes_no_byte(size: int, spp: int, texels: int) -> 
             assert torch.equal(ours, theirs)
 
 
+@pytest.mark.medium
 def test_the_gradient_agrees_with_a_central_difference_of_the_same_samples(raw: Renderer) -> None:
     u = inside(raw).requires_grad_()
     loss(raw, u, 0, 256).backward()
@@ -143,6 +146,7 @@ def test_the_gradient_agrees_with_a_central_difference_of_the_same_samples(raw: 
     assert float((u.grad * direction).sum()) == pytest.approx(float(difference), rel=LINEAR_TOLERANCE)
 
 
+@pytest.mark.medium
 def test_a_loss_linear_in_the_texture_changes_by_step_times_gradient() -> None:
     """Direct light only (paths of two segments) makes radiance linear in reflectance, so the identity is exact."""
     scene = MitsubaScene(describe("ball"), (SIZE, SIZE), max_depth=2)
@@ -198,6 +202,7 @@ def test_the_denoiser_is_the_identity_in_the_backward_pass(raw: Renderer, denois
     assert torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.medium
 def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: Renderer) -> None:
     with torch.no_grad():
         many, noisy, clean = raw(raw.start, 0, 1024), raw(raw.start, 1, 8), denoised(denoised.start, 1, 8)
@@ -266,6 +271,7 @@ def test_rounding_to_8_bits_leaves_256_levels() -> None:
     assert torch.equal(to_8_bit(values), values)
 
 
+@pytest.mark.medium
 def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
     scene = load_scene("mug")
     plain, better = (

@@ -298,6 +298,7 @@ def test_bones_of_vrm_have_their_names(old: bool, tmp_path: Path) -> None:
     assert asset.warnings == ("someone.vrm is shown at rest: the control body moves it, and plays Bend",)
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("two_threads")
 def test_true_boxes_follow(tmp_path: Path) -> None:
     """What is seen lies where a pinhole, worked out here in metres, sees the format's vertices."""
@@ -337,6 +338,7 @@ def _set(*keys: Any, value: Any) -> Callable[[File], None]:
 SAMPLER = ("animations", 0, "samplers", 0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -25,6 +25,7 @@ def picture(scene: Scene) -> torch.Tensor:
     return renderer(renderer.start, 0, 16)
 
 
+@pytest.mark.medium
 def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
     street = load_scene("car", "street")
     assert paved(street.description)
@@ -37,6 +38,7 @@ def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
         describe("car", "street", given={"ground.kind": "wet-road", "ground.red": 0.5})
 
 
+@pytest.mark.medium
 def test_another_environment_brings_its_own_ground() -> None:
     street, wet = (load_scene("car", name) for name in ("street", "street-wet"))
     lit = street.lit_by(wet.description.environment)
@@ -55,6 +57,7 @@ def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
     assert lane.max() < 0.12 < pavement.max() < line.max()
 
 
+@pytest.mark.medium
 def test_the_road_is_seen_and_hidden() -> None:
     street = load_scene("car", "street", settings={"camera.elevation": 30.0})
     with_road, without = picture(street), picture(street.with_settings({"ground.size": 0.0}))

@@ -30,6 +30,7 @@ def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: st
     assert np.abs(points[:, :2]).max() == pytest.approx(FRAME_FILL, abs=1e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["mug", "banana", "hammer", "chair", "teapot"])
 def test_no_azimuth_takes_any_of_the_object_out_of_the_picture(name: str) -> None:
     reached = [

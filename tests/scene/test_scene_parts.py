@@ -65,6 +65,7 @@ def test_meshes_have_names_and_one_of_them_is_the_object() -> None:
         scene.with_part(scene.meshes["object"])
 
 
+@pytest.mark.medium
 def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
     scene = describe("mug")
     side = describe("mug", given={"camera.azimuth": 130.0, "camera.fov": 50.0})

@@ -246,6 +246,7 @@ def test_wrong_numbers_of_lights_and_cameras_are_damage(file: Path, data: bytes)
             describe(f"{file}#crate")
 
 
+@pytest.mark.medium
 def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, tmp_path: Path) -> None:
     small = ["--resolution", "16", "--spp", "1", "--steps", "2", "--trials", "6", "--label", "ball", "--json"]
     run, fixed = tmp_path / "run", ["--set", "pose:the-wall.z=0.5", "--set", "material:the-wall.roughness=0.3"]
@@ -262,6 +263,7 @@ def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, t
     )
 
 
+@pytest.mark.medium
 def test_a_camera_of_the_file_is_chosen_by_name(file: Path, tmp_path: Path) -> None:
     seen: list[bytes] = []
     for more in ([], ["--camera", "orbit"], ["--camera", "front"]):
@@ -272,6 +274,7 @@ def test_a_camera_of_the_file_is_chosen_by_name(file: Path, tmp_path: Path) -> N
     assert seen[0] == seen[1] != seen[2]
 
 
+@pytest.mark.medium
 def test_a_scene_seen_by_a_camera_of_its_file_is_kept_by_its_name(file: Path, tmp_path: Path) -> None:
     scene = advsearch.load_scene(f"{file}#crate", camera="front")
     small: Any = {"resolution": 16, "spp": 1, "trials": 6, "label": "ball"}
@@ -279,6 +282,7 @@ def test_a_scene_seen_by_a_camera_of_its_file_is_kept_by_its_name(file: Path, tm
     assert "camera: front" in (tmp_path / "run" / "run.yaml").read_text()
 
 
+@pytest.mark.medium
 def test_a_camera_that_is_none_or_says_otherwise_is_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["sweep", "--object", f"{file}#crate", "--grid", "pose.yaw=0,90", "--label", "ball", "--camera"]
     for more, words in {

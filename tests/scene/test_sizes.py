@@ -165,11 +165,13 @@ SIZES = {
 """Metres of the longest side of each bundled object."""
 
 
+@pytest.mark.medium
 def test_bundled_objects_have_their_true_size() -> None:
     assert {name: library.load_object(name).metres for name in library.list_objects()} == pytest.approx(SIZES, abs=6e-3)
     assert not any(describe(name).notes for name in SIZES)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", sorted(SIZES))
 def test_a_size_in_metres_changes_no_picture(name: str) -> None:
     """Neither where the camera stands by itself nor where it is searched; and a distance in sizes is that in metres."""

@@ -78,6 +78,7 @@ def test_an_object_without_metres_has_nothing_beside_it_and_stands_beside_none(t
         advsearch.load_scene("car", things=[{"object": "car", "x": 1}])
 
 
+@pytest.mark.medium
 def test_what_stands_in_another_thing_is_said() -> None:
     notes = advsearch.load_scene("car", things="car@1,0.5; stop-sign@6,6; chair@6,6,size=1").description.notes
     assert [one for one in notes if "stand in each other" in one] == [
@@ -210,6 +211,7 @@ def projected_box(thing: str, x: float, y: float, heading: float, size: float) -
     return column.min(), row.min(), column.max(), row.max()
 
 
+@pytest.mark.medium
 def test_boxes_are_those_of_an_independent_projection() -> None:
     scene = advsearch.load_scene("car", "street", settings=VIEW, things=THREE)
     renderer = scene.renderer({"pose": {}}, resolution=SIDE, denoise="none")
@@ -226,6 +228,7 @@ def test_boxes_are_those_of_an_independent_projection() -> None:
         assert (found[name].share or 0.0) > 0.97 and found[name].truncated is False
 
 
+@pytest.mark.medium
 def test_a_thing_hides_is_hidden_and_casts_a_shadow() -> None:
     behind = {**VIEW, "camera.azimuth": 0.0, "camera.elevation": 14.0}
     pictures, seen = [], []
@@ -254,6 +257,7 @@ def test_the_settings_of_a_scene_name_its_things() -> None:
         scene.with_settings({"pose:char.yaw": 90.0})
 
 
+@pytest.mark.medium
 def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
     """What hides the object and shades it is in the matrix; a predicted change of its paint is the traced one."""
     scene = advsearch.load_scene("car", "street", settings=VIEW, things="stop-sign@3,0.6,size=1.6; chair@-2,2,size=1")
@@ -271,6 +275,7 @@ def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
     assert inside.any() and float(change[inside].abs().mean()) < 0.01  # light from the paint, and no paint itself
 
 
+@pytest.mark.medium
 def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
     def reason(things: str | None) -> str | None:
         scene = advsearch.load_scene("mug", size=0.1, things=things)
@@ -281,6 +286,7 @@ def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
     assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))
 
 
+@pytest.mark.medium
 def test_a_thing_on_the_pavement_stands_on_it() -> None:
     description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
     low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
@@ -26,6 +25,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport import matrix as linear
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
+from stand_ins import Impatient, rows
 
 SIZE = 64
 HALF = 5e-4
@@ -54,6 +54,7 @@ def changed(renderer: Renderer, epsilon: float, kind: str) -> Tensor:
     return (renderer.start + epsilon * way.get(kind, torch.tensor(1.0 if kind == "up" else -1.0))).clamp(0.0, 1.0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("kind", "most"), [("signs", 1.3), ("up", 2.0), pytest.param("down", 2.0, marks=pytest.mark.slow)]
 )
@@ -70,6 +71,7 @@ def test_a_predicted_change_is_the_traced_one(
     assert levels(after, before) > 3.0 * most, "the change itself is large"
 
 
+@pytest.mark.medium
 def test_a_fine_pattern_is_compared_without_the_denoiser(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
     """Which takes it for noise: with the pattern, a prediction is as near as at the start."""
     squares = []
@@ -80,12 +82,14 @@ def test_a_fine_pattern_is_compared_without_the_denoiser(renderer: Renderer, pre
     assert squares[1] < squares[0] + 1.0
 
 
+@pytest.mark.medium
 def test_what_it_starts_from_is_the_traced_picture(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
     with torch.no_grad():
         one, other = (renderer(renderer.start, seed=seed, spp=256) for seed in (11, 12))
         assert levels(predicted(renderer.start), one) < 1.5 * levels(one, other)
 
 
+@pytest.mark.medium
 def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
     def loss(picture: Tensor) -> Tensor:
         return (picture * picture).mean()
@@ -174,6 +178,7 @@ def test_where_it_can_predict(controls: object, options: dict[str, object], reas
     assert (None if refusal is None else refusal.text) == reason
 
 
+@pytest.mark.medium
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear, "MOST_BYTES", 1000)
     with pytest.raises(linear.TransportTooLargeError, match="would take more than"):
@@ -185,6 +190,7 @@ def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch:
 SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "controls": {"texture": {"resolution": 8}}}
 
 
+@pytest.mark.medium
 def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     made, guesses = 0, 0
     linearised, likely = lights.predicting, searching.Transport.likely
@@ -207,6 +213,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     assert made == 1 and guesses >= 5
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     made, linearised = 0, lights.predicting
@@ -239,6 +246,7 @@ def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.Monk
     assert not made.likely(torch.tensor(1.7)) and made.likely(torch.tensor(2.0))
 
 
+@pytest.mark.medium
 def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_with_the_same_rows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -260,6 +268,7 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("options", "reason"),
     [

@@ -42,6 +42,7 @@ def test_each_square_has_its_own_picture(name: str, tmp_path: Path) -> None:
     assert {part.surface.name for part in parts} == {"m"}
 
 
+@pytest.mark.medium
 def test_both_pictures_are_on_the_object(tmp_path: Path) -> None:
     picture(tmp_path, "skin.1001.png", RED), picture(tmp_path, "skin.1002.png", BLUE)
     read(tmp_path, TWO, a="newmtl m\nmap_Kd skin.1001.png\n")

@@ -142,6 +142,7 @@ def same_picture(one: Path | str, other: Path | str) -> None:
     assert np.ptp(theirs) > 50.0
 
 
+@pytest.mark.medium
 @needs_usd
 @pytest.mark.parametrize(("up", "unit"), [("Y", 1.0), ("Z", 0.01)])
 def test_a_file_looks_as_its_twin_in_gltf(mug: tuple[ObjectAsset, Path], up: str, unit: float) -> None:
@@ -163,6 +164,7 @@ def faults_of(path: Path) -> list[str]:
     return [f"{one.GetName()}: {one.GetMessage()}" for one in found]
 
 
+@pytest.mark.medium
 @needs_usd
 def test_binary_files_and_packages_are_the_same(mug: tuple[ObjectAsset, Path]) -> None:
     from pxr import Sdf
@@ -196,6 +198,7 @@ def skin(folder: Path) -> None:
     Image.fromarray(levels).save(folder / "skin.png")
 
 
+@pytest.mark.medium
 @needs_usd
 def test_subsets_have_materials_of_their_own(tmp_path: Path) -> None:
     subset = """
@@ -215,6 +218,7 @@ def test_subsets_have_materials_of_their_own(tmp_path: Path) -> None:
     assert found.material.roughness == pytest.approx(0.3) and found.material.metallic == 0.0
 
 
+@pytest.mark.medium
 @needs_usd
 def test_numbers_and_pictures_of_a_preview_surface(tmp_path: Path) -> None:
     """Two pictures of numbers become their means, of linear values as USD says of colours of 8 bits; the emission is
@@ -235,6 +239,7 @@ def test_numbers_and_pictures_of_a_preview_surface(tmp_path: Path) -> None:
     assert ((blue + 0.055) / 1.055) ** 2.4 == pytest.approx(dark, rel=0.05)
 
 
+@pytest.mark.medium
 @needs_usd
 def test_opacity_cuts_out_and_a_transform_moves_the_texture(tmp_path: Path) -> None:
     skin(tmp_path)
@@ -262,6 +267,7 @@ def test_opacity_cuts_out_and_a_transform_moves_the_texture(tmp_path: Path) -> N
     assert found.mesh.uvs[:, 1].min() == pytest.approx(0.6) and found.mesh.uvs[:, 1].max() == pytest.approx(0.85)
 
 
+@pytest.mark.medium
 @needs_usd
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
 def test_polygons_holes_and_orientation(tmp_path: Path, orientation: str) -> None:
@@ -277,6 +283,7 @@ def test_polygons_holes_and_orientation(tmp_path: Path, orientation: str) -> Non
     assert (across[:, 1] < 0).all(), "towards the viewer, which is +z with y up"
 
 
+@pytest.mark.medium
 @needs_usd
 def test_a_mesh_to_be_subdivided_is_smooth_and_said_to_be_whole(tmp_path: Path) -> None:
     found = import_object(written(tmp_path, mesh(CUBE, SIDES, scheme="catmullClark")))
@@ -325,6 +332,7 @@ ROOM = f"""
 """
 
 
+@pytest.mark.medium
 @needs_usd
 def test_nodes_cameras_and_lights_are_those_of_the_file(tmp_path: Path) -> None:
     """Radiance times the disk of a sphere is its intensity; normalised, the power is that of the number."""
@@ -350,6 +358,7 @@ def said(scene: SceneDescription) -> str:
     return " ".join(scene.object.warnings)
 
 
+@pytest.mark.medium
 @needs_usd
 def test_references_payloads_variants_and_instances(tmp_path: Path) -> None:
     """A variant that is chosen in the file, and a part of another file, twice as an instance."""
@@ -386,6 +395,7 @@ def test_references_payloads_variants_and_instances(tmp_path: Path) -> None:
     assert sizes["board"] == pytest.approx((3.0, 0.1, 1.0)) and sizes["Root/leg1/stick"] == pytest.approx((0.1, 1, 0.1))
 
 
+@pytest.mark.medium
 @needs_usd
 def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
     """Bound in one pose, at rest in another: the upper joint is moved by 2 in x, and its points with it."""
@@ -414,6 +424,7 @@ def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
     assert node.size == pytest.approx((3.0, 1.0, 1.0))
 
 
+@pytest.mark.medium
 @needs_usd
 def test_what_is_left_out_is_named(tmp_path: Path) -> None:
     body = mesh(CUBE, SIDES, material="glass") + preview(
@@ -456,6 +467,7 @@ def refers_to(name: str) -> str:
     return f'    def Xform "part" (prepend references = @{name}@) {{}}\n' + mesh(CUBE, SIDES)
 
 
+@pytest.mark.medium
 @needs_usd
 @pytest.mark.parametrize(
     ("body", "expected"),
@@ -487,6 +499,7 @@ def test_what_is_refused(tmp_path: Path, body: str, expected: str) -> None:
     assert str(raised.value).startswith(str(folder))
 
 
+@pytest.mark.medium
 @needs_usd
 @pytest.mark.parametrize(
     ("name", "compression", "expected"),
@@ -507,6 +520,7 @@ def test_packages_that_are_refused(tmp_path: Path, name: str, compression: int, 
     assert not (tmp_path.parent / "out.usda").exists()
 
 
+@pytest.mark.medium
 @needs_usd
 def test_damaged_files_and_large_ones_end_in_a_sentence(
     tmp_path: Path, mug: tuple[ObjectAsset, Path], monkeypatch: pytest.MonkeyPatch

@@ -57,6 +57,7 @@ def depression(scene: Scene) -> float:
     return view.lowest - math.degrees(half) + math.degrees(math.atan(slope))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("away", [6.0, 12.0, 24.0])
 def test_houses_are_as_much_too_large_as_the_formula_says(away: float) -> None:
     shown = math.tan(math.radians(depression(street(away, EYE, **{"ground.size": 0.0}))))
@@ -64,12 +65,14 @@ def test_houses_are_as_much_too_large_as_the_formula_says(away: float) -> None:
     assert shown / true == pytest.approx(1.0 + away / 12.0, rel=0.08)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("height", [1.5, 3.0, 4.5])
 def test_houses_are_as_much_too_high_as_the_formula_says(height: float) -> None:
     shown = math.tan(math.radians(depression(street(8.0, height, **{"ground.size": 0.0, "camera.fov": 60.0}))))
     assert (height / 12.0) / shown == pytest.approx(height / EYE, rel=0.08)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("side", [90.0, 270.0])
 def test_the_road_ends_in_sight_where_the_formula_says(side: float) -> None:
     scene = street(10.0, 1.6, side).description
@@ -83,6 +86,7 @@ def test_the_road_ends_in_sight_where_the_formula_says(side: float) -> None:
     assert not outside[-1].any()
 
 
+@pytest.mark.medium
 def test_from_60_m_the_houses_stand_below_the_road() -> None:
     def below(away: float) -> bool:
         houses, things = seen(street(away, 1.6))

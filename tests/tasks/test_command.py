@@ -88,6 +88,7 @@ def judged(**options: Any) -> Command:
 # ---- judgements -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_the_margin_is_the_largest_difference_in_envelopes_less_one() -> None:
     task, clean = judged(), torch.tensor([0.1, -0.2])
     output = torch.tensor([[0.1, -0.2], [0.35, -0.2], [0.1, -0.45], [-0.9, -0.15]], requires_grad=True)
@@ -112,6 +113,7 @@ def test_an_action_that_is_no_number_is_neither_right_nor_a_success(bad: float) 
         Command(envelope=1).after_calibration(torch.tensor([[bad]]), None)
 
 
+@pytest.mark.medium
 def test_a_target_is_reached_within_its_envelope(monkeypatch: pytest.MonkeyPatch) -> None:
     model = advsearch.load_model(Colours(), task=Command(), input_size=8)
     asked = Command(envelope=0.1, names="r,g,b").on(model, target="g=0.9")
@@ -202,6 +204,7 @@ def exported(folder: Path) -> str:
     return str(folder / "turn.pt2")
 
 
+@pytest.mark.medium
 def test_a_policy_gets_pictures_and_a_state(tmp_path: Path) -> None:
     pictures = torch.rand(3, SIDE, SIDE, 3, generator=torch.Generator().manual_seed(1))
     expected = TowardsBlue()(pictures.permute(0, 3, 1, 2), {"speed": torch.full((3, 1), 2.0)})
@@ -245,6 +248,7 @@ def test_a_policy_with_select_action_is_called_by_it_and_forgets_each_time() -> 
         torch.testing.assert_close(model(pictures), expected)
 
 
+@pytest.mark.medium
 def test_a_policy_of_a_rig_takes_all_pictures_at_once(tmp_path: Path) -> None:
     class Mean(nn.Module):
         def forward(self, images: Tensor, state: dict[str, Tensor]) -> Tensor:
@@ -266,6 +270,7 @@ def test_a_policy_of_a_rig_takes_all_pictures_at_once(tmp_path: Path) -> None:
 # ---- questions ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_texture_turns_a_policy_the_wrong_way_and_the_page_says_no_more(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,6 +291,7 @@ def test_a_texture_turns_a_policy_the_wrong_way_and_the_page_says_no_more(
     assert "nothing moves, and no later picture follows from it" in page and "moved the" not in page
 
 
+@pytest.mark.medium
 def test_a_sweep_counts_actions_within_the_envelope() -> None:
     model = advsearch.load_model(TowardsBlue(), task=make_task(ASKED), input_size=SIDE)
     asked = {"name": "command", "state": {"speed": 2}, "envelope": 0.3}

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import SIDE, Ranger
 from torch import Tensor, nn
 
 import advsearch
@@ -34,6 +33,7 @@ from advsearch.tasks.depth import (
     Depth,
     Distances,
 )
+from small_models import SIDE, Ranger
 
 HIGH, WIDE = 8, 10
 MASK = torch.zeros(HIGH, WIDE).bool()
@@ -260,6 +260,7 @@ def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none", "--trials", "6"]
 
 
+@pytest.mark.medium
 def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     flags = ["--epsilon", "0.5", "--steps", "12", "--objective", "gone", "--no-baseline", "--run", str(run)]
@@ -280,6 +281,7 @@ def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFix
     assert "orange the object&#x27;s pixels whose distance is right." in page
 
 
+@pytest.mark.medium
 def test_a_sweep_counts(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """From above, what is beside the object says no scale, and the whole picture does."""
     flags = ["--grid", "camera.elevation=25,85", "--spp", "2", "--denoise", "none", "--trials", "6"]

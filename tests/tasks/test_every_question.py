@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from small_models import SIDE, Finder, Painter, Slider
 from torch import nn
 
 import advsearch
@@ -21,6 +20,7 @@ from advsearch.questions.photographs.result import rendering_file
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
+from small_models import SIDE, Finder, Painter, Slider
 
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
@@ -80,6 +80,7 @@ figures:
 """
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE)
@@ -94,6 +95,7 @@ def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
 
 
+@pytest.mark.medium
 def test_a_search_predicts_verifies_and_draws(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -124,6 +126,7 @@ def test_a_search_predicts_verifies_and_draws(
     assert photographed(taker, run, "clean", SIDE // 2) == [True, False]
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_stopped_search_goes_on_with_the_same_words(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -136,6 +139,7 @@ def test_a_stopped_search_goes_on_with_the_same_words(
         assert again[name] == first[name]
 
 
+@pytest.mark.medium
 def test_a_sweep_counts_and_keeps_the_worst(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -152,6 +156,7 @@ def test_a_sweep_counts_and_keeps_the_worst(
     assert photographed(taker, tmp_path / "run", "0", SIDE // 2) == [True, False]
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_an_adversarial_scene_is_tried_on_other_models_and_under_other_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -179,6 +184,7 @@ def test_an_adversarial_scene_is_tried_on_other_models_and_under_other_condition
     assert {row["ending"] for row in again["table"] if row["way"] in ("as verified", "model")} == {"found"}
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--steps", "3", "--average", "4", "--trials", "6", "--policy", "random", "--run", str(tmp_path / "run")]
@@ -186,6 +192,7 @@ def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.Captur
     assert found["average"]["configurations"] == 4
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--vary", "pose.yaw", "--denoise", "none", "--verify-spp", "4", "--samples", "20"]
@@ -195,6 +202,7 @@ def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixt
     assert found["verdict"] in ("right", "wrong") and found["box"][0]["name"] == "pose.yaw"
 
 
+@pytest.mark.medium
 @pytest.mark.slow
 def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--epsilon", "0.3", "--smallest", "--steps", "8", "--trials", "6", "--run", str(tmp_path / "run")]
@@ -202,6 +210,7 @@ def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str
     assert found["ending"] == "found" and 0.0 < found["smallest"]["epsilon"]["texture"] < 0.3
 
 
+@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_configuration_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -248,6 +257,7 @@ def test_the_first_predictions_are_told_where_no_label_fits(
     assert f"calls a clean picture of it {'cup' if detects else 'class 0'!r} " in said and "name what is right" in said
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("asked", ["detection"], indirect=True)
 def test_a_wrong_name_is_sought_by_its_objective(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -258,6 +268,7 @@ def test_a_wrong_name_is_sought_by_its_objective(
     assert set(found["verified"]["labels"]) == {"bowl"}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("objective", "network", "controls", "said"),
     [

@@ -121,6 +121,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.medium
 def test_rows_have_what_was_said_beside_the_words(home: Path) -> None:
     for name in ("swept", "attacked"):
         with Store(home / "runs" / name / "results.sqlite", read_only=True) as store:
@@ -174,6 +175,7 @@ def depth_task() -> Any:
     return module.Distance
 
 
+@pytest.mark.medium
 def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> None:
     task = depth_task()(factor=1.05)
     model = load_model(Flat(), input_size=24, read=task.reader)

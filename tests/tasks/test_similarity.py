@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from small_models import SIDE
 from torch import Tensor, nn
 
 import advsearch
@@ -24,6 +23,7 @@ from advsearch.runs.files import read_png, to_8bit
 from advsearch.runs.summary import file_digests
 from advsearch.tasks import Facts, make_task
 from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE, Similarity
+from small_models import SIDE
 
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)
@@ -310,6 +310,7 @@ def typed(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("objective", ["margin", "distance"])
 def test_an_attack_is_verified(
     rendered: Path, objective: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -339,6 +340,7 @@ def test_an_attack_is_verified(
     assert typed(capsys, "resume", str(run))["verified"] == found["verified"]
 
 
+@pytest.mark.medium
 def test_a_sweep_counts_what_is_not_itself_any_more(
     rendered: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

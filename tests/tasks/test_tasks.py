@@ -245,6 +245,7 @@ def test_an_output_may_be_a_list_with_one_thing_for_each_picture() -> None:
     assert model.differentiable
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("tolerance", "right"), [(1e3, 2), (1e-3, 0)])
 def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: int) -> None:
     network, task = load_model(Level(), input_size=8, read=Yaw().reader), Yaw(tolerance=tolerance)
@@ -319,6 +320,7 @@ def test_options_are_shown_and_a_file_says_those_that_are_not_the_default(
     assert "unknown task 'yow'. Did you mean 'yaw'?" in capsys.readouterr().err
 
 
+@pytest.mark.medium
 def test_options_of_an_instance_are_kept_and_a_run_with_others_is_not_gone_on_with(named: None, tmp_path: Path) -> None:
     network, run = load_model(Level(), input_size=8, read=Yaw().reader), tmp_path / "run"
     given: dict[str, Any] = {"controls": {"pose": {"yaw": [0, 90]}}, "policy": "random", "steps": 2, "trials": 6}

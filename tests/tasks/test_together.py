@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from small_models import SIDE, Finder, Painter, Ranger
 from torch import nn
 
 import advsearch
@@ -23,6 +22,7 @@ from advsearch.tasks import Detection, Facts, Sight, Task, make_task
 from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE, Depth
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import Together, together
+from small_models import SIDE, Finder, Painter, Ranger
 
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
 
@@ -46,6 +46,7 @@ def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.medium
 def test_one_configuration_against_a_detector_and_a_model_of_depth(
     files: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

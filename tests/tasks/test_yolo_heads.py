@@ -316,6 +316,7 @@ class Bright(nn.Module):
         return numbers, [x, x]
 
 
+@pytest.mark.medium
 def test_a_search_goes_through_a_head_to_its_verified_end(tmp_path: Path) -> None:
     model = load_model(Bright(), input_size=32, read=Detection().reader)
     result = advsearch.attack(

@@ -10,6 +10,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.errors import FileFormatError
+from advsearch.questions.attack import wording
+from advsearch.report.figures import search_axes
+from advsearch.report.views import NARROW, WIDE, Html, element, join_html, study_chart
+from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
+from advsearch.runs.directory import OBJECT_FILE
+from advsearch.runs.files import read_png
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.viewer.document import asset
+from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 from samples import (
     ATTACK,
     AVERAGE,
@@ -24,18 +36,6 @@ from samples import (
     rated,
     written_page,
 )
-
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.errors import FileFormatError
-from advsearch.questions.attack import wording
-from advsearch.report.figures import search_axes
-from advsearch.report.views import NARROW, WIDE, Html, element, join_html, study_chart
-from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
-from advsearch.runs.directory import OBJECT_FILE
-from advsearch.runs.files import read_png
-from advsearch.statistics.intervals import clopper_pearson
-from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
 
@@ -225,6 +225,7 @@ def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> 
     assert not page.all("img") and "Verified rates" not in page.text
 
 
+@pytest.mark.medium
 def test_a_large_picture_is_embedded_smaller(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     large = run / "artifacts" / "texture.png"
@@ -259,6 +260,7 @@ def searches(objectives: dict[str, list[float | None]], zero: str = "", width: i
     return study_chart(partial(search_axes, objectives, "margin", zero_means=zero), "the search", width)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("width", [WIDE, NARROW])
 @pytest.mark.parametrize(
     "values", [[1.0], [2.0, 2.0, 2.0], [None, 1.0, None], [1e-12, 2e-12], [-1e9, 1e9], [float(i) for i in range(5000)]]
@@ -553,6 +555,7 @@ def test_the_page_says_how_the_search_worked(tmp_path: Path) -> None:
     assert text.count("at its end") == 1
 
 
+@pytest.mark.medium
 def test_the_page_does_not_say_what_is_not_known_of_the_search(tmp_path: Path) -> None:
     text = page_of(make_run(tmp_path / "run")).text
     assert "Light paths" in text

@@ -15,24 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from covering import once_each
 from PIL import Image
-from samples import (
-    CURVE,
-    EXPLAIN,
-    HARDEN,
-    RECIPE,
-    REPLAY,
-    STABILITY,
-    curve,
-    keep_object,
-    make_run,
-    matrix,
-    region,
-    written_page,
-)
-from samples import attack as attack_with
-from stored_sweeps import described, make_sweep, serving
 
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.explain.result import ExplainResult
@@ -50,6 +33,23 @@ from advsearch.tasks import Prediction
 from advsearch.viewer import thumbnails
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
+from covering import once_each
+from samples import (
+    CURVE,
+    EXPLAIN,
+    HARDEN,
+    RECIPE,
+    REPLAY,
+    STABILITY,
+    curve,
+    keep_object,
+    make_run,
+    matrix,
+    region,
+    written_page,
+)
+from samples import attack as attack_with
+from stored_sweeps import described, make_sweep, serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -68,7 +68,7 @@ PLANNED: dict[str, Any] = {
 
 
 def test_a_browser_is_looked_for() -> None:
-    """Where there is none the tests below are skipped; tools/browser.sh, which `make test` calls, installs one."""
+    """Where there is none the tests below are skipped; tools/browser.sh, which `make test-all` calls, installs one."""
     assert CHROMIUM is None or Path(CHROMIUM).is_file()
 
 
@@ -481,6 +481,7 @@ def test_everybody_can_use_the_pages(
         assert faults(page) == []
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "result",
     [
@@ -591,6 +592,7 @@ def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> Non
 # ---- photographs ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: Path) -> None:
     """With a camera that isn't there, over HTTPS as a phone has it; and everybody can use the page."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
@@ -628,6 +630,7 @@ def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: P
                 assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
 
 
+@pytest.mark.medium
 def test_edges_alone_are_drawn_from_the_rendering(browser: Browser, tmp_path: Path) -> None:
     run = make_sweep(tmp_path / "first", keep="all")
     square = np.zeros((64, 64, 3), np.float32)

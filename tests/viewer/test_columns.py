@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stored_sweeps import make_sweep
 
 from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.tables import sweep_frame
 from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, packed, read_columns
 from advsearch.viewer.thumbnails import kept_pictures, path_of
+from stored_sweeps import make_sweep
 
 
 def row(step: int, **values: Any) -> Row:

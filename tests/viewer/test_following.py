@@ -8,12 +8,12 @@ from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
-from stored_sweeps import described, serving
 
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.viewer.server import START, following_page, is_under_way, progress_json
+from stored_sweeps import described, serving
 
 
 def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:

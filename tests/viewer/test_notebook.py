@@ -11,15 +11,15 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from conftest import ROOT
 from matplotlib.figure import Figure
 from PIL import Image
-from samples import CURVE, sweep
 
 from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.sweep.display import sweep_axes
 from advsearch.report.figures import search_axes
 from advsearch.report.views import side_by_side
+from conftest import ROOT
+from samples import CURVE, sweep
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 
@@ -30,6 +30,7 @@ def code() -> list[str]:
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
+@pytest.mark.medium
 @pytest.mark.docs
 def test_the_notebook_of_the_docs_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     from matplotlib import pyplot as plt
@@ -90,6 +91,7 @@ def test_a_study_is_shown() -> None:
     assert drawn.has_data()
 
 
+@pytest.mark.medium
 def test_a_figure_is_a_picture_and_what_has_none_says_so() -> None:
     points = [{**CURVE["curve"][0], "epsilon": epsilon} for epsilon in (0.01, 0.1)]
     several = CurveResult.of({**CURVE, "curve": points})

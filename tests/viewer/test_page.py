@@ -9,13 +9,13 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from stored_sweeps import make_sweep
 
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
+from stored_sweeps import make_sweep
 
 
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:

@@ -20,8 +20,6 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from PIL import Image
-from samples import make_run
-from stored_sweeps import make_sweep, serving
 
 from advsearch.cli.main import main
 from advsearch.errors import InputError
@@ -39,6 +37,8 @@ from advsearch.statistics.intervals import clopper_pearson
 from advsearch.trust.network import https_context
 from advsearch.viewer.clients import LARGEST_SENT, reachable
 from advsearch.viewer.server import Dashboard
+from samples import make_run
+from stored_sweeps import make_sweep, serving
 
 
 def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:
@@ -107,6 +107,7 @@ def kept(run: Path) -> int:
 # ---- what is taken in -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> None:
     stream = io.BytesIO()
     exif = Image.Exif()

@@ -19,8 +19,6 @@ from ssl import _create_unverified_context
 import numpy as np
 import pytest
 from PIL import Image
-from samples import make_run, written_page
-from stored_sweeps import make_sweep, serving
 
 from advsearch.errors import InputError
 from advsearch.questions.photographs.result import PhotoAgreement
@@ -29,6 +27,8 @@ from advsearch.viewer import clients
 from advsearch.viewer.document import document, has_other_scripts
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.thumbnails import Kept
+from samples import make_run, written_page
+from stored_sweeps import make_sweep, serving
 
 
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
@@ -205,6 +205,7 @@ def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
         assert ask(server, "/runs/first/rows", Cookie="advsearch-1=x")[0].status == 401
 
 
+@pytest.mark.medium
 def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
     """All are connected and have asked before the first answer is read; the server has no more threads than before."""
     asked = f"GET /runs/first/pictures/0000/1.jpg HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
@@ -298,6 +299,7 @@ def test_a_request_has_its_time_in_all(server: Dashboard, monkeypatch: pytest.Mo
                 assert talk.recv(1000) == b""  # ended by the server, although no letter was late
 
 
+@pytest.mark.medium
 def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("advsearch.viewer.clients.GRACE", 0.2)
     monkeypatch.setattr("advsearch.viewer.server.list_page", lambda _: "x" * (64 << 20))
@@ -311,6 +313,7 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
 # ---- what lies in a run is somebody else's ---------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("path", "kind", "own"),
     [

@@ -8,8 +8,6 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
-from samples import ACCURACY, AVERAGE, CURVE, RECIPE, STABILITY, curve, make_run, matrix, region
-from stored_sweeps import serving
 
 from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
@@ -20,6 +18,8 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.document import heading
 from advsearch.viewer.pages import shown_page, write_page
+from samples import ACCURACY, AVERAGE, CURVE, RECIPE, STABILITY, curve, make_run, matrix, region
+from stored_sweeps import serving
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
 
@@ -114,6 +114,7 @@ def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
     assert "cases that were not begun" not in meanings
 
 
+@pytest.mark.medium
 def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
     run = make_study(tmp_path / "study", two_objects())
     (run / "parts" / "bowl" / "report.html").unlink()
@@ -145,6 +146,7 @@ def test_any_result_has_a_page(tmp_path: Path, result: Result, said: list[str]) 
     assert "None" not in text_of(page)
 
 
+@pytest.mark.medium
 def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path) -> None:
     run = make_study(tmp_path / "study", two_objects())
     with serving(run) as server:

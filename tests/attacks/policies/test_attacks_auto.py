@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from covering import once_each
 from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
 from advsearch.attacks.evaluation import Policy, one_thread, seeded
 from advsearch.attacks.policies.auto import LOW, make_plan
 from advsearch.attacks.policies.surrogate import box_coordinates, fit
+from covering import once_each
 
 POSE = (Block(3, name="position"), Block(3, periodic=True, name="rotation"))
 BALL = Block(40, "linf", 0.1, name="texture")
@@ -210,6 +210,7 @@ def test_choices_visit_every_option_at_its_middle() -> None:
     assert len({int(u * 5) for u in seen}) == 5
 
 
+@pytest.mark.medium
 def test_an_angle_is_searched_across_its_seam() -> None:
     """A peak of width 0.03 on the seam, whose both sides are equally good."""
     domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, periodic=True), Block(1)), 10**6)
@@ -316,6 +317,7 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
     return reached(Auto()) - reached(Random())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", FUNCTIONS)
 def test_it_beats_random_search_at_equal_renders(kind: str) -> None:
     """The mean gap of 12 searches is over zero. Over 120 searches it is 0.20, 0.27, 0.44 and 0.62 in the order of

@@ -13,8 +13,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from covering import once_each
-from hostile import SHORT, shown
 from torch import Tensor
 
 from advsearch.attacks import (
@@ -40,6 +38,8 @@ from advsearch.attacks.objectives import OBJECTIVES
 from advsearch.attacks.policies.pgd import Window
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
+from covering import once_each
+from hostile import SHORT, shown
 
 RATIO = 1.05  # an optimum counts as reached within this factor (STYLE, and the figure of adversarial-library)
 STEPS = 60
@@ -472,6 +472,7 @@ def constant(query: Query) -> Evaluation:
     return Evaluation(0.5, torch.zeros_like(query.u) if query.gradient else None, False, cost=query.samples)
 
 
+@pytest.mark.medium
 @once_each("policy, objective", every_policy(), sorted(OBJECTIVES), ids=label)
 def test_the_battery(policy: Policy[Any], objective: str) -> None:
     """Stays inside, keeps dtype and shape, honours the budget, survives NaN, and repeats with its seed."""
@@ -574,6 +575,7 @@ def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float)
     assert math.isfinite(result.best_objective)
 
 
+@pytest.mark.medium
 @battery
 def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) -> None:
     """The best option of two choices is worth more than the numbers; angles are met on both sides of their seam."""

@@ -95,6 +95,7 @@ SCENES: dict[str, tuple[Domain, Callable[[Tensor], float]]] = {
 """Closed forms whose failures are rare: beside the two numbers of a cell the others have to be right."""
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("scene", ["ball", "corner", "choice"])
 def test_three_times_as_many_cells_fail_as_in_random_search(scene: str) -> None:
     ours, theirs = (len(failing_cells(scene, policy, 300, 0.2, 3)) for policy in ("archive", "random"))

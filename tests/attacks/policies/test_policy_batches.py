@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import torch
-from covering import once_each
 from torch import Tensor
 
 from advsearch.attacks import POLICIES, Block, Domain, Evaluation, Policy, make_policy
 from advsearch.attacks.policies.choices import with_choices
+from covering import once_each
 
 NUMBERS = Domain(torch.tensor([0.3, 0.6, 0.5, 0.5]), (Block(2), Block(2, "linf", 0.2)))
 CHOICES = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
@@ -56,6 +56,7 @@ def proposed(policy: Policy[Any], domain: Domain, n: int) -> tuple[list[tuple[An
     return seen, sizes
 
 
+@pytest.mark.medium
 @once_each("policy, domain", FORMS, DOMAINS)
 def test_a_batch_has_what_would_have_come_one_by_one(policy: str, domain: str) -> None:
     alone, _ = proposed(FORMS[policy], DOMAINS[domain], 1)

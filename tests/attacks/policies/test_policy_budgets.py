@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import ROOT
 
 from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, Query, make_policy, search
+from conftest import ROOT
 
 PAGE = (ROOT / "docs" / "policies" / "README.md").read_text("utf-8")
 EXTENDING = (ROOT / "docs" / "extending.md").read_text("utf-8")
@@ -55,6 +55,7 @@ def stated() -> list[Any]:
     return [pytest.param(*one, id=f"{one[0]}-{one[1]}-{one[2]}", marks=mark) for one, mark in marks.items()]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "objective", "d", "renders"), stated())
 def test_a_policy_reaches_the_optimum_within_its_stated_budget(name: str, objective: str, d: int, renders: int) -> None:
     """`reached` also fails a policy that leaves the domain, or a wrong optimum."""
@@ -79,6 +80,7 @@ def test_a_gradient_pays_in_many_dimensions() -> None:
                 assert renders is None or renders >= 5000, name
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("objective", DIMENSIONS)
 def test_an_optimum_is_the_largest_value(objective: str) -> None:
     """Nothing that random search or a gradient finds is larger, and the start is far from it."""

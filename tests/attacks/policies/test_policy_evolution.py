@@ -90,6 +90,7 @@ def test_a_peak_on_the_seam_of_an_angle_is_met_from_both_sides(policy: Policy[An
     assert sides == {True, False}
 
 
+@pytest.mark.medium
 @both
 def test_through_noise_the_mean_is_better_than_the_best_that_was_seen(policy: Policy[Any]) -> None:
     """Noise of a third of the bowl's height: one lucky render says nothing, the distribution averages."""
@@ -119,6 +120,7 @@ def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Pol
     assert float(w @ result.distribution.mean) - start > 0.9 * (best - start)
 
 
+@pytest.mark.medium
 def test_a_constant_objective_does_not_blow_a_distribution_up() -> None:
     domain = Domain(torch.full((3,), 0.5), (Block(3),))
     for policy in (CMAES(population=4), NES(population=4)):
@@ -168,6 +170,7 @@ def test_cmaes_is_separable_in_many_dimensions_and_refuses_more() -> None:
         search(evaluator(bowl(0.5)), over, CMAES(), steps=10, seed=0)
 
 
+@pytest.mark.medium
 def test_cmaes_begins_anew_when_it_has_converged_and_answers_with_its_best_run() -> None:
     """The hill at the start is half as high as the one far away."""
 

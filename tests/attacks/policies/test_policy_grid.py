@@ -108,6 +108,7 @@ def test_choices_alone_are_enumerated() -> None:
     assert {(int(a * 4), int(b * 2)) for a, b in seen.tolist()} == {(a, b) for a in range(4) for b in range(2)}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("steps", [1, 7, 100, 10_000, 123_456])
 def test_one_number_takes_every_render(steps: int) -> None:
     domain = Domain(torch.tensor([0.5]), (Block(1, periodic=True),))

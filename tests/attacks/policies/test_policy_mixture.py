@@ -60,6 +60,7 @@ def share(known: Failures) -> FailureShare:
     return known.share
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("margin", "truth"), [(corner, 0.04), (across, 0.05), (two, 0.02)])
 def test_its_share_is_the_true_one_with_less_error_than_even_draws(margin: Margin, truth: float) -> None:
     found = [share(learnt(margin, seed)) for seed in range(8)]
@@ -71,6 +72,7 @@ def test_its_share_is_the_true_one_with_less_error_than_even_draws(margin: Margi
     assert abs(float(estimates.mean()) - truth) < 3.0 * spread < truth
 
 
+@pytest.mark.medium
 def test_it_answers_with_a_failure_for_each_place_and_what_tells_it_apart() -> None:
     known = learnt(two, 1)
     assert known.found > 5 * 0.02 * known.seen and known.places is None

@@ -19,12 +19,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import small_models
 import torch
 import yaml
 from torch import Tensor
 
 import advsearch
+import small_models
 from advsearch.api import workbench
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
@@ -121,6 +121,7 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---- answers --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tuple[SuiteResult, Path]) -> None:
     result, folder = tested
     found = {one.name: one for one in result.claims}
@@ -147,6 +148,7 @@ def test_the_evidence_has_a_paragraph_for_each_claim(tested: tuple[SuiteResult, 
     assert sorted(kinds) == sorted([*measured, ("nothing claimed", "too-few"), ("measured", "no-worse")])
 
 
+@pytest.mark.medium
 def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp_path: Path) -> None:
     result, _ = tested
     first = next(one for one in result.claims if one.name == "behind")
@@ -181,6 +183,7 @@ def test_pictures_that_two_equal_models_would_need_are_told() -> None:
     assert not claims.check_pictures("it", few.model_copy(update={"pictures": 84}), 0.95)
 
 
+@pytest.mark.medium
 def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_safe(tmp_path: Path) -> None:
     claims = {
         "little": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [-20, 20]}}}},
@@ -247,6 +250,7 @@ def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProces
     yield None if config.workers is None else InProcess(getattr(import_module(module), name)(settings))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("workers", [None, 2])
 def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
     workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -304,6 +308,7 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
     assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
+@pytest.mark.medium
 def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) -> None:
     config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="behind,in-front", seconds=1e-3, run=str(tmp_path / "r"))
     result = carry_out(config)
@@ -315,6 +320,7 @@ def test_what_the_time_is_over_for_is_undecided_and_can_go_on(tmp_path: Path) ->
 # ---- counterexamples and expectations -------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Path, tmp_path: Path) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     added = carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
@@ -574,6 +580,7 @@ def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[Suite
 # ---- for machines ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -683,6 +690,7 @@ def test_a_share_may_be_written_in_per_cent_and_an_unknown_claim_is_named(tmp_pa
 # ---- for other people's CI ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.docs
 def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -744,6 +752,7 @@ def always() -> advsearch.Model:
         return advsearch.load_model(small_models.Blue(-9.0), labels=["mug", "vase"], input_size=32, name="always")
 
 
+@pytest.mark.medium
 def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -760,6 +769,7 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
         assert_no_worse("mug", easy, always(), points=20.0, pictures=13, controls=FRONT, **small)
 
 
+@pytest.mark.medium
 def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert assert_not_broken(advsearch.load_scene("mug"), always(), **SMALL, **QUICK).status == 0
@@ -768,6 +778,7 @@ def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytes
         assert_suite(suite)
 
 
+@pytest.mark.medium
 @pytest.mark.docs
 def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
@@ -786,6 +797,7 @@ def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.
     assert len(list(Path("runs").iterdir())) == 3, "each keeps its run"
 
 
+@pytest.mark.medium
 def test_a_suite_at_work_is_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said: list[str] = []
 

@@ -33,6 +33,7 @@ def on(count: int) -> Iterator[None]:
         threads.configure()
 
 
+@pytest.mark.medium
 def test_the_same_bytes_at_any_number_of_threads() -> None:
     mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)

@@ -149,6 +149,7 @@ def compare(setup: Setup, axes: range, tolerance: float, **options: Any) -> None
     assert error < tolerance, f"adjoint {found.tolist()}, differences {expected.tolist()}, error {error:.3f}"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "axes"), [("mug", range(6)), pytest.param("book", range(2, 6), marks=pytest.mark.slow)]
 )
@@ -156,10 +157,12 @@ def test_pose_axes_of_a_floating_object_agree_with_differences(name: str, axes: 
     compare(build(name), axes, AGREEMENT, shadow_spp=16)
 
 
+@pytest.mark.medium
 def test_shadows_on_a_ground_agree_with_differences() -> None:
     compare(build("mug", lift=0.1, ground=True), range(3, 6), SHADOW_AGREEMENT, shadow_spp=16)
 
 
+@pytest.mark.medium
 def test_a_smooth_deformation_agrees_with_differences() -> None:
     setup = build("mug")
     phase = 3.0 * setup.vertices[:, [1, 2, 0]] + torch.tensor([0.3, 1.0, 2.0])
@@ -197,6 +200,7 @@ def test_an_object_outside_the_picture_has_no_gradient() -> None:
         assert float(part.abs().max()) == 0.0
 
 
+@pytest.mark.medium
 def test_the_gradient_of_a_shift_is_the_sum_over_vertices() -> None:
     setup = build("ball")
     by_vertices, by_normals = setup.adjoint(hills())
@@ -207,6 +211,7 @@ def test_the_gradient_of_a_shift_is_the_sum_over_vertices() -> None:
         assert float(by_vertices.sum(dim=0)[axis - 3]) == pytest.approx(expected, abs=AGREEMENT * scale)
 
 
+@pytest.mark.medium
 def test_the_same_seed_gives_the_same_gradient_and_another_one_another() -> None:
     setup = build("mug")
     first, again = setup.adjoint(hills(), spp=4), setup.adjoint(hills(), spp=4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 import torch
 
 import advsearch
@@ -28,6 +29,7 @@ def shown(renderer: Renderer) -> torch.Tensor:
     return [renderer(renderer.start, seed=seed, spp=4) for seed in (1, 2, 3)][-1]
 
 
+@pytest.mark.medium
 def test_scenes_with_media_do_not_disturb_each_other() -> None:
     alone = shown(smoke())
     assert 0.0 < float(alone.mean()) < 1.0

@@ -50,6 +50,7 @@ assert torch.equal(other.radiance({}, seed=2, spp=4), before)
 """A scene is held by nothing but a cycle when another one is recorded."""
 
 
+@pytest.mark.medium
 def test_a_scene_in_a_cycle_is_not_collected_while_another_is_recorded() -> None:
     done = subprocess.run(
         [sys.executable, "-c", COLLECTED_IN_A_RECORDING], capture_output=True, text=True, timeout=600, check=False

@@ -77,6 +77,7 @@ def levels(one: Tensor, other: Tensor) -> float:
     return 255.0 * float(((one - other) ** 2).mean().sqrt())
 
 
+@pytest.mark.medium
 def test_pictures_are_those_that_are_traced(traced: Renderer, light: SurfaceRenderer) -> None:
     """From other cameras and under other lights, about as near as rendered ones of 8 samples."""
     with torch.no_grad():
@@ -86,6 +87,7 @@ def test_pictures_are_those_that_are_traced(traced: Renderer, light: SurfaceRend
             assert levels(light(u), truth) < 1.3 * levels(traced(u, seed=2, spp=8), truth) + 0.5
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("camera", "fixed"), [("fisheye", {}), (None, {"k1": -0.9, "fov": 60.0}), ("fisheye", {"k1": -0.1})]
 )
@@ -125,6 +127,7 @@ def test_pictures_stay_when_the_scene_had_a_map_of_another_size(traced: Renderer
         assert torch.equal(light(traced.start), before)
 
 
+@pytest.mark.medium
 def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
     """Of radiance in the texture, in which it is linear but for the curve between both."""
     linear = SurfaceRenderer(traced.like(transfer="linear"), traced.start, seed=0)
@@ -140,6 +143,7 @@ def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
     assert float(found @ way) == pytest.approx(float(ends[0] - ends[1]) / 2e-2, rel=2e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("size", [(24, 40), (40, 24)])
 def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
     """Surfaces are where Mitsuba's own camera sees them, with a shifted picture of any shape and another lens."""
@@ -155,6 +159,7 @@ def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
     assert float(same.float().mean()) > 0.97
 
 
+@pytest.mark.medium
 def test_what_is_seen_of_a_photographed_room_is_its_map() -> None:
     """A photographed ground shows the photograph, and where a ray escapes there is the map."""
     scene = load_scene("ball", "kitchen", settings={"ground.kind": "photograph"})
@@ -173,6 +178,7 @@ STRANGE = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("value", [0.0, 1.0])
 @pytest.mark.parametrize("place", STRANGE)
 def test_strange_views_have_finite_pictures_and_derivatives(value: float, place: str) -> None:
@@ -189,6 +195,7 @@ def test_strange_views_have_finite_pictures_and_derivatives(value: float, place:
     assert 0.0 <= float(picture.detach().min()) and float(picture.detach().max()) <= 1.0
 
 
+@pytest.mark.medium
 def test_an_object_out_of_sight_has_no_derivative() -> None:
     """Its texels are in no picture; the environment is."""
     of = renderer_of(load_scene("ball"))
@@ -203,6 +210,7 @@ def test_an_object_out_of_sight_has_no_derivative() -> None:
     assert not bool(found.any()) and float(picture.detach().mean()) > 0.0
 
 
+@pytest.mark.medium
 def test_lights_make_room(traced: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest one goes where there is no memory, and is found again when it is wanted."""
     made = SurfaceRenderer(traced, traced.start, seed=0)
@@ -214,6 +222,7 @@ def test_lights_make_room(traced: Renderer, monkeypatch: pytest.MonkeyPatch) -> 
         assert torch.equal(made(drawn(traced, 0)), before) and made.dropped == 2
 
 
+@pytest.mark.medium
 def test_light_between_surfaces_follows_the_texture_when_it_is_renewed(traced: Renderer) -> None:
     """A black mug sends nothing to its inside."""
     made, black = SurfaceRenderer(traced, traced.start, seed=0), set_to(traced, 0.0)
@@ -225,6 +234,7 @@ def test_light_between_surfaces_follows_the_texture_when_it_is_renewed(traced: R
     assert float(after) < float(before)
 
 
+@pytest.mark.medium
 def test_a_surface_is_measured() -> None:
     """The bundled mug reflects more at grazing angles, in a lobe about the mirrored direction; a mirror all of it."""
     shares = {}
@@ -241,6 +251,7 @@ def test_a_surface_is_measured() -> None:
     assert np.abs(mirror.up[8:] - middle[8:]).max() < 0.2
 
 
+@pytest.mark.medium
 def test_what_it_cannot_predict_has_a_reason() -> None:
     """In words, before anything is measured."""
     mug = load_scene("mug")
@@ -270,6 +281,7 @@ def whole() -> SurfaceRenderer:
     return SurfaceRenderer(ball, ball.start, seed=0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("opacity", [0.0, 0.4])
 def test_light_passes_cut_outs(opacity: float, whole: SurfaceRenderer) -> None:
     """What is behind them is seen, with the light that comes in; without that a picture is much further off."""
@@ -297,6 +309,7 @@ def test_a_sun_of_one_texel_is_as_wide_as_the_map_shows_it() -> None:
     assert float(light.sum(dim=0)[0]) == pytest.approx(1e5 * float(solid), rel=0.03)  # the rest is left to the cells
 
 
+@pytest.mark.medium
 def test_exposures_of_one_map_share_its_light(traced: Renderer, light: SurfaceRenderer) -> None:
     """Its pictures are those of light that was found for the other exposure; a turned map has a light of its own."""
     first = drawn(traced, 1)
