@@ -33,11 +33,11 @@ from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_
 from advsearch.scene.mitsuba_backend.texel_rays import (
     Ints,
     Lobes,
-    gather,
+    compute_visible_cosines,
+    is_visible_from_behind,
     measured,
-    seen_from_behind,
-    to_map,
-    towards,
+    trace_texel_rays,
+    world_to_map,
 )
 from advsearch.scene.predictor import LinearMap
 from advsearch.scene.raster import rasterised
@@ -155,7 +155,7 @@ class Arrangement:
         vertices, normals = (values.reshape(-1, 3).numpy() for values in shape)
         charts = rasterised(description.meshes[OBJECT].mesh, SIDE)
         some = [texels.on_mesh(OBJECT, charts, vertices, normals)]
-        if seen_from_behind(scene, OBJECT, some[0].places):
+        if is_visible_from_behind(scene, OBJECT, some[0].places):
             some = [
                 texels.on_mesh(OBJECT, charts, vertices, side * normals, side)
                 for side in (1, -1)
@@ -200,7 +200,7 @@ class Arrangement:
             )
         places = self.texels.places
         facing = self.texels.normals
-        seen = gather(
+        seen = trace_texel_rays(
             scene, self.texels.grids, texels.CELLS, places, facing, GATHERED, seed
         )
         self._sees = texels.seen_of(seen, self.texels.of_cell, len(places))
@@ -226,7 +226,7 @@ class Arrangement:
             len(some) - self.sides
         )
         self._photographed = None if photograph is None else description.capture_height
-        self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
+        self.to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
@@ -333,7 +333,7 @@ class Arrangement:
             direct = None
             if len(sky.hot[0]):
                 self._scene.stand(self.inputs)
-                cosines = towards(
+                cosines = compute_visible_cosines(
                     self._scene,
                     self.texels.places,
                     self.texels.normals,
