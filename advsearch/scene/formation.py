@@ -363,8 +363,8 @@ def visible_normals(scene: SceneDescription) -> Doubles:
     normals = (weights[visible, :, None] * object_normals).sum(axis=1) @ linear.T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     from_camera = points[corners].mean(axis=1) @ camera[:3, :3].T
-    faces_away = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
-    return np.asarray(np.where(faces_away, -normals, normals))
+    is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
+    return np.asarray(np.where(is_back_facing, -normals, normals))
 
 
 @lru_cache(maxsize=8)

@@ -127,17 +127,20 @@ def examine(path: Path, *, name_hint: Path) -> LibraryFile:
         path: of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
-    own = own_elf_header()
+    interpreter_header = own_elf_header()
     header = b""
     try:
         with path.open("rb") as file:
             header = file.read(20)
     except OSError as error:
         return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
-    if own and (header[:4] != b"\x7fELF" or len(header) < 20):
+    if interpreter_header and (header[:4] != b"\x7fELF" or len(header) < 20):
         return LibraryFile(path, (), "it is not a shared library")
     # word size and byte order, and the processor
-    if own and (header[4:6], header[18:20]) != (own[4:6], own[18:20]):
+    if interpreter_header and (header[4:6], header[18:20]) != (
+        interpreter_header[4:6],
+        interpreter_header[18:20],
+    ):
         return LibraryFile(path, (), "it is for another processor")
     version = version_in(path) or version_in(name_hint) or asked_version(str(path))
     return LibraryFile(path, version, refusal(version))
@@ -182,28 +185,28 @@ def ensure_llvm() -> LibraryFile:
     """
     variable = os.environ.get(VARIABLE, "")
     if not variable:
-        chosen = newest(find())
-        os.environ[VARIABLE] = str(chosen.path)
-        return chosen
+        library = newest(find())
+        os.environ[VARIABLE] = str(library.path)
+        return library
     path = Path(variable)
     advice = "Correct it, or unset it to let advsearch look for one."
     # the dynamic loader looks it up; only the library itself knows its version
     if os.sep not in variable:
         version = asked_version(variable)
-        chosen = LibraryFile(path, version, refusal(version))
+        library = LibraryFile(path, version, refusal(version))
     elif path.is_file():
-        chosen = examine(path.resolve(), name_hint=path)
+        library = examine(path.resolve(), name_hint=path)
     else:
         raise EnvironmentSetupError(
             f"{VARIABLE}: expected a libLLVM file, got {variable!r}, which does not "
             f"exist. {advice}"
         )
-    if chosen.refused:
+    if library.refused:
         raise EnvironmentSetupError(
             f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got "
-            f"{chosen}. {advice}"
+            f"{library}. {advice}"
         )
-    return replace(chosen, path=path)
+    return replace(library, path=path)
 
 
 def install_command(
@@ -307,11 +310,11 @@ def asked_version(library: str) -> Version:
 def main() -> int:
     """Print the libLLVM that advsearch will use, or why there is none (status 3)."""
     try:
-        chosen = ensure_llvm()
+        library = ensure_llvm()
     except AdvsearchError as error:
         print(f"advsearch: {error}", file=sys.stderr)
         return 3
-    print(f"{'.'.join(map(str, chosen.version))} ({chosen.path})")
+    print(f"{'.'.join(map(str, library.version))} ({library.path})")
     return 0
 
 

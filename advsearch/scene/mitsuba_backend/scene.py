@@ -40,7 +40,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     one_at_a_time,
     population,
 )
-from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
+from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
 from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
@@ -677,6 +677,6 @@ def _to_repeating(
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(
-        plugin for plugin in plugins_in(surface) if plugin["type"] == BASE_COLOR_PLACE
+        plugin for plugin in plugins_in(surface) if plugin["type"] == BASE_COLOR_TYPE
     )
     return repeating(uv, options, size)

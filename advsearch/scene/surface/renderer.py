@@ -213,10 +213,10 @@ class SurfaceRenderer(Predictor):
         )
         running = next(launches)
         for light, numbers in cameras_of_light.items():
-            seen = running()
+            samples = running()
             running = next(launches, running)
             for index, number in enumerate(numbers):
-                view = self.arrangement.view(seen, index)
+                view = self.arrangement.view(samples, index)
                 yield Look(number, view, light, lights[number][1])
 
     def shown(
