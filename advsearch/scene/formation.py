@@ -192,20 +192,20 @@ NOTHING: frozenset[str] = frozenset()
 # Exposure: an incident-light meter held where the camera sees the object.
 #
 # A grey card is laid against every piece of the object's surface that the camera sees,
-# and the light that arrives there is averaged over the picture: from the environment as
+# and the light that arrives there is averaged over the image: from the environment as
 # far as the surface faces it, and from the ground plane, which is lit by the
 # environment itself, from lamps, and from surroundings that emit light. What the object
-# is made of takes no part, so that a black object stays black; nor do shadows, which
+# is made of does not count, so that a black object stays black; nor do shadows, which
 # would need a render.
 #
 # The meter is held with camera, pose and rotation of the environment as they are by
-# default, and then left alone. So a configuration has the same exposure whether its
+# default, and then does not change. So a configuration has the same exposure whether its
 # camera is a setting, a control's fixed value or a point of a grid.
 #
 #     E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi
 # E(up) where w ends on the ground
 
-# pixels along the longer side of the picture in which the surface is looked at
+# pixels along the longer side of the image in which the surface is sampled
 RASTER = 32
 ROWS = 32  # rows of a coarse environment: irradiance varies slowly
 WHITE = 0.8  # reflectance of the card that is metered
@@ -407,7 +407,7 @@ def _block_starts(size: int, count: int) -> Ints:
 #
 # A row r of H is exposed for `shutter` seconds, and rows are read within `rolling`
 # seconds, the first at the top, or at the bottom where that is below 0; the middle of
-# the picture's exposure is the time of the configuration. What a sensor counts is
+# the image's exposure is the time of the configuration. What a sensor counts is
 # light, so a row is the mean of linear radiance over its exposure, before the denoiser
 # and the tone curve. The mean is over M moments, evenly spaced, of which each row takes
 # those in its own exposure.

@@ -119,7 +119,7 @@ def _find_patches(soup: Soup) -> Ints:
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _FLUSH
     plane = connected(count, face[is_flush], neighbour[is_flush])
-    plane_sums = np.stack(
+    plane_sums: Doubles = np.stack(
         [np.bincount(plane, normals[:, axis]) for axis in range(3)], axis=1
     )
     plane_normals = unit_vectors(plane_sums)[plane]
@@ -182,7 +182,8 @@ def _halve_patches(centers: Doubles, patch: Ints) -> Ints:
 
 
 CELLS = 64  # cells along each side of the map
-# of a mesh, which are counted one by one; smaller ones are not told apart in a picture
+# of a mesh, which are counted one by one; smaller ones cannot be distinguished in an
+# image
 MOST_FACES = 20_000
 # fraction of the map that charts may cover twice before the mesh is unwrapped anew
 DOUBLED = 0.01
