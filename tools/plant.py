@@ -66,8 +66,8 @@ FAULTS = (
     Fault(
         "scene: the exposure is left out",
         "advsearch/scene/formation.py",
-        "_Shown.apply(radiance, self.gain)",
-        "_Shown.apply(radiance, 1.0)",
+        "_SrgbDisplay.apply(radiance, self.gain)",
+        "_SrgbDisplay.apply(radiance, 1.0)",
         ("tests/scene/test_renderer.py",),
     ),
     Fault(

@@ -1,16 +1,15 @@
-"""From what controls say to what Mitsuba takes: poses and displacements to vertices,
-environments to padded maps.
+"""Assemble Mitsuba's inputs from those of controls, and measure motion in the image.
 
-Controls speak of an object's pose (`NAME.to_world`) and shape (`NAME.offsets`)
-separately, so that they compose; Mitsuba takes world-space vertices and normals.
-Everything here is torch, so gradients of vertices reach both.
+Controls set an object's pose (`NAME.to_world`) and shape (`NAME.offsets`) separately,
+so that they compose; Mitsuba takes world-space vertices and normals, and padded maps of
+the environment. Everything here is torch, so gradients of vertices reach both.
 
-And how fast each coordinate of u moves points in the picture (`Motion`), with
-derivatives by differences of a width that fits. A smooth loss is best differenced over
-about one pixel of motion of the fastest outline, never over a fixed length in the world
+`Motion` measures how fast each coordinate of u moves points in the image, so that
+differences have a width that fits. A smooth loss is best differenced over about one
+pixel of motion of the fastest outline, never over a fixed length in the world
 (docs/gradients.md, "The estimators"): narrower and noise wins, wider and the loss
-bends. For a classifier's see `gradients.SEARCH_STEP`. The renders of a difference share
-their random numbers, and have no graph.
+bends. For a classifier's loss see `gradients.SEARCH_STEP`. The renders of a difference
+share their random numbers, and have no graph.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Mesh, Shape
+from advsearch.scene.assets import Floats, Ints, Mesh, Shape
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
@@ -35,9 +34,7 @@ ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 
 
 class MovingMesh:
-    """One mesh, in its own coordinates, whose vertices and normals follow a pose (4, 4)
-    and a displacement.
-    """
+    """A mesh whose vertices and normals follow a pose (4, 4) and a displacement."""
 
     def __init__(self, mesh: Mesh, to_world: np.ndarray) -> None:
         self._mesh = mesh
@@ -48,103 +45,108 @@ class MovingMesh:
     def place(
         self, to_world: Tensor | None, offsets: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return world-space vertices and unit normals, both (V, 3), under an
-        invertible affine map (4, 4), None for the base pose, and with a displacement
-        (V, 3) in mesh coordinates, or None.
+        """Return world-space vertices and unit normals, both (V, 3).
+
+        Args:
+            to_world: invertible affine map (4, 4); None for the base pose.
+            offsets: displacement (V, 3) in mesh coordinates, or None.
         """
         moving = to_world if to_world is not None else offsets
         device = self.vertices.device if moving is None else moving.device
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices = self.vertices.to(device)
         normals = self.normals.to(device)
-        # the author's normals turn by as much as those that follow from the faces
+        # The author's normals turn by as much as those that follow from the faces.
         if offsets is not None:
-            turned = self._area_normals(
-                vertices + offsets
-            ) - self._original_area_normals.to(device)
+            original = self._original_area_normals.to(device)
+            change = self._area_normals(vertices + offsets) - original
             vertices = vertices + offsets
-            normals = normals + turned
-        moved = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        turned = normals @ torch.linalg.inv(matrix[:3, :3])
-        return moved, turned / turned.norm(dim=1, keepdim=True).clamp_min(1e-12)
+            normals = normals + change
+        world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        world_normals = normals @ torch.linalg.inv(matrix[:3, :3])
+        lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        return world_vertices, world_normals / lengths
 
     def _area_normals(self, vertices: Tensor) -> Tensor:
-        """Area-weighted normals over vertices that share place and normal, so that
-        creases stay creases.
+        """Return area-weighted normals (V, 3).
+
+        Vertices that share position and normal share the average, so that creases stay
+        creases.
         """
-        faces, groups = (numbers.to(vertices.device) for numbers in self._sharing)
+        faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
         first, second, third = (
             vertices.index_select(0, faces[:, corner]) for corner in range(3)
         )
         normals = torch.linalg.cross(second - first, third - first)
-        summed = vertices.new_zeros(int(groups.max()) + 1, 3)
-        summed = summed.index_add(0, groups[faces].T.reshape(-1), normals.repeat(3, 1))[
-            groups
-        ]
-        return summed / (summed.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
+        sums = vertices.new_zeros(int(groups.max()) + 1, 3)
+        group_of_corner = groups[faces].T.reshape(-1)
+        sums = sums.index_add(0, group_of_corner, normals.repeat(3, 1))[groups]
+        return sums / (sums.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
 
     @cached_property
     def _original_area_normals(self) -> Tensor:
         return self._area_normals(self.vertices)
 
     @cached_property
-    def _sharing(self) -> tuple[Tensor, Tensor]:
+    def _shared_groups(self) -> tuple[Tensor, Tensor]:
+        """The faces (F, 3), and the group (V,) of vertices that share a normal."""
         rounded = np.round(
             np.concatenate(
                 [self._mesh.vertices * 1e5, self._mesh.normals * 1e3], axis=1
             )
         )
         groups = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
-        return torch.from_numpy(self._mesh.faces.astype(np.int64)), torch.from_numpy(
-            groups.astype(np.int64)
-        )
+        faces = self._mesh.faces.astype(np.int64)
+        return torch.from_numpy(faces), torch.from_numpy(groups.astype(np.int64))
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
-    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from
-    the base values, have it: in world space, z up.
+    """Return a mesh of a scene with its inputs set: in world space, z up.
+
+    The inputs are those of `MitsubaScene` that differ from the base values.
     """
-    begin = f"{part.name}."
-    own = {
-        key.removeprefix(begin): value.detach().cpu()
+    prefix = f"{part.name}."
+    values = {
+        key.removeprefix(prefix): value.detach().cpu()
         for key, value in inputs.items()
-        if key.startswith(begin)
+        if key.startswith(prefix)
     }
-    places = dict(
-        zip(
-            ("vertices", "normals"),
-            MovingMesh(part.mesh, part.to_world).place(None, None),
-            strict=True,
-        )
+    base_vertices, base_normals = MovingMesh(part.mesh, part.to_world).place(None, None)
+
+    def to_rows(tensor: Tensor) -> Floats:
+        rows: Floats = tensor.reshape(-1, 3).to(torch.float32).numpy()
+        return rows
+
+    mesh = replace(
+        part.mesh,
+        vertices=to_rows(values.get("vertices", base_vertices)),
+        normals=to_rows(values.get("normals", base_normals)),
     )
-    rows = {
-        name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy()
-        for name, flat in places.items()
-    }
-    mesh = replace(part.mesh, vertices=rows["vertices"], normals=rows["normals"])
     color = part.base_color
-    if "base_color" in own:
-        color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
-    material = replace(
-        part.material,
-        **{key: float(own[key]) for key in vars(part.material) if key in own},
-    )
+    if "base_color" in values:
+        color = linear_to_srgb(values["base_color"].clamp(0.0, 1.0)).numpy()
+    material_numbers = {
+        key: float(values[key]) for key in vars(part.material) if key in values
+    }
+    material = replace(part.material, **material_numbers)
     return replace(
         part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4)
     )
 
 
-AWAY = 1000.0  # object sizes to the side, where a thing is under a pixel wide
+# distance in object sizes to the side, at which an object is less than a pixel wide
+AWAY = 1000.0
 
 
 class Assembly:
-    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all
-    its parts.
+    """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
+
+    Attributes:
+        away: put the object so far away that neither it nor its shadow is in the image.
+            The bounds of a scene in which this was set once change the last bits of
+            every later image: use it for such images alone.
     """
 
-    # whether the object is put so far away that neither it nor its shadow is in the
-    # picture. A scene in which it was so has bounds from then on that change last bits
-    # of every picture: it is for such pictures alone
     away = False
 
     def __init__(self, description: SceneDescription) -> None:
@@ -160,42 +162,29 @@ class Assembly:
         self._photograph = description.photograph
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the inputs with poses, displacements and maps worked out;
-        differentiable torch operations.
+        """Return the inputs with poses, displacements and maps applied.
+
+        All are differentiable torch operations.
         """
         if self.away:
-            pose = inputs.get(
-                f"{OBJECT}.to_world", self.meshes[OBJECT].to_world
-            ).clone()
+            name = f"{OBJECT}.to_world"
+            pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
             pose[1, 3] += AWAY
-            inputs = {**inputs, f"{OBJECT}.to_world": pose}
+            inputs = {**inputs, name: pose}
         parameters = dict(inputs)
         for part in self._carried:  # what carries it may be moved or deformed
-            carrier, offsets = (
-                inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets")
-            )
-            if isinstance(part, LampGlass) and offsets is not None:
-                parameters[f"{part.name}.offsets"] = offsets[
-                    torch.from_numpy(part.follows).to(offsets.device)
-                ]
-            if carrier is not None and isinstance(part, BeamLamp):
-                car = driving(carrier) if part.carrier == CAMERA else carrier
-                carrier = seated(car, torch.from_numpy(part.seat).to(carrier))
-            if carrier is not None:
-                parameters[f"{part.name}.to_world"] = carrier
+            parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():
             to_world = parameters.pop(f"{name}.to_world", None)
             offsets = parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
-                parameters[f"{name}.vertices"], parameters[f"{name}.normals"] = (
-                    mesh.place(to_world, offsets)
-                )
+                vertices, normals = mesh.place(to_world, offsets)
+                parameters[f"{name}.vertices"] = vertices
+                parameters[f"{name}.normals"] = normals
         if "camera.shift" in parameters:
             shift = parameters.pop("camera.shift")
-            parameters["camera.shift_x"], parameters["camera.shift_y"] = (
-                shift[:1],
-                shift[1:],
-            )
+            parameters["camera.shift_x"] = shift[:1]
+            parameters["camera.shift_y"] = shift[1:]
         if "environment.data" in parameters:
             data = parameters.pop("environment.data")
             if self._photograph is not None:
@@ -206,11 +195,30 @@ class Assembly:
         return parameters
 
     def vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
-        """Return the vertices (V, 3) that a mesh has in world space, by inputs as a
-        call returns them.
+        """Return the vertices (V, 3) of a mesh in world space.
+
+        `assembled` are inputs as a call returns them.
         """
-        moved = assembled.get(f"{name}.vertices")
-        return self.meshes[name].place(None, None)[0] if moved is None else moved
+        vertices = assembled.get(f"{name}.vertices")
+        return self.meshes[name].place(None, None)[0] if vertices is None else vertices
+
+
+def _move_carried(
+    part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return the inputs of a lamp that is moved with what carries it."""
+    moved_inputs: dict[str, Tensor] = {}
+    pose = inputs.get(f"{part.carrier}.to_world")
+    offsets = inputs.get(f"{part.carrier}.offsets")
+    if isinstance(part, LampGlass) and offsets is not None:
+        follows = torch.from_numpy(part.follows).to(offsets.device)
+        moved_inputs[f"{part.name}.offsets"] = offsets[follows]
+    if pose is not None and isinstance(part, BeamLamp):
+        car_pose = driving(pose) if part.carrier == CAMERA else pose
+        pose = seated(car_pose, torch.from_numpy(part.seat).to(pose))
+    if pose is not None:
+        moved_inputs[f"{part.name}.to_world"] = pose
+    return moved_inputs
 
 
 # from a configuration (d,) to one number, at one seed
@@ -218,46 +226,59 @@ Value = Callable[[Tensor], Tensor]
 
 
 def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
-    """Put the slopes of a group, each by two values `group.step` to either side, into
-    (d,) `derivative`.
+    """Write the central differences of a function into a derivative.
+
+    Args:
+        value: from a configuration (d,) to a number.
+        group: the coordinates, and the half-width of the differences.
+        u: (d,) configuration.
+        derivative: (d,) into which the slopes of the group are written.
     """
-    for number in range(group.begin, group.begin + group.size):
+    for coordinate in range(group.begin, group.begin + group.size):
         step = torch.zeros_like(u)
-        step[number] = group.step
-        (above, up) = moved(u, step, group.periodic)
-        (below, down) = moved(u, -step, group.periodic)
+        step[coordinate] = group.step
+        above, step_up = moved(u, step, group.periodic)
+        below, step_down = moved(u, -step, group.periodic)
         rise = value(above) - value(below)
-        derivative[number] = float(rise) / float((up - down)[number])
+        run = (step_up - step_down)[coordinate]
+        derivative[coordinate] = float(rise) / float(run)
 
 
 def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
     """Return u + step brought back into the box, and the step that was really taken.
-    Periodic coordinates wrap around, so that they can go the whole step.
+
+    Periodic coordinates wrap around, so that they can go the full step.
     """
-    there = u + step
-    clipped = there.clamp(0.0, 1.0)
-    cyclic = torch.as_tensor(periodic).expand(u.shape)
-    return torch.where(cyclic, torch.remainder(there, 1.0), clipped), torch.where(
-        cyclic, step, clipped - u
-    )
+    target = u + step
+    clipped = target.clamp(0.0, 1.0)
+    is_periodic = torch.as_tensor(periodic).expand(u.shape)
+    position = torch.where(is_periodic, torch.remainder(target, 1.0), clipped)
+    return position, torch.where(is_periodic, step, clipped - u)
 
 
 POINTS = 400  # vertices of a mesh that are followed
 NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
-"""Changes of u that the speed is measured over: the largest that leaves something in
-the frame.
+"""Changes of u over which the speed is measured.
+
+The largest is taken that leaves something in the frame.
 """
 # directions in which the environment is followed: some hundred of them lie in a frame
 DIRECTIONS = 4000
 EDGE = 25  # points that are followed along each side of the ground plane
-FAR = 1e4  # how far away its points are taken to be, in scene units
+FAR = 1e4  # distance of the environment's points, in scene units
 
 
 class Motion:
-    """Projects a scene's vertices, the table's edge or the floor, and what is seen of
-    the environment into the picture, of a resolution (height, width) in pixels; the
-    assembly makes vertices from poses. A camera that goes around an object hardly moves
-    the object's outline, but all that lies behind it.
+    """Measure how fast coordinates of u move points in the image.
+
+    The points are a scene's vertices, the edge of the table or the floor, and what is
+    visible of the environment. A camera that goes around an object hardly moves the
+    object's outline, but all that lies behind it.
+
+    Args:
+        description: the scene.
+        resolution: height and width in pixels.
+        assembly: makes vertices from poses.
     """
 
     def __init__(
@@ -269,76 +290,56 @@ class Motion:
         self._description = description
         self._resolution = resolution
         self._assembly = assembly
-        self._camera = torch.from_numpy(
-            camera_to_world(description, resolution[1] / resolution[0])
-        ).double()
-        floor = (
-            None
-            if description.photograph is None
-            else description.photograph.mesh.vertices
-        )
-        self._ground = (
-            description.number("ground.size") / 2.0
-            if floor is None
-            else float(floor.max())
-        )
-        if floor is None:  # a square at height 0
-            along = torch.linspace(
-                -self._ground,
-                self._ground,
-                EDGE if self._ground > 0.0 else 0,
-                dtype=torch.float64,
-            )
-            side = torch.full_like(along, self._ground)
-            zero = torch.zeros_like(along)
-            sides = [(along, side), (along, -side), (side, along), (-side, along)]
-            self._edge = torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
+        aspect = resolution[1] / resolution[0]
+        pose = camera_to_world(description, aspect)
+        self._camera = torch.from_numpy(pose).double()
+        if description.photograph is None:
+            self._ground = description.number("ground.size") / 2.0
+            self._edge = _square_edge(self._ground)
         else:
+            floor = description.photograph.mesh.vertices
+            self._ground = float(floor.max())
             self._edge = torch.from_numpy(floor).double()
-        # Points of the environment, evenly spread (Fibonacci spiral); none where
-        # nothing shows them
+        # Points of the environment; none if nothing shows them.
         hidden = description.backdrop or description.environment is None
-        number = torch.arange(0 if hidden else DIRECTIONS, dtype=torch.float64)
-        up = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
-        turn = number * torch.pi * (3.0 - 5.0**0.5)
-        radius = (1.0 - up**2).sqrt()
-        self._far = (
-            torch.stack([radius * turn.cos(), radius * turn.sin(), up], dim=1) * FAR
-        )
+        self._far = _sphere_directions(0 if hidden else DIRECTIONS) * FAR
         self._picks = {
-            name: torch.from_numpy(
-                np.linspace(
-                    0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))
-                ).astype(int)
-            )
+            name: torch.from_numpy(_spread_indices(len(mesh.vertices), POINTS))
             for name, mesh in assembly.meshes.items()
         }
 
     def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return where the followed vertices lie, (N, 2) pixels from the middle, and
-        which are in or near the frame.
+        """Return where the followed points lie in the image.
+
+        Returns:
+            (N, 2) pixels from the center, and (N,) whether each is in or near the
+            frame.
         """
-        camera = (
-            inputs["camera.to_world"].double()
-            if "camera.to_world" in inputs
-            else self._camera
-        )
+        camera = self._camera
+        if "camera.to_world" in inputs:
+            camera = inputs["camera.to_world"].double()
         points = [
             self._assembly.vertices(name, inputs)[picks].double()
             for name, picks in self._picks.items()
         ]
         eye = camera[:3, 3]
         relative = (torch.cat([*points, self._edge, self._far]) - eye) @ camera[:3, :3]
-        places, seen = projected(self._description, inputs, relative, self._resolution)
-        # Which of the far points the ground plane hides
-        ways = self._far - eye
-        hit = eye + (-eye[2] / ways[:, 2].clamp_max(-1e-9))[:, None] * ways
-        on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
-        seen[len(seen) - len(self._far) :] &= ~(
-            (ways[:, 2] < 0.0) & bool(eye[2] > 0.0) & on_ground
+        positions, is_visible = projected(
+            self._description, inputs, relative, self._resolution
         )
-        frame = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
-        return places, seen & (places.abs() <= 1.2 * frame).all(dim=1)
+        n_near = len(is_visible) - len(self._far)
+        is_visible[n_near:] &= ~self._hidden_by_ground(eye)
+        half_size = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
+        near_frame = (positions.abs() <= 1.2 * half_size).all(dim=1)
+        return positions, is_visible & near_frame
+
+    def _hidden_by_ground(self, eye: Tensor) -> Tensor:
+        """Return which of the far points the ground plane hides from the eye."""
+        directions = self._far - eye
+        distance = -eye[2] / directions[:, 2].clamp_max(-1e-9)
+        hit = eye + distance[:, None] * directions
+        on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
+        return (directions[:, 2] < 0.0) & bool(eye[2] > 0.0) & on_ground
 
     def speeds(
         self,
@@ -346,21 +347,52 @@ class Motion:
         u: Tensor,
         coordinates: list[int],
     ) -> Tensor:
-        """Return the speed (d,) of the fastest point in the frame for some coordinates
-        of u (d,), 0 for the others, in pixels per unit of u; `inputs` maps u to
-        assembled inputs.
+        """Return the speed (d,) of the fastest point in the frame.
+
+        It is in pixels per unit of u, and 0 for coordinates that are not requested.
+
+        Args:
+            inputs: maps u to assembled inputs.
+            u: (d,) configuration.
+            coordinates: those whose speed is measured.
         """
         speeds = torch.zeros(len(u))
         with torch.no_grad():
-            here, seen = self.pixels(inputs(u))
-            for number in coordinates:
+            positions, is_visible = self.pixels(inputs(u))
+            for coordinate in coordinates:
                 for size in NUDGES:
-                    there = u.clone()
-                    there[number] += size if float(u[number]) + size <= 1.0 else -size
-                    moved, still = self.pixels(inputs(there))
-                    distances = (moved - here)[seen & still].norm(dim=1)
-                    # what stands still says nothing of what has left the frame
+                    nudged = u.clone()
+                    sign = 1.0 if float(u[coordinate]) + size <= 1.0 else -1.0
+                    nudged[coordinate] += sign * size
+                    new_positions, still_visible = self.pixels(inputs(nudged))
+                    shifts = (new_positions - positions)[is_visible & still_visible]
+                    distances = shifts.norm(dim=1)
+                    # If nothing moves, all that does may have left the frame.
                     if bool((distances > 0.0).any()):
-                        speeds[number] = float(distances.max()) / size
+                        speeds[coordinate] = float(distances.max()) / size
                         break
         return speeds
+
+
+def _square_edge(half_width: float) -> Tensor:
+    """Return points (n, 3) along the edge of a level square at height 0."""
+    count = EDGE if half_width > 0.0 else 0
+    along = torch.linspace(-half_width, half_width, count, dtype=torch.float64)
+    side = torch.full_like(along, half_width)
+    zero = torch.zeros_like(along)
+    sides = [(along, side), (along, -side), (side, along), (-side, along)]
+    return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
+
+
+def _sphere_directions(count: int) -> Tensor:
+    """Return (count, 3) directions evenly spread over the sphere (Fibonacci spiral)."""
+    index = torch.arange(count, dtype=torch.float64)
+    z = 1.0 - (2.0 * index + 1.0) / DIRECTIONS
+    azimuth = index * torch.pi * (3.0 - 5.0**0.5)
+    radius = (1.0 - z**2).sqrt()
+    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
+
+
+def _spread_indices(count: int, limit: int) -> Ints:
+    """Return at most `limit` indices evenly spread over [0, count)."""
+    return np.linspace(0, count - 1, min(limit, count)).astype(int)

@@ -1,10 +1,9 @@
-"""The gradient plan: how the derivative of every coordinate of u is obtained
-(docs/gradients.md).
+"""The gradient plan: how the derivative of every coordinate of u is obtained.
 
-A control's groups of coordinates declare which estimators are valid for them. Where
-only one is, the plan takes it; where several are, it takes the first, until a
-measurement on the actual scene (`advsearch.engine.gradients.planning`) says which has
-the least variance x time. Any of them can be forced by name.
+See docs/gradients.md. A control's groups of coordinates declare which estimators are
+valid for them. If only one is, the plan uses it; if several are, it uses the first,
+until a measurement on the actual scene (`advsearch.engine.gradients.planning`) shows
+which has the smallest variance x time. Any of them can be forced by name.
 """
 
 from __future__ import annotations
@@ -26,13 +25,10 @@ BY_DIFFERENCES = frozenset({"differences", "secant"})
 
 @dataclass(frozen=True)
 class Budget:
-    """How far a group of u may go from its start, inside the unit box: within a ball of
-    radius `epsilon` in units of u, by the norm "linf" or "l2"; or everywhere, "box",
-    with None.
-    """
+    """How far a group of u may go from its start, inside the unit box."""
 
-    norm: str
-    epsilon: float | None
+    norm: str  # "linf" or "l2", or "box" for everywhere
+    epsilon: float | None  # radius of the norm's ball in units of u; None for "box"
 
 
 WHOLE_RANGE = Budget("box", None)
@@ -40,9 +36,10 @@ WHOLE_RANGE = Budget("box", None)
 
 @dataclass(frozen=True)
 class Group:
-    """Neighbouring coordinates with one budget and one way to be differentiated. A
-    control says the first seven; the space in which it lies, whose it is and where it
-    begins; a `GradientPlan`, how it is differentiated.
+    """Neighbouring coordinates with one budget that are differentiated alike.
+
+    A control sets the first seven fields; the space in which it lies the control's name
+    and where it begins; a `GradientPlan` how it is differentiated.
     """
 
     parameter: str  # name of the parameter behind them
@@ -53,15 +50,15 @@ class Group:
     periodic: bool = False  # 0 and 1 are the same value
     # number of options of a discrete choice; 0 for a continuous parameter
     options: int = 0
-    setting: str = ""  # name of the scene's setting that says the same; may be empty
+    setting: str = ""  # name of the scene's setting for the same value; may be empty
     control: str = ""  # name of the control
     begin: int = 0  # first coordinate in u
-    estimator: str = "none"  # the one that is taken
+    estimator: str = "none"  # the one that is used
     step: float = 0.0  # half-width of a difference in u; 0 where none is taken
     # that over which the fastest outline moves by a pixel; that of the group where
     # nothing moves
     pixel: float = 0.0
-    reason: str = ""  # why this estimator, in words
+    reason: str = ""  # why this estimator is used, as a text
     # the caller named the estimator, or nobody uses the derivative: it is not compared
     is_forced: bool = False
     # variance x time of each valid one, where measured
@@ -69,15 +66,17 @@ class Group:
 
     @property
     def coordinates(self) -> slice:
+        """The group's coordinates in u."""
         return slice(self.begin, self.begin + self.size)
 
     @cached_property
     def name(self) -> str:
+        """Control and parameter."""
         return f"{self.control}.{self.parameter}"
 
     @property
     def step_reason(self) -> str:
-        """Why the step is as wide as it is, in words; empty where none is taken."""
+        """Why the step has its width, as a text; empty where none is taken."""
         if self.estimator not in BY_DIFFERENCES:
             return ""
         if self.step == self.pixel:
@@ -109,41 +108,45 @@ ESTIMATORS: Mapping[str, str] = {
 BY_ADJOINT = frozenset({"adjoint", "material"})
 # they need nothing but renders: right for any continuous coordinate
 ALWAYS_VALID = ("differences", "secant", "none")
-# coordinates over which differences are not compared with an adjoint: one by one they
-# take too many renders
+# number of coordinates above which differences are not compared with an adjoint: they
+# take two renders for each coordinate
 MANY = 16
 DEFAULT_STEP = 0.05
 TURN_STEP = 0.005
-"""Half of a difference's width in u, for coordinates that move nothing in the picture:
-of a range, of a full turn.
+"""Half-widths of differences in u for coordinates that move nothing in the image.
+
+The first is that of a range, the second that of a full turn.
 """
-# of the fastest point of an outline in half a difference (docs/gradients.md, "The
+# motion of the fastest point of an outline in half a difference (docs/gradients.md, "The
 # estimators")
 DEFAULT_PIXELS = 1.0
 STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 
 
 def steps_for(speeds: Tensor) -> Tensor:
-    """Return half-widths of differences in u over which outlines of such speeds, pixels
-    a unit, move by a pixel.
+    """Return half-widths of differences in u over which outlines move by a pixel.
+
+    The speeds of the outlines are in pixels per unit of u.
     """
-    moved = torch.where(
+    steps = torch.where(
         speeds > 1e-3,
         DEFAULT_PIXELS / speeds.clamp_min(1e-3),
         torch.full_like(speeds, DEFAULT_STEP),
     )
-    return moved.clamp(*STEP_RANGE)
+    return steps.clamp(*STEP_RANGE)
 
 
 SEARCH_STEP = 0.03
-"""Smallest step in u of one number that moves outlines. Over a pixel a classifier's
-loss is rough: what it does over the 2 to 5 % of a range that a search goes at a time
-has another sign as often as not, and more noise hides it. `benchmarks/gradients.py
---steps` shows that, and that 3 % is enough.
+"""Smallest step in u of a single coordinate that moves outlines.
+
+Over a pixel a classifier's loss is rough: its change over the 2 to 5 % of a range that
+a search goes at a time has another sign as often as not, and more noise hides it.
+`benchmarks/gradients.py --steps` shows that, and that 3 % is enough.
 """
 SEARCH_SHARE = 0.4
-"""Share of the picture that such a step moves the fastest outline over at most: of an
-endless range, 3 % would move all things out of sight.
+"""Largest fraction of the image over which such a step moves the fastest outline.
+
+Of an endless range, 3 % would move all objects out of the frame.
 """
 STORED = (
     "control",
@@ -156,18 +159,16 @@ STORED = (
     "reason",
 )
 """What a run stores of one group of coordinates; see `Group`."""
-# what of it a plan for the same space takes over
+# fields that a plan for the same space copies
 CHOSEN = ("estimator", "step", "reason")
 
 
 @dataclass(frozen=True)
 class GradientPlan:
-    """How the gradient of a whole space is obtained: every group of every control, in
-    the order of u, and the samples a pixel of differences; None takes the primal's.
-    """
+    """How the gradient of a full space is obtained."""
 
-    groups: tuple[Group, ...]
-    spp: int | None = None
+    groups: tuple[Group, ...]  # of all controls, in the order of u
+    spp: int | None = None  # samples per pixel of differences; None is the primal's
 
     def having(self, *estimators: str) -> tuple[Group, ...]:
         """Return the groups that use one of these estimators."""
@@ -180,8 +181,9 @@ class GradientPlan:
 
     @cached_property
     def through(self) -> Tensor:
-        """(d,) float32: 1 for coordinates whose derivative runs back through scene
-        inputs or the picture.
+        """(d,) float32 mask of coordinates that are differentiated by autograd.
+
+        It is 1 where the derivative runs back through scene inputs or the image.
         """
         mask = torch.zeros(sum(group.size for group in self.groups))
         for group in self.having(*BY_ADJOINT, "image"):
@@ -189,66 +191,66 @@ class GradientPlan:
         return mask
 
     def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
-        """Return the plan with the estimators of some groups forced, by
-        `control.parameter`.
+        """Return the plan with the estimators of some groups forced.
+
+        The names are those of estimators by `control.parameter`.
         """
-        chosen = {
+        changes = {
             name: {"estimator": estimator, "reason": reason, "is_forced": True}
             for name, estimator in names.items()
         }
-        return self._changed(lambda group: chosen.get(group.name, {}))
+        return self._change_groups(lambda group: changes.get(group.name, {}))
 
     def with_steps(self, factor: float) -> GradientPlan:
-        """Return the plan with every step multiplied by a factor, within
-        `STEP_RANGE`.
-        """
-        low, high = STEP_RANGE
-        return self._changed(
-            lambda group: {"step": min(high, max(low, group.step * factor))}
+        """Return the plan with steps multiplied by a factor, within `STEP_RANGE`."""
+        smallest, largest = STEP_RANGE
+        return self._change_groups(
+            lambda group: {"step": min(largest, max(smallest, group.step * factor))}
         )
 
     def at_a_pixel(self) -> GradientPlan:
-        """Return the plan with steps over which outlines move by a pixel: for smooth
-        losses, which bend over more.
-        """
-        return self._changed(lambda group: {"step": group.pixel})
+        """Return the plan with steps over which outlines move by a pixel.
 
-    def _changed(self, change: Callable[[Group], dict[str, Any]]) -> GradientPlan:
-        return replace(
-            self, groups=tuple(replace(group, **change(group)) for group in self.groups)
-        )
+        They are for smooth losses, which bend over wider ones.
+        """
+        return self._change_groups(lambda group: {"step": group.pixel})
+
+    def _change_groups(self, change: Callable[[Group], dict[str, Any]]) -> GradientPlan:
+        """Return the plan with fields of each group replaced."""
+        groups = tuple(replace(group, **change(group)) for group in self.groups)
+        return replace(self, groups=groups)
 
     def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
-        """Return the plan with the choices that `to_dict` has stored of a plan for the
-        same space.
+        """Return the plan with the choices of another plan for the same space.
+
+        `stored` is what its `to_dict` has returned.
         """
-        kept = {
-            f"{group['control']}.{group['parameter']}": {
-                name: group[name] for name in CHOSEN
-            }
-            | {"measured": group["variance_x_seconds"]}
-            for group in stored["groups"]
-        }
-        return replace(self._changed(lambda group: kept[group.name]), spp=stored["spp"])
+        changes: dict[str, dict[str, Any]] = {}
+        for group in stored["groups"]:
+            change = {name: group[name] for name in CHOSEN}
+            change["measured"] = group["variance_x_seconds"]
+            changes[f"{group['control']}.{group['parameter']}"] = change
+        plan = self._change_groups(lambda group: changes[group.name])
+        return replace(plan, spp=stored["spp"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a run stores of the plan: its renders, and `STORED` and the
-        measurements of each group.
+        """Return what a run stores of the plan.
+
+        It has its renders, and of each group `STORED` and the measurements.
         """
-        groups = [
-            {
-                **{name: getattr(group, name) for name in STORED},
-                "valid": list(group.valid),
-            }
-            | {"variance_x_seconds": dict(group.measured)}
-            for group in self.groups
-        ]
+        groups = []
+        for group in self.groups:
+            entries = {name: getattr(group, name) for name in STORED}
+            entries["valid"] = list(group.valid)
+            entries["variance_x_seconds"] = dict(group.measured)
+            groups.append(entries)
         return {"renders_per_gradient": self.renders, "spp": self.spp, "groups": groups}
 
 
 def compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
-    """Return which of the estimators that are valid for `size` coordinates are worth a
-    measurement.
+    """Return which of the valid estimators of a group are worth a measurement.
+
+    `size` is its number of coordinates.
     """
     adjoints = tuple(estimator for estimator in valid if estimator in BY_ADJOINT)
     return adjoints if adjoints and size > MANY else tuple(valid)
@@ -261,12 +263,20 @@ def first_plan(
     spp: int | None = None,
     across: float = math.inf,
 ) -> GradientPlan:
-    """Return the plan before anything was measured: each group's preferred estimator,
-    or the one `forced` on it by "control.parameter", "control", or "*" for all where it
-    is valid; with (d,) half-widths of differences in u over which outlines move by a
-    pixel, samples a pixel of differences, and pixels of the longer side of the picture.
-    Raises InputError: an estimator is unknown, or not valid where it was forced by
-    name.
+    """Return the plan before anything was measured.
+
+    Each group has its preferred estimator, or the forced one.
+
+    Args:
+        groups: of the space.
+        steps: (d,) half-widths of differences in u over which outlines move by a pixel.
+        forced: estimators by "control.parameter", "control", or "*" for all groups
+            where it is valid.
+        spp: samples per pixel of differences.
+        across: pixels of the longer side of the image.
+
+    Raises:
+        InputError: an estimator is unknown, or not valid where it was forced by name.
     """
     forced = dict(forced or {})
     names = {key for group in groups for key in (group.name, group.control)}
@@ -281,66 +291,58 @@ def first_plan(
         if name != "*" and name not in names:
             raise UnknownNameError("control in `estimators`", name, sorted(names))
     return GradientPlan(
-        tuple(_first(group, steps, forced, across) for group in groups), spp
+        tuple(_plan_group(group, steps, forced, across) for group in groups), spp
     )
 
 
-def _first(
+def _plan_group(
     group: Group, steps: Tensor, forced: Mapping[str, str], across: float
 ) -> Group:
+    """Return a group with its preferred or forced estimator; see `first_plan`."""
     pixel = float(steps[group.coordinates].min()) if group.size else 0.0
-    outline = group.size == 1 and not {"adjoint", "image"} & {*group.valid}
-    step = (
-        max(pixel, min(SEARCH_STEP, SEARCH_SHARE * across * pixel))
-        if outline
-        else pixel
-    )
+    step = pixel
+    moves_outlines = not {"adjoint", "image"} & {*group.valid}
+    if group.size == 1 and moves_outlines:
+        step = max(pixel, min(SEARCH_STEP, SEARCH_SHARE * across * pixel))
     group = replace(group, pixel=pixel)
     if not group.valid:
         return replace(
             group, estimator="none", reason="a discrete choice has no derivative"
         )
-    wanted = forced.get(group.name) or forced.get(group.control)
-    if wanted is not None:
-        if wanted not in group.valid and wanted not in ALWAYS_VALID:
+    by_name = forced.get(group.name) or forced.get(group.control)
+    if by_name is not None:
+        allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID))
+        if by_name not in allowed:
             raise InputError(
-                f"`estimators` {group.name}={wanted}: not valid there; expected one of "
-                f"{', '.join(dict.fromkeys((*group.valid, *ALWAYS_VALID)))}"
+                f"`estimators` {group.name}={by_name}: not valid there; expected one "
+                f"of {', '.join(allowed)}"
             )
         return replace(
-            group, estimator=wanted, step=step, reason="forced by name", is_forced=True
+            group, estimator=by_name, step=step, reason="forced by name", is_forced=True
         )
-    everywhere = forced.get("*", "")
-    if everywhere in group.valid or (
-        everywhere in ALWAYS_VALID and "image" not in group.valid
-    ):
+    for_all = forced.get("*", "")
+    has_alternative = for_all in ALWAYS_VALID and "image" not in group.valid
+    if for_all in group.valid or has_alternative:
         return replace(
-            group,
-            estimator=everywhere,
-            step=step,
-            reason="forced for all",
-            is_forced=True,
+            group, estimator=for_all, step=step, reason="forced for all", is_forced=True
         )
-    only = len(group.valid) == 1
-    reason = (
-        "the only valid estimator"
-        if only
-        else f"preferred among {', '.join(group.valid)}; not measured"
-    )
+    reason = "the only valid estimator"
+    if len(group.valid) > 1:
+        reason = f"preferred among {', '.join(group.valid)}; not measured"
     return replace(group, estimator=group.valid[0], step=step, reason=reason)
 
 
 # ---- no second derivatives
-# -------------------------------------------------------------------------------------------
 
 Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 
 
 def first_order(backward: Backward) -> Backward:
-    """Have what an autograd function's backward pass returns refuse to be
-    differentiated again. Torch's own `once_differentiable` refuses only where the
-    engine runs its node: `torch.autograd.grad` and `functional.hessian` leave that out,
-    and a part of the derivative with it.
+    """Make what a backward pass returns refuse to be differentiated again.
+
+    Torch's own `once_differentiable` refuses only where the engine runs its node:
+    `torch.autograd.grad` and `functional.hessian` leave that out, and a part of the
+    derivative with it.
     """
 
     @wraps(backward)
@@ -349,22 +351,22 @@ def first_order(backward: Backward) -> Backward:
             derivatives = backward(ctx, cotangent)
         if not torch.is_grad_enabled():
             return derivatives
-        of = (cotangent, *ctx.saved_tensors)
-        return tuple(
-            value if value is None or value is cotangent else _Once.apply(value, *of)  # type: ignore[no-untyped-call]
-            for value in derivatives
-        )
+        arguments = (cotangent, *ctx.saved_tensors)
+        guarded = []
+        for value in derivatives:
+            if value is not None and value is not cotangent:
+                value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
+            guarded.append(value)
+        return tuple(guarded)
 
     return once
 
 
-class _Once(torch.autograd.Function):
-    """A derivative, as something that depends on what it is taken at and cannot be
-    differentiated.
-    """
+class _OnceDifferentiable(torch.autograd.Function):
+    """A derivative that depends on its arguments and cannot be differentiated."""
 
     @staticmethod
-    def forward(ctx: Any, derivative: Tensor, *of: Tensor) -> Tensor:
+    def forward(ctx: Any, derivative: Tensor, *arguments: Tensor) -> Tensor:
         return derivative.view_as(derivative)
 
     @staticmethod

@@ -1,6 +1,7 @@
-"""How much of a thing a picture shows: of all that there would be of it if nothing
-stood before it and the picture went on, by its mesh, projected and rasterised without a
-renderer.
+"""Measure which fraction of a mesh an image shows.
+
+It is a fraction of the mesh's outline, as it were if nothing stood before it and the
+image went on: the mesh is projected and rasterised without a renderer.
 """
 
 from __future__ import annotations
@@ -14,124 +15,159 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.scene.assets import Bools
+from advsearch.scene.assets import Bools, Doubles
 from advsearch.scene.camera_model import EQUIRECTANGULAR
-from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, projected
 from advsearch.scene.raster import pixels_in
 from advsearch.scene.renderer import Renderer
 
-# most pixels along a side of an outline; of a larger one each stands for several of the
-# picture
+# largest width of an outline in cells; in a larger one a cell is several pixels wide
 RASTER = 2048
-# share of the pixels that are seen which an outline has to have, give or take one, or
-# it is not believed
+# fraction of the visible pixels that have to be in an outline, within one cell, or it
+# is not trusted
 WITHIN = 0.98
 
 
 @dataclass(frozen=True, eq=False)
 class SeenThing:
-    """What a picture shows of one mesh."""
+    """What an image shows of one mesh."""
 
     name: str
-    mask: Bools  # (H, W) the pixels that it is first seen in
-    # of its outline that these are, in (0, 1]; None where the outline is not known
+    mask: Bools  # (H, W) the pixels in which it is seen first
+    # fraction of its outline that these are, in (0, 1]; None where the outline is not
+    # known
     share: float | None
-    # whether the outline goes on beyond the picture; None where it is not known
+    # whether the outline goes on beyond the image; None where it is not known
     truncated: bool | None
-    # along the ray to its nearest seen point, in metres; object sizes where its size is
-    # not known
+    # along the ray to its nearest visible point, in metres; object sizes where its size
+    # is not known
     distance: float
 
     @property
     def box(self) -> tuple[int, int, int, int]:
-        """The smallest box round the mask: x0, y0, x1, y1 in pixels from the top left,
-        with x0 <= x < x1.
+        """The smallest box around the mask.
+
+        That is x0, y0, x1, y1 in pixels from the top left, with x0 <= x < x1.
         """
-        rows, columns = (np.flatnonzero(self.mask.any(axis=side)) for side in (1, 0))
+        rows = np.flatnonzero(self.mask.any(axis=1))
+        columns = np.flatnonzero(self.mask.any(axis=0))
         return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def seen_things(
     renderer: Renderer, u: Tensor, names: Collection[str] | None = None
 ) -> list[SeenThing]:
-    """Return the meshes, or those of some names, that the picture of a configuration
-    (d,) shows.
+    """Return the meshes that the image of a configuration (d,) shows.
+
+    With `names` only those are considered.
     """
     description = renderer.scene.made[0]
     surfaces = renderer.surfaces(u)
     with torch.no_grad():
         inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    things = []
+    visible = []
     for name in description.meshes if names is None else names:
-        mask = (
-            surfaces.seen(name).numpy()
-            if name in surfaces.names
-            else np.zeros(surfaces.id.shape, np.bool_)
-        )
+        if name not in surfaces.names:
+            continue
+        mask = surfaces.seen(name).numpy()
         if mask.any():
-            near = float(surfaces.depth.numpy()[mask].min())
-            things.append(
-                SeenThing(
-                    name,
-                    mask,
-                    *_outline(renderer, description, inputs, name, mask),
-                    near,
-                )
-            )
-    return things
+            fraction, truncated = _compare_outline(renderer, inputs, name, mask)
+            distance = float(surfaces.depth.numpy()[mask].min())
+            visible.append(SeenThing(name, mask, fraction, truncated, distance))
+    return visible
 
 
-def _outline(
+def _compare_outline(
+    renderer: Renderer, inputs: Mapping[str, Tensor], name: str, mask: Bools
+) -> tuple[float | None, bool | None]:
+    """Compare the visible pixels of a mesh with its outline.
+
+    Args:
+        renderer: of the scene.
+        inputs: of the scene, assembled.
+        name: of the mesh.
+        mask: (H, W) the pixels in which it is seen first.
+
+    Returns:
+        The fraction of the outline that is visible, and whether the outline goes on
+        beyond the image. Both are None where the outline is not known.
+    """
+    height, width = mask.shape
+    corners = _project_faces(renderer, inputs, name, (height, width))
+    if corners is None:
+        return None, None
+    outline = _rasterise_outline(corners)
+    if not outline.covers(mask):
+        return None, None
+    row, column = np.nonzero(outline.cells)
+    x = outline.left + (column + 0.5) * outline.step
+    y = outline.top + (row + 0.5) * outline.step
+    inside = (x > 0) & (x < width) & (y > 0) & (y < height)
+    fraction = float(mask.sum()) / (len(row) * outline.step**2)
+    return min(1.0, fraction), bool((~inside).any())
+
+
+def _project_faces(
     renderer: Renderer,
-    description: SceneDescription,
     inputs: Mapping[str, Tensor],
     name: str,
-    mask: Bools,
-) -> tuple[float | None, bool | None]:
-    # the share of an outline that is seen, and whether it goes on beyond the picture
+    size: tuple[int, int],
+) -> Doubles | None:
+    """Project the corners of a mesh's faces to pixels (F, 3, 2) from the top left.
+
+    None where the mesh is no outline: of a cut-out, at the seam of a panorama, or where
+    it reaches behind the camera.
+    """
+    height, width = size
+    description = renderer.scene.made[0]
     part = description.meshes[name]
-    (height, width) = mask.shape
     vertices = renderer.scene.assembly.vertices(name, inputs)
-    camera = inputs.get(
-        "camera.to_world",
-        torch.from_numpy(camera_to_world(description, width / height)),
-    )
-    camera = camera.detach().double().cpu()
+    default_camera = torch.from_numpy(camera_to_world(description, width / height))
+    camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
-    inputs = {
-        name: value.detach().cpu()
-        for name, value in inputs.items()
-        if name.startswith("camera.")
+    camera_inputs = {
+        key: value.detach().cpu()
+        for key, value in inputs.items()
+        if key.startswith("camera.")
     }
-    places, before = projected(description, inputs, points, (height, width))
+    positions, is_before = projected(description, camera_inputs, points, size)
     model = description.camera_model
+    has_seam = model is not None and model.kind == EQUIRECTANGULAR
     faces = torch.from_numpy(part.mesh.faces.astype(np.int64))
-    seam = model is not None and model.kind == EQUIRECTANGULAR
-    if part.opacity is not None or seam or not bool(before[faces].all()):
-        # of a cut-out the mesh is no outline, and what reaches behind the camera has
-        # none
-        return None, None
-    corners = places.numpy()[faces.numpy()] + (width / 2.0, height / 2.0)
-    low = np.floor(corners.min(axis=(0, 1)))
-    high = np.ceil(corners.max(axis=(0, 1)))
-    step = max(1, math.ceil(float((high - low).max()) / RASTER))
-    columns, rows = map(int, (high - low) // step + 1)
-    _, row, column, _ = pixels_in((corners - low) / step - 0.5, (rows, columns))
-    outline = np.zeros((rows, columns), np.bool_)
-    outline[row, column] = True
-    row, column = np.nonzero(outline)
-    x = low[0] + (column + 0.5) * step
-    y = low[1] + (row + 0.5) * step
-    inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    seen_row, seen_column = np.nonzero(mask)
-    near = ndimage.binary_dilation(outline, np.ones((3, 3)))
-    at = (
-        ((seen_row + 0.5 - low[1]) // step).astype(np.int64),
-        ((seen_column + 0.5 - low[0]) // step).astype(np.int64),
-    )
-    within = (at[0] >= 0) & (at[0] < rows) & (at[1] >= 0) & (at[1] < columns)
-    here = within & near[at[0].clip(0, rows - 1), at[1].clip(0, columns - 1)]
-    if here.mean() < WITHIN:
-        return None, None
-    return min(1.0, float(mask.sum()) / (len(row) * step**2)), bool((~inside).any())
+    if part.opacity is not None or has_seam or not bool(is_before[faces].all()):
+        return None
+    corners: Doubles = positions.numpy()[faces.numpy()] + (width / 2.0, height / 2.0)
+    return corners
+
+
+@dataclass(frozen=True, eq=False)
+class _Outline:
+    """A rasterised outline, in cells of one or more pixels."""
+
+    cells: Bools  # (rows, columns)
+    left: float  # of the first cell, pixels from the image's top left
+    top: float
+    step: int  # width of a cell in pixels
+
+    def covers(self, mask: Bools) -> bool:
+        """Return whether visible pixels lie in the outline, or next to it."""
+        n_rows, n_columns = self.cells.shape
+        pixel_row, pixel_column = np.nonzero(mask)
+        row = ((pixel_row + 0.5 - self.top) // self.step).astype(np.int64)
+        column = ((pixel_column + 0.5 - self.left) // self.step).astype(np.int64)
+        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+        near = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
+        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
+        return bool((inside & near[clipped]).mean() >= WITHIN)
+
+
+def _rasterise_outline(corners: Doubles) -> _Outline:
+    """Rasterise the outline of faces with corners (F, 3, 2) in pixels."""
+    lower = np.floor(corners.min(axis=(0, 1)))
+    upper = np.ceil(corners.max(axis=(0, 1)))
+    step = max(1, math.ceil(float((upper - lower).max()) / RASTER))
+    n_columns, n_rows = map(int, (upper - lower) // step + 1)
+    _, row, column, _ = pixels_in((corners - lower) / step - 0.5, (n_rows, n_columns))
+    cells = np.zeros((n_rows, n_columns), np.bool_)
+    cells[row, column] = True
+    return _Outline(cells, left=lower[0], top=lower[1], step=step)

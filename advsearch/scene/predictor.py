@@ -1,4 +1,4 @@
-"""What predicts pictures of a scene, so that no paths have to be traced for them."""
+"""Base class of what predicts images of a scene without tracing paths for each."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from advsearch.scene.renderer import Renderer
 
 
 class RefusalCause(Enum):
-    """Why a predictor does not make the images of a search, as far as code has to know
-    it.
-    """
+    """Cause of a refusal, as far as code has to know it."""
 
     UNSUITABLE = "the scene, the space or the policy"
     TOO_FEW_STEPS = "it does not pay for so few images"
@@ -30,11 +28,9 @@ class RefusalCause(Enum):
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why images are rendered and not predicted: a text that completes "rendered: ...",
-    and its cause.
-    """
+    """Why images are rendered and not predicted."""
 
-    text: str
+    text: str  # completes "rendered: ..."
     cause: RefusalCause = RefusalCause.UNSUITABLE
 
     def __str__(self) -> str:
@@ -45,18 +41,21 @@ NOTHING_MOVES = Refusal(
     "nothing that varies is what it predicts", RefusalCause.NOTHING_MOVES
 )
 NOISE = Refusal("noise is part of the picture without the denoiser", RefusalCause.NOISE)
-"""A refusal that stands alone: with the denoiser, the same images could be
-predicted.
-"""
-# places in the range of a parameter at which its effect on the inputs is looked up
+"""A refusal without other reasons: with the denoiser, the images could be predicted."""
+# fractions of a parameter's range at which its effect on the inputs is tested
 BETWEEN = (0.02, 0.29, 0.61, 0.97)
-MOST_BYTES = 2**30  # memory of what one predictor keeps, times `ADVSEARCH_LIMITS`
+MOST_BYTES = 2**30  # memory limit of one predictor, times `ADVSEARCH_LIMITS`
 
 
 class Predictor(ABC):
-    """Predicts the pictures of the space of a renderer, which traces paths, without
-    noise; differentiable. `non_finite` values were not finite while it was made, and
-    were set to zero.
+    """Predict the images of a space without noise; differentiable.
+
+    Args:
+        traced: a renderer of the space, which traces paths.
+
+    Attributes:
+        non_finite: how many values were not finite while it was made, and were set to
+            zero.
     """
 
     non_finite: int = 0
@@ -66,42 +65,44 @@ class Predictor(ABC):
 
     @property
     def renderer(self) -> Renderer:
-        """A renderer of the same space whose pictures are the predicted ones."""
-        # made each time: two objects that hold each other are freed late, and matrices
-        # are large
+        """A renderer of the same space whose images are the predicted ones."""
+        # A new one each time: two objects that hold each other are freed late, and
+        # matrices are large.
         return self.traced.like(predict=self.radiance)
 
     def __call__(self, u: Tensor) -> Tensor:
-        """Return the picture (H, W, 3) sRGB of a configuration (d,); differentiable."""
+        """Return the image (H, W, 3) sRGB of a configuration (d,); differentiable."""
         return self.renderer(u)
 
     def pictures(self, us: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the images of several configurations."""
         return [self(u) for u in us]
 
     @abstractmethod
     def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """Return the linear radiance of scene inputs; see
-        `advsearch.scene.renderer.Predict`.
+        """Return the linear radiance of scene inputs.
+
+        See `advsearch.scene.renderer.Predict`.
         """
 
     @property
     @abstractmethod
     def entries(self) -> int:
-        """Entries of all matrices, for one colour channel."""
+        """Number of entries of all matrices, for one color channel."""
 
     @property
     @abstractmethod
     def bytes(self) -> int:
-        """Memory of all that is kept."""
+        """Memory of all that is stored."""
 
     @property
     def lights(self) -> int:
-        """Pictures that were traced for it."""
+        """Number of images that were traced for it."""
         return 1
 
 
 def differs(one: Tensor | None, other: Tensor | None) -> bool:
-    """Whether two inputs of a scene are not the same, bit for bit."""
+    """Return whether two inputs of a scene are not the same, bit for bit."""
     return (
         one is None
         or other is None
@@ -111,8 +112,9 @@ def differs(one: Tensor | None, other: Tensor | None) -> bool:
 
 
 class LinearMap(torch.autograd.Function):
-    """A linear map as a torch operation: `times`, with its transpose as the derivative,
-    any number of times.
+    """A linear map as a torch operation, differentiable any number of times.
+
+    It is `times`; its transpose is the derivative.
     """
 
     @staticmethod
@@ -122,9 +124,10 @@ class LinearMap(torch.autograd.Function):
         transposed_times: Callable[[Tensor], Tensor],
         values: Tensor,
     ) -> Tensor:
-        ctx.back = transposed_times, times
+        ctx.transpose = transposed_times, times
         return times(values.detach())
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[None, None, Tensor]:
-        return None, None, LinearMap.apply(*ctx.back, cotangent.contiguous())  # type: ignore[no-untyped-call]
+        gradient = LinearMap.apply(*ctx.transpose, cotangent.contiguous())  # type: ignore[no-untyped-call]
+        return None, None, gradient

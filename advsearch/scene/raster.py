@@ -1,16 +1,15 @@
-"""Triangles to pixels: the one rasteriser, in numpy, for silhouettes, texture charts
-and baked textures.
+"""Rasterise triangles, for silhouettes, texture charts and baked textures.
 
 Each triangle is cut into the spans of rows that it crosses, and each span into pixels.
 
-And where on a mesh each texel of its texture lies: the UV charts rasterised at the
-texel centres. Row 0 is at v = 1, as in every texture of ours. A texel belongs to the
-triangle that its centre lies in; one that no chart covers takes over what the nearest
-covered texel has, so that bilinear lookups at a chart's border find values that
-continue it.
+`Charts` has the position on a mesh of each texel of its texture: the UV charts
+rasterised at the texel centers. Row 0 is at v = 1, as in all our textures. A texel
+belongs to the triangle that its center lies in; one that no chart covers has the values
+of the nearest covered texel, so that bilinear look-ups at a chart's border find values
+that continue it.
 
-`MeshSurface` finds places on a mesh by rays and the connected region around them, for
-what is stuck onto it.
+`MeshSurface` finds points on a mesh by rays and the connected region around them, for
+patches.
 """
 
 from __future__ import annotations
@@ -25,20 +24,26 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh, face_vectors
 from advsearch.scene.importing.geometry import connected
 
-# barycentric weight by which a pixel's centre may miss a triangle, so that shared edges
+# barycentric weight by which a pixel's center may miss a triangle, so that shared edges
 # leave no gaps
 TOLERANCE = 1e-6
-MISS = 1e-4  # pixels by which a centre may miss a triangle and still be looked at
+MISS = 1e-4  # pixels by which a center may miss a triangle and still be a candidate
 
 
 def pixels_in(
     corners: Doubles, shape: tuple[int, int], tolerance: float = TOLERANCE
 ) -> tuple[Ints, Ints, Ints, Doubles]:
-    """List the pixels of a raster (height, width) whose centres lie in each of many
-    triangles, or miss it by a barycentric weight of at most `tolerance`, triangle by
-    triangle: for every such pixel its triangle, row and column (N,), and the corners'
-    barycentric weights (N, 3). Corners (F, 3, 2) are columns and rows, integers at
-    pixel centres; triangles without area cover nothing.
+    """List the pixels of a raster whose centers lie in triangles.
+
+    Args:
+        corners: (F, 3, 2) columns and rows of the triangles' corners, integers at pixel
+            centers; triangles without area cover nothing.
+        shape: height and width of the raster.
+        tolerance: largest barycentric weight by which a center may miss a triangle.
+
+    Returns:
+        For each pixel of each triangle, triangle by triangle, the triangle, row and
+        column (N,), and the corners' barycentric weights (N, 3).
     """
     face, row, column = pixels_near(corners, shape, 10.0 * MISS)
     weights = weights_at(corners[face], row, column)
@@ -49,55 +54,75 @@ def pixels_in(
 def pixels_near(
     corners: Doubles, shape: tuple[int, int], miss: float = MISS
 ) -> tuple[Ints, Ints, Ints]:
-    """List the pixels whose centres lie in each of many triangles, also flat ones, or
-    miss it by so many pixels along their row or column; arguments as of `pixels_in`,
-    returns triangle, row and column (N,).
+    """List the pixels whose centers lie in triangles, also flat ones, or nearly.
+
+    They may miss a triangle by `miss` pixels along their row or column. Other arguments
+    as for `pixels_in`.
+
+    Returns:
+        Triangle, row and column (N,).
     """
-    face, row = _ranges(
+    face, row = _integers_within(
         corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], miss
     )
-    span, column = _ranges(*_crossing(corners[face], row, miss), shape[1], miss)
+    left, right = _cross_rows(corners[face], row, miss)
+    span, column = _integers_within(left, right, shape[1], miss)
     return face[span], row[span], column
 
 
 def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
-    """Return the texels (h, w) that bilinear lookups anywhere in triangles (F, 3, 2),
-    as of `pixels_in` and at most half a texel outside of the texture, read; lookups
-    repeat at the border.
+    """Return the texels (h, w) that bilinear look-ups in triangles read.
+
+    Look-ups repeat at the border. The triangles (F, 3, 2) are as for `pixels_in`, at
+    most half a texel outside of the texture.
     """
-    # a lookup between two texels is in the cell of the first; -1 is the last one again
-    moved = corners + 1.0
-    low = np.floor(moved[..., 1].min(axis=1) - MISS)
-    high = np.floor(moved[..., 1].max(axis=1) + MISS)
-    face, row = _ranges(low, high, shape[0] + 1, 0.0)
-    here = moved[face]
-    rows = row[:, None]
-    edges = [_crossing(here, row + k, MISS) for k in (0, 1)]
-    within = (here[..., 1] >= rows - MISS) & (here[..., 1] <= rows + 1 + MISS)
-    left = np.where(within, here[..., 0], np.inf).min(axis=1)
-    right = np.where(within, here[..., 0], -np.inf).max(axis=1)
-    for begin, end in edges:
-        left = np.where(begin <= end, np.minimum(left, begin), left)
-        right = np.where(begin <= end, np.maximum(right, end), right)
-    span, column = _ranges(
+    # A look-up between two texels is in the cell of the first; -1 is the last one
+    # again.
+    shifted = corners + 1.0
+    lowest_row = np.floor(shifted[..., 1].min(axis=1) - MISS)
+    highest_row = np.floor(shifted[..., 1].max(axis=1) + MISS)
+    face, row = _integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
+    left, right = _span_of_rows(shifted[face], row)
+    span, column = _integers_within(
         np.floor(left - MISS), np.floor(right + MISS), shape[1] + 1, 0.0
     )
-    read = np.zeros(shape, np.bool_)
-    for down in (0, 1):
-        for across in (0, 1):
-            read[
-                (row[span] - 1 + down) % shape[0], (column - 1 + across) % shape[1]
-            ] = True
-    return read
+    is_read = np.zeros(shape, np.bool_)
+    for row_offset in (0, 1):
+        for column_offset in (0, 1):
+            read_row = (row[span] - 1 + row_offset) % shape[0]
+            read_column = (column - 1 + column_offset) % shape[1]
+            is_read[read_row, read_column] = True
+    return is_read
+
+
+def _span_of_rows(corners: Doubles, row: Ints) -> tuple[Doubles, Doubles]:
+    """Return the columns that triangles (N, 3, 2) have between a row (N,) and the next.
+
+    The first and the last column are in the triangle's corners, or where its edges
+    cross one of the two rows.
+    """
+    rows = row[:, None]
+    y = corners[..., 1]
+    is_between = (y >= rows - MISS) & (y <= rows + 1 + MISS)
+    left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
+    right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
+    for offset in (0, 1):
+        first, last = _cross_rows(corners, row + offset, MISS)
+        left = np.where(first <= last, np.minimum(left, first), left)
+        right = np.where(first <= last, np.maximum(right, last), right)
+    return left, right
 
 
 def weights_at(
     corners: Doubles, row: Ints | Doubles, column: Ints | Doubles
 ) -> Doubles:
-    """Return the barycentric weights (N, 3) of pixel centres in triangles (N, 3, 2);
-    NaN where one has no area.
+    """Return the barycentric weights (N, 3) of pixel centers in triangles (N, 3, 2).
+
+    They are NaN where a triangle has no area.
     """
-    (ax, ay), (bx, by), (cx, cy) = (corners[:, number].T for number in range(3))
+    ax, ay = corners[:, 0].T
+    bx, by = corners[:, 1].T
+    cx, cy = corners[:, 2].T
     with np.errstate(all="ignore"):
         scale = 1.0 / doubled_areas(corners)
         second = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) * scale
@@ -112,39 +137,50 @@ def doubled_areas(corners: Doubles) -> Doubles:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _ranges(low: Doubles, high: Doubles, size: int, miss: float) -> tuple[Ints, Ints]:
-    """List the integers of [low, high] within [0, size - 1] for many intervals: each
-    one's interval, and its value.
+def _integers_within(
+    lower: Doubles, upper: Doubles, size: int, miss: float
+) -> tuple[Ints, Ints]:
+    """List the integers of many intervals within [0, size - 1].
+
+    The intervals are [lower, upper], wider by `miss` on each side.
+
+    Returns:
+        The index of the interval, and the integer.
     """
-    first = np.maximum(np.ceil(low - miss), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(high + miss), size - 1.0).astype(np.int64)
+    first = np.maximum(np.ceil(lower - miss), 0.0).astype(np.int64)
+    last = np.minimum(np.floor(upper + miss), size - 1.0).astype(np.int64)
     counts = np.maximum(last - first + 1, 0)
-    owner = np.repeat(np.arange(len(counts)), counts)
-    begin = np.cumsum(counts) - counts
-    return owner, first[owner] + np.arange(len(owner)) - begin[owner]
+    interval = np.repeat(np.arange(len(counts)), counts)
+    start = np.cumsum(counts) - counts
+    value = first[interval] + np.arange(len(interval)) - start[interval]
+    return interval, value
 
 
-def _crossing(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Doubles]:
+def _cross_rows(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Doubles]:
+    """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
+
+    An empty range is 0 to -1.
+    """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
-    for begin, end in ((0, 1), (1, 2), (2, 0)):
-        (x0, y0) = corners[:, begin].T
-        (x1, y1) = corners[:, end].T
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        x0, y0 = corners[:, first].T
+        x1, y1 = corners[:, second].T
         rise = y1 - y0
-        share = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
-        meets = (
+        fraction = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
+        crosses = (
             (np.minimum(y0, y1) - miss <= row)
             & (row <= np.maximum(y0, y1) + miss)
             & (rise != 0.0)
         )
-        x = x0 + share * (x1 - x0)
-        left = np.where(meets, np.minimum(left, x), left)
-        right = np.where(meets, np.maximum(right, x), right)
-    empty = left > right
-    return np.where(empty, 0.0, left), np.where(empty, -1.0, right)
+        x = x0 + fraction * (x1 - x0)
+        left = np.where(crosses, np.minimum(left, x), left)
+        right = np.where(crosses, np.maximum(right, x), right)
+    is_empty = left > right
+    return np.where(is_empty, 0.0, left), np.where(is_empty, -1.0, right)
 
 
-# texels around a chart that belong to it: a bilinear lookup inside reaches one texel
+# texels around a chart that belong to it: a bilinear look-up inside reads one texel
 # beyond it
 BORDER = 2.0
 
@@ -160,13 +196,14 @@ class Charts:
     # (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up
     # to 1
     weights: Doubles
-    covered: Bools  # (h, w) the texel's centre lies in a chart
+    covered: Bools  # (h, w) the texel's center lies in a chart
     distance: Doubles  # (h, w) texels to the nearest covered texel; 0 where covered
 
     @property
     def touched(self) -> Bools:
-        """(h, w): a lookup on the surface can touch the texel; it is in a chart or
-        `BORDER` texels around one.
+        """(h, w) whether a look-up on the surface can read the texel.
+
+        It is in a chart or `BORDER` texels around one.
         """
         return np.asarray(self.distance <= BORDER)
 
@@ -182,40 +219,56 @@ class Charts:
         corners = self.mesh.normals[self.mesh.faces[self.face]]
         normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-        flat = _face_normals(self.mesh)[self.face]
-        return np.where(
-            lengths > 1e-6, normals / np.maximum(lengths, 1e-6), flat
-        ).astype(np.float32)
+        unit_normals = normals / np.maximum(lengths, 1e-6)
+        face_normals = _face_normals(self.mesh)[self.face]
+        return np.where(lengths > 1e-6, unit_normals, face_normals).astype(np.float32)
 
     def areas(self) -> Floats:
-        """Return the surface area (h, w) that each texel stands for, in squared mesh
-        units; 0 where no chart is.
+        """Return the surface area (h, w) of each texel, in squared mesh units.
+
+        It is 0 where no chart is.
         """
-        places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        surface = np.linalg.norm(face_vectors(places), axis=1)
+        corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
+        face_areas = np.linalg.norm(face_vectors(corners), axis=1)
         texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
-        share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
-        return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
+        area_per_texel = np.where(
+            texels > 0.0, face_areas / np.maximum(texels, 1e-12), 0.0
+        )
+        return np.where(self.covered, area_per_texel[self.face], 0.0).astype(np.float32)
 
 
 def texels_of_faces(
     mesh: Mesh, faces: Ints, shape: tuple[int, int]
 ) -> tuple[Bools, float]:
-    """Return the texels (h, w) that bilinear lookups on some faces, by their numbers
-    (N,), read and lookups on all others do not, and their share of those that lookups
-    on these faces read.
+    """Return the texels that bilinear look-ups on some faces alone read.
+
+    Args:
+        mesh: the mesh.
+        faces: (N,) indices of the faces.
+        shape: height and width of the texture.
+
+    Returns:
+        (h, w) texels that no look-up on other faces reads, and their fraction of those
+        that look-ups on these faces read.
     """
     corners = _in_texels(mesh, shape)
-    ours = np.isin(np.arange(len(mesh.faces)), faces)
-    read = texels_read(corners[ours], shape)
-    alone = read & ~texels_read(corners[~ours], shape)
-    return alone, float(alone.sum()) / max(1, int(read.sum()))
+    is_selected = np.isin(np.arange(len(mesh.faces)), faces)
+    read = texels_read(corners[is_selected], shape)
+    exclusive = read & ~texels_read(corners[~is_selected], shape)
+    return exclusive, float(exclusive.sum()) / max(1, int(read.sum()))
 
 
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
-    """Find the face and the barycentric weights behind every texel centre of a texture,
-    square where its resolution is one number. Where charts overlap, one of their faces
-    wins. Raises InputError: the texture coordinates cover no texel.
+    """Find the face and the barycentric weights of every texel of a texture.
+
+    Where charts overlap, one of their faces wins.
+
+    Args:
+        mesh: with texture coordinates.
+        resolution: height and width, or both as one number.
+
+    Raises:
+        InputError: the texture coordinates cover no texel.
     """
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _in_texels(mesh, shape)
@@ -226,116 +279,136 @@ def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
             "lies in a triangle; unwrap the mesh "
             "again"
         )
-    corners = corners[face]
     points = np.stack([column, row], axis=1)
-    whole = doubled_areas(corners)
-    parts = []
-    # barycentric weights, clipped to the triangle
-    for begin, end in ((1, 2), (2, 0), (0, 1)):
-        a = corners[:, begin] - points
-        b = corners[:, end] - points
-        parts.append(
-            (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.where(whole == 0.0, 1.0, whole)
-        )
-    weights = np.maximum(np.stack(parts, axis=1), 0.0)
-    total = weights.sum(axis=1, keepdims=True)
-    weights = np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
+    weights = _clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
     weight_map = np.zeros((*shape, 3))
     covered = np.zeros(shape, np.bool_)
-    face_map[row, column], weight_map[row, column], covered[row, column] = (
-        face,
-        weights,
-        True,
-    )
-    distance, nearest = ndimage.distance_transform_edt(~covered, return_indices=True)
-    return Charts(
-        mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance
-    )
+    face_map[row, column] = face
+    weight_map[row, column] = weights
+    covered[row, column] = True
+    distance, indices = ndimage.distance_transform_edt(~covered, return_indices=True)
+    nearest = tuple(indices)
+    return Charts(mesh, face_map[nearest], weight_map[nearest], covered, distance)
+
+
+def _clipped_weights(corners: Doubles, points: Ints) -> Doubles:
+    """Return the barycentric weights (N, 3) of points, clipped to their triangles."""
+    doubled = doubled_areas(corners)
+    divisor = np.where(doubled == 0.0, 1.0, doubled)
+    columns = []
+    for first, second in ((1, 2), (2, 0), (0, 1)):
+        a = corners[:, first] - points
+        b = corners[:, second] - points
+        columns.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
+    weights = np.maximum(np.stack(columns, axis=1), 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
 
 
 def looked_up(
     texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]
 ) -> Floats:
-    """Look a repeating texture (H, W, C) up with bilinear interpolation of its values
-    at columns and rows (...), any number of textures away, where integers are texel
-    centres: (..., C) float32.
+    """Look a repeating texture up with bilinear interpolation.
+
+    Args:
+        texels: (H, W, C).
+        x, y: columns and rows (...), integers at texel centers; they may be any number
+            of textures away.
+
+    Returns:
+        (..., C) float32.
     """
     height, width = texels.shape[:2]
     left = np.floor(x)
     top = np.floor(y)
     fx = (x - left).astype(np.float32)[..., None]
     fy = (y - top).astype(np.float32)[..., None]
-    columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
-    rows = [((top + k) % height).astype(np.int64) for k in (0, 1)]
-    upper = texels[rows[0], columns[0]] * (1 - fx) + texels[rows[0], columns[1]] * fx
-    lower = texels[rows[1], columns[0]] * (1 - fx) + texels[rows[1], columns[1]] * fx
+    column0 = (left % width).astype(np.int64)
+    column1 = ((left + 1) % width).astype(np.int64)
+    row0 = (top % height).astype(np.int64)
+    row1 = ((top + 1) % height).astype(np.int64)
+    upper = texels[row0, column0] * (1 - fx) + texels[row0, column1] * fx
+    lower = texels[row1, column0] * (1 - fx) + texels[row1, column1] * fx
     return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
 
 
 class MeshSurface:
-    """The faces of a mesh, ready for rays and for neighbourhoods."""
+    """The faces of a mesh, prepared for rays and for neighbourhoods."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _face_normals(mesh)
-        self._low, self._high = self._corners.min(axis=1), self._corners.max(axis=1)
-        # Pairs (E, 2) of faces with an edge in common, across UV seams too
-        places = welded(mesh)[0][mesh.faces]
-        edges = np.sort(
-            np.concatenate([places[:, [0, 1]], places[:, [1, 2]], places[:, [2, 0]]]),
-            axis=1,
+        self._lower = self._corners.min(axis=1)
+        self._upper = self._corners.max(axis=1)
+        # Pairs (E, 2) of faces with an edge in common, across UV seams too.
+        corners = welded(mesh)[0][mesh.faces]
+        edges = np.concatenate(
+            [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
+        edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
-        same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        owner = order % len(mesh.faces)
-        self._neighbours = np.stack([owner[:-1][same], owner[1:][same]], axis=1)
+        is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+        face = order % len(mesh.faces)
+        self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
     def hit(self, origin: Doubles, direction: Doubles) -> tuple[int, Doubles]:
-        """Return the first face that a ray from (3,) outside the mesh in a unit
-        direction (3,) meets, from either side, and the point (3,) where it does. If it
-        meets none: the face with the corner nearest to the ray's line, and that corner.
+        """Find the first face that a ray meets, from either side.
+
+        Args:
+            origin: (3,) outside of the mesh.
+            direction: (3,) unit vector.
+
+        Returns:
+            The face, and the point (3,) where the ray meets it. If it meets none: the
+            face with the corner nearest to the ray's line, and that corner.
+        """
+        distance = self._intersect(origin, direction)
+        if np.isfinite(distance).any():
+            face = int(distance.argmin())
+            return face, origin + distance[face] * direction
+        to_corners = np.cross(self._corners - origin, direction)
+        line_distance = np.linalg.norm(to_corners, axis=-1)
+        face, corner = np.unravel_index(line_distance.argmin(), line_distance.shape)
+        return int(face), self._corners[face, corner]
+
+    def _intersect(self, origin: Doubles, direction: Doubles) -> Doubles:
+        """Return the distance (F,) at which a ray meets each face, or infinity.
+
+        Moeller and Trumbore 1997, all faces at once.
         """
         a = self._corners[:, 0]
         b = self._corners[:, 1]
         c = self._corners[:, 2]
-        # Moeller and Trumbore 1997, all faces at once
-        across = np.cross(direction, c - a)
-        determinant = ((b - a) * across).sum(axis=1)
+        p = np.cross(direction, c - a)
+        determinant = ((b - a) * p).sum(axis=1)
         inverse = np.where(
             np.abs(determinant) > 1e-15,
             1.0 / np.where(determinant == 0.0, 1.0, determinant),
             0.0,
         )
-        offset = origin - a
-        first = (offset * across).sum(axis=1) * inverse
-        turned = np.cross(offset, b - a)
-        second = (turned @ direction) * inverse
-        distance = ((c - a) * turned).sum(axis=1) * inverse
+        t = origin - a
+        u = (t * p).sum(axis=1) * inverse
+        q = np.cross(t, b - a)
+        v = (q @ direction) * inverse
+        distance = ((c - a) * q).sum(axis=1) * inverse
         slack = 1e-9
-        meets = (
-            (inverse != 0.0)
-            & (first >= -slack)
-            & (second >= -slack)
-            & (first + second <= 1.0 + slack)
-        )
-        meets &= distance > 0.0
-        if meets.any():
-            face = int(np.where(meets, distance, np.inf).argmin())
-            return face, origin + distance[face] * direction
-        aside = np.linalg.norm(np.cross(self._corners - origin, direction), axis=-1)
-        face, corner = np.unravel_index(aside.argmin(), aside.shape)
-        return int(face), self._corners[face, corner]
+        is_hit = (inverse != 0.0) & (u >= -slack) & (v >= -slack)
+        is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)
+        return np.where(is_hit, distance, np.inf)
 
     def region(
         self, face: int, point: Doubles, normal: Doubles, radius: float
     ) -> Bools:
-        """Return which faces (F,) lie within a radius of a point (3,), face a direction
-        (3,), and are reached from one face, which always counts, over edges between
-        such faces. The other wall of a cup, or the next slat of a chair, are not.
+        """Return the faces (F,) around a point that are connected to a face.
+
+        They lie within a radius of the point (3,), face a direction (3,), and are
+        reached from the face, which always counts, over edges between such faces. The
+        other wall of a cup, or the next slat of a chair, are not.
         """
-        gap = np.maximum(np.maximum(self._low - point, point - self._high), 0.0)
-        inside = (np.linalg.norm(gap, axis=1) <= radius) & (self.normals @ normal > 0.0)
+        gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
+        is_near = np.linalg.norm(gap, axis=1) <= radius
+        inside = is_near & (self.normals @ normal > 0.0)
         inside[face] = True
         links = self._neighbours[inside[self._neighbours].all(axis=1)]
         labels = connected(len(inside), *links.T)
@@ -343,33 +416,34 @@ class MeshSurface:
 
 
 def welded(mesh: Mesh) -> tuple[Ints, int]:
-    """Return the number of the place that each vertex lies at (V,), and how many places
-    there are. Vertices that UV seams and creases split share a place: 1e-5 of the
-    mesh's largest extent apart or less.
+    """Return the index of the position of each vertex (V,), and how many there are.
+
+    Vertices that UV seams and creases split share a position: 1e-5 of the mesh's
+    largest extent apart or less.
     """
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     rounded = np.round(mesh.vertices.astype(np.float64) / max(extent, 1e-12) * 1e5)
-    place = (
-        np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    )
-    return place, int(place.max()) + 1
+    index = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
+    index = index.astype(np.int64)
+    return index, int(index.max()) + 1
 
 
 def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
-    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at
-    texel centres. Where a texture repeats, each face is moved by whole textures, so
-    that its middle lies in the first one.
+    """Return texture coordinates of the faces' corners (F, 3, 2) in texels.
+
+    They are column and row, integers at texel centers. Where a texture repeats, each
+    face is moved by full textures, so that its center lies in the first one.
     """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
     if mesh.repeats:
         uvs -= np.floor(uvs.mean(axis=1, keepdims=True))
-    return np.stack(
-        [uvs[..., 0] * shape[1] - 0.5, (1.0 - uvs[..., 1]) * shape[0] - 0.5], axis=-1
-    )
+    column = uvs[..., 0] * shape[1] - 0.5
+    row = (1.0 - uvs[..., 1]) * shape[0] - 0.5
+    return np.stack([column, row], axis=-1)
 
 
 def _face_normals(mesh: Mesh) -> Doubles:
-    normals = face_vectors(mesh.vertices[mesh.faces].astype(np.float64))
-    return np.asarray(
-        normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    )
+    """Return the unit normals (F, 3) of a mesh's faces."""
+    vectors = face_vectors(mesh.vertices[mesh.faces].astype(np.float64))
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, 1e-20))

@@ -1,5 +1,4 @@
-"""The function in the middle: `render(u, seed, spp)`, differentiable in ordinary torch
-autograd.
+"""Render configurations: `render(u, seed, spp)`, differentiable in torch autograd.
 
 See docs/design.md, "One function in the middle".
 
@@ -54,14 +53,16 @@ Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]
 # from inputs, seed and spp to radiance (H, W, 3)
 Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
-"""From scene inputs to linear radiance (H, W, 3), or (H, W, 4) with coverage where
-there is a backdrop; differentiable.
+"""From scene inputs to linear radiance (H, W, 3); differentiable.
+
+It is (H, W, 4) with coverage where there is a backdrop.
 """
 
 
 class InputSpace(Later, Protocol):
-    """What the renderer and a loop of one's own ask of a space: its start, its groups,
-    what a configuration does.
+    """What the renderer and a user's own loop need of a space.
+
+    It is its start, its groups, and what a configuration does.
     """
 
     @property
@@ -73,30 +74,32 @@ class InputSpace(Later, Protocol):
         """Every group of coordinates with its valid estimators."""
 
     def later(self, seconds: float) -> Later:
-        """Return what maps u to scene inputs so many seconds later."""
+        """Return what maps u to scene inputs some seconds later."""
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Change the finished picture; differentiable."""
+        """Change the finished image; differentiable."""
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the colours that are searched, (h, w, 3) or (h, w, 4), by control;
-        differentiable.
+        """Return the colors that are searched, (h, w, 3) or (h, w, 4), by control.
+
+        They are differentiable.
         """
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the numbers of the configuration, in their units, by name;
-        differentiable.
+        """Return the numbers of the configuration, in their units, by name.
+
+        They are differentiable.
         """
 
 
-# coordinates of a group up to which it is measured how far they move outlines
+# largest group for which it is measured how far its coordinates move outlines
 MOST_MEASURED = 64
-# of noise, over which the tone curve is straight; see `Renderer.halves`
+# fraction of the noise over which the tone curve is straight; see `Renderer.halves`
 SMALL_PART = 0.0625
 
 
 class Renderer:
-    """Renders the configurations of one space in one scene.
+    """Render the configurations of one space in one scene.
 
     Attributes:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
@@ -111,10 +114,10 @@ class Renderer:
     Args:
         scene: the scene inside Mitsuba, at the formation's resolution.
         space: maps u to scene inputs.
-        formation: how radiance becomes the picture.
+        formation: how radiance becomes the image.
         root_seed: seeds of different roots never meet, whatever is passed as `seed`.
-        moments: that a picture is the mean of, while something moves; empty of a still.
-        motion: measures how fast coordinates move points; None takes the default step
+        moments: an image is their mean, while something moves; empty if nothing does.
+        motion: measures how fast coordinates move points; None uses the default step
             for all.
         estimators: estimators forced by "control.parameter", "control" or "*".
     """
@@ -155,22 +158,23 @@ class Renderer:
 
     def __repr__(self) -> str:
         height, width = self.formation.resolution
-        numbers = ", ".join(
-            f"{group.name} ({group.size})" for group in self.space.groups
-        )
+        groups = [f"{group.name} ({group.size})" for group in self.space.groups]
         return (
-            f"Renderer({len(self.start)} numbers: {numbers}; {height} x {width} pixels)"
+            f"Renderer({len(self.start)} numbers: {', '.join(groups)}; "
+            f"{height} x {width} pixels)"
         )
 
     def _repr_png_(self) -> bytes:
-        """The start as a notebook shows it; it does not count as a render."""
+        """Return the start as a notebook shows it; it does not count as a render."""
         with torch.no_grad():
             return png_of(levels_of(self.like()(self.start)).numpy())
 
     @property
     def composed(self) -> str:
-        """Why a picture is not that of one scene as one camera sees it; empty where it
-        is, so that others may predict it from light that was collected once.
+        """Why an image is not that of one scene as one camera sees it.
+
+        It is empty if it is, so that others may predict it from light that was
+        collected once.
         """
         if self.scene.made[0].rig:
             return "a picture is made of those of several cameras"
@@ -184,11 +188,17 @@ class Renderer:
         predict: Predict | None = None,
         **formation: Any,
     ) -> Renderer:
-        """Return a renderer of the same space that counts on from this one's counters,
-        by itself: with another scene, other fields of the image formation, a `source`
-        (another program, which renders and denoises), or what predicts radiance
-        (`scene.predictor`): seed and samples of a call mean nothing then, and every
-        derivative runs back through scene inputs, whatever the plan says.
+        """Return a renderer of the same space with some changes.
+
+        It continues from this one's counters, which do not follow it.
+
+        Args:
+            scene: another scene.
+            source: another program, which renders and denoises.
+            predict: predicts radiance (`scene.predictor`). Seed and samples of a call
+                mean nothing then, and every derivative runs back through scene inputs,
+                whatever the plan is.
+            formation: other fields of the image formation.
         """
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
@@ -198,13 +208,13 @@ class Renderer:
         return other
 
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render a configuration as the model would see it, or several.
+        """Render one or several configurations as the model would see them.
 
         Args:
             u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the
                 other with the same seed. It is rendered in float32, whatever its dtype.
-            seed: number of the noise; the same seed gives the same bytes.
-            spp: independent samples a pixel, 1 to 65,536.
+            seed: of the noise; the same seed gives the same bytes.
+            spp: independent samples per pixel, 1 to 65,536.
 
         Returns:
             (H, W, 3) float32, display-referred sRGB in [0, 1], or (N, H, W, 3);
@@ -217,91 +227,110 @@ class Renderer:
             InputError: u has another shape, or values outside [0, 1], or spp is out of
                 range; or u requires a gradient and was made in `torch.inference_mode`.
         """
-        u = _tensor(u)
+        u = _to_tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
-        u, through = self._given(u, spp)
+        u, through = self._check_arguments(u, spp)
         with _no_inference():
-            image = self._picture(through, seed, spp)
+            image = self._render_image(through, seed, spp)
             if through is not u and torch.is_grad_enabled() and self._differenced():
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
 
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render linear radiance, denoised if the formation says so; arguments as for a
-        call; (H, W, 3) float32. Exposure and backdrop of the configuration are in it;
-        what controls do to the finished picture is not.
+        """Render linear radiance (H, W, 3) float32; arguments as for a call.
+
+        It is denoised if the formation requires it. Exposure and backdrop of the
+        configuration are in it; what controls do to the finished image is not.
         """
-        _, through = self._given(u, spp)
+        _, through = self._check_arguments(u, spp)
         with _no_inference():
-            return self._picture(through, seed, spp, display=False)
+            return self._render_image(through, seed, spp, display=False)
 
     def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Trace two pictures (H, W, 3) of a configuration with independent noise, which
-        are not denoised; and return beside them that of all their samples, which is.
-        Arguments as for a call; without a graph, and not counted. The two are taken
-        through a tone curve that is straight about the third, so that they are right on
-        average, and not darker where they are noisy; they may leave [0, 1].
+        """Trace two images of a configuration with independent noise.
+
+        The two are passed through a tone curve that is straight about the third, so
+        that they are right on average, and not darker where they are noisy; they may
+        leave [0, 1]. Arguments as for a call; there is no graph, and nothing is
+        counted.
+
+        Returns:
+            Three images (H, W, 3): the two, which are not denoised, and that of all
+            their samples, which is.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-            hide = "backdrop.color" in inputs
-            traced = _traced(inputs)
-            undenoised = self.like(denoiser="none")
-            numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
-            halves = [
-                undenoised.rendered(traced, number, spp, hide) for number in numbers
-            ]
-            both = (halves[0] + halves[1]) / 2.0
-            noise = seeds.stream(self.root_seed, "guides", numbers[0])
-            clean = denoise(
-                both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp)
-            )
-            both = torch.cat([clean, both[..., 3:]], dim=-1)
-            *noisy, clean = (
-                self.finished(picture, inputs, u, display=False)
-                for picture in (*halves, both)
-            )
-            there = self.formation.display(clean)
-            moved = (
-                self.formation.display(torch.lerp(clean, half, SMALL_PART))
-                for half in noisy
-            )
-            first, second = (
-                self.space.picture(u, there + (half - there) / SMALL_PART)
-                for half in moved
-            )
-            return first, second, self.space.picture(u, there)
+            halves, mean = self._trace_halves(inputs, seed, spp)
+
+            def finish(radiance: Tensor) -> Tensor:
+                return self.finished(radiance, inputs, u, display=False)
+
+            clean = finish(mean)
+            curve_point = self.formation.display(clean)
+
+            def display_straight(radiance: Tensor) -> Tensor:
+                """Extend the tone curve's tangent at the denoised image."""
+                nudged = torch.lerp(clean, finish(radiance), SMALL_PART)
+                slope = (self.formation.display(nudged) - curve_point) / SMALL_PART
+                return self.space.picture(u, curve_point + slope)
+
+            first = display_straight(halves[0])
+            second = display_straight(halves[1])
+            return first, second, self.space.picture(u, curve_point)
+
+    def _trace_halves(
+        self, inputs: Mapping[str, Tensor], seed: int, spp: int
+    ) -> tuple[list[Tensor], Tensor]:
+        """Trace two renders with independent noise; return them and the denoised mean."""
+        hide = "backdrop.color" in inputs
+        scene_inputs = _select_scene_inputs(inputs)
+        undenoised = self.like(denoiser="none")
+        noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
+        halves = [
+            undenoised.rendered(scene_inputs, noise_seed, spp, hide)
+            for noise_seed in noise_seeds
+        ]
+        mean = (halves[0] + halves[1]) / 2.0
+        guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
+        albedo, normal = self.scene.guides(scene_inputs, guide_seed, spp)
+        clean = denoise(mean[..., :3].contiguous(), albedo, normal)
+        return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
 
     def traced_inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Return what the scene gets of a configuration (d,), by name, without a
-        graph.
-        """
+        """Return the inputs of Mitsuba's scene at a configuration (d,), without a graph."""
         inputs = self.scene.assembly(self.space.inputs(u))
-        return {name: value.detach() for name, value in _traced(inputs).items()}
+        return {
+            name: value.detach() for name, value in _select_scene_inputs(inputs).items()
+        }
 
     def mask(self, u: Configuration) -> Tensor:
-        """Return the pixels in which the object is the first thing that the camera
-        sees, (H, W) bool. It is asked for at the middle of each pixel. What controls do
-        to the finished picture moves nothing in it.
+        """Return the pixels in which the camera sees the object first, (H, W) bool.
+
+        The ray through the center of each pixel counts. What controls do to the
+        finished image moves nothing in it.
         """
         return self.surfaces(u).seen(OBJECT)
 
     def surfaces(
         self, u: Configuration, fineness: int = 1, camera: int = 0
     ) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel of u (d,),
-        or of each of `fineness` by `fineness` parts of it; as of `mask`. The cameras of
-        a rig have numbers from 0.
+        """Find what the camera sees first through the center of each pixel.
+
+        Args:
+            u: (d,) configuration.
+            fineness: divide each pixel into that many rows and columns.
+            camera: index of the camera of a rig.
         """
-        u, _ = self._given(u, 1)
+        u, _ = self._check_arguments(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
-            seen = self.scene.surfaces(
-                _traced(self._seen(rig[camera] if rig else None, u)), fineness
-            )
+            inputs = self._camera_inputs(rig[camera] if rig else None, u)
+            surfaces = self.scene.surfaces(_select_scene_inputs(inputs), fineness)
         metres = self.scene.made[0].metres
-        return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
+        return replace(
+            surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
+        )
 
     def gradient(
         self,
@@ -312,50 +341,55 @@ class Renderer:
         *,
         free: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return the loss, from (H, W, 3) sRGB to a number, of the picture of u (d,),
-        without graph, and its derivative (d,) float32 by the plan; u, seed and spp as
-        in a call. Unlike autograd through a call, this gives coordinates with the
-        estimator "secant" differences of the loss; `free` leaves out what takes primal
-        renders of its own, with zero for coordinates that use differences.
+        """Return a loss of the image of u, and its derivative by the plan.
+
+        Unlike autograd through a call, this gives coordinates with the estimator
+        "secant" differences of the loss.
+
+        Args:
+            loss: from an image (H, W, 3) sRGB to a number.
+            u, seed, spp: as for a call.
+            free: leave out what needs primal renders of its own; coordinates that use
+                differences then have a derivative of zero.
+
+        Returns:
+            The loss without graph, and (d,) float32.
         """
         self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
         try:
             with torch.inference_mode(False), torch.enable_grad():
-                at = u.detach().clone().requires_grad_()
-                value = loss(self(at, seed, spp))
-            slope = (
-                torch.autograd.grad(value, at, allow_unused=True)[0]
-                if value.requires_grad
-                else None
-            )
+                leaf = u.detach().clone().requires_grad_()
+                value = loss(self(leaf, seed, spp))
+            slope = None
+            if value.requires_grad:
+                (slope,) = torch.autograd.grad(value, leaf, allow_unused=True)
         finally:
             self._left_out = frozenset()
-        derivative = torch.zeros_like(at) if slope is None else slope
-        secants = [
-            group
-            for group in self.plan.groups
-            if group.estimator == "secant" and not free
-        ]
-        noise = seeds.stream(self.root_seed, "differences", seed)
-        count = self.plan.spp or spp
+        derivative = torch.zeros_like(leaf) if slope is None else slope
+        if free:
+            return value.detach(), derivative
+        noise_seed = seeds.stream(self.root_seed, "differences", seed)
+        difference_spp = self.plan.spp or spp
         with torch.no_grad():
-            for group in secants:
+            for group in self.plan.having("secant"):
                 central(
-                    lambda at: loss(self._picture(at, noise, count)),
+                    lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
                     group,
                     u.detach(),
                     derivative,
                 )
         return value.detach(), derivative
 
-    # ---- from u to the picture
-    # --------------------------------------------------------------------------------------
+    # ---- from u to the image
 
-    def _given(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
-        """Return a configuration as float32, and with a graph only where the derivative
-        runs back through scene inputs or the picture; raises as `__call__`.
+    def _check_arguments(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
+        """Check a call's arguments; raises as `__call__`.
+
+        Returns:
+            The configuration as float32; and the same with a graph only where the
+            derivative runs back through scene inputs or the image.
         """
-        u = _tensor(u)
+        u = _to_tensor(u)
         if u.shape != self._shape:
             raise InputError(
                 f"render: expected u of shape {tuple(self._shape)}, got "
@@ -363,8 +397,11 @@ class Renderer:
             )
         if not 1 <= spp <= MAX_SPP:
             raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
-        low, high = torch.aminmax(u.detach()) if u.numel() else (u.sum(), u.sum())
-        if not bool((low >= 0.0) & (high <= 1.0)):
+        if u.numel():
+            smallest, largest = torch.aminmax(u.detach())
+        else:
+            smallest = largest = u.sum()
+        if not bool((smallest >= 0.0) & (largest <= 1.0)):
             raise InputError(
                 "render: expected every entry of u in [0, 1]; project u "
                 "before you render it"
@@ -377,91 +414,94 @@ class Renderer:
             )
         with _no_inference():
             u = u.clone() if u.is_inference() else u
-            if (
-                self._predict is not None
-                or not u.requires_grad
-                or bool((mask := self.plan.through).all())
-            ):
+            if self._predict is not None or not u.requires_grad:
+                return u, u
+            mask = self.plan.through
+            if bool(mask.all()):
                 return u, u
             return u, u.detach() + mask * (u - u.detach())
 
-    def _picture(
+    def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
     ) -> Tensor:
-        """The picture of u, or its radiance before display; of a rig its cameras' side
-        by side, (H, K W, 3).
+        """Render the image of u, or its radiance before display.
+
+        For a rig the images of its cameras stand side by side, (H, K W, 3).
         """
-        renders = self.renders
-        views = list[Tensor]()
-        for number, mount in enumerate(self.scene.made[0].rig or (None,)):
-            noise = seeds.stream(seed, "camera", number) if number else seed
-            inputs = self._seen(mount, u)
+        renders_before = self.renders
+        images = list[Tensor]()
+        for index, mount in enumerate(self.scene.made[0].rig or (None,)):
+            camera_seed = seeds.stream(seed, "camera", index) if index else seed
+            inputs = self._camera_inputs(mount, u)
             hide = "backdrop.color" in inputs
             if self.moments:
-                rendered = self._exposed(mount, u, noise, spp, hide)
+                rendered = self._render_exposure(mount, u, camera_seed, spp, hide)
             else:
-                rendered = self.rendered(_traced(inputs), noise, spp, hide)
-            views.append(self.finished(rendered, inputs, u, display=display))
-        if len(views) == 1:
-            return views[0]
-        self.renders = renders + 1  # one configuration, as budgets count it
-        return torch.cat(views, dim=1)
+                rendered = self.rendered(
+                    _select_scene_inputs(inputs), camera_seed, spp, hide
+                )
+            images.append(self.finished(rendered, inputs, u, display=display))
+        if len(images) == 1:
+            return images[0]
+        self.renders = renders_before + 1  # one configuration, as budgets count it
+        return torch.cat(images, dim=1)
 
-    def _seen(
-        self, mount: Mount | None, u: Tensor, then: Later | None = None
+    def _camera_inputs(
+        self, mount: Mount | None, u: Tensor, space: Later | None = None
     ) -> dict[str, Tensor]:
-        """Scene inputs of u as a camera of a rig, or the only one, sees them: when it
-        takes its picture, or `then`.
-        """
-        space = then or (
-            self.space.later(mount.later) if mount and mount.later else self.space
-        )
-        inputs = self.scene.assembly(space.inputs(u))
-        description = self.scene.made[0]
-        return (
-            mount.seen(inputs, *_standing(description), description.metres)
-            if mount
-            else inputs
-        )
+        """Return the scene inputs of u for a camera of a rig, or for the only one.
 
-    def _exposed(
+        They are those of the time when it takes its image, or of another `space`.
+        """
+        if space is None:
+            space = self.space
+            if mount is not None and mount.later:
+                space = self.space.later(mount.later)
+        inputs = self.scene.assembly(space.inputs(u))
+        if mount is None:
+            return inputs
+        description = self.scene.made[0]
+        pose, center = _base_pose_and_center(description)
+        return mount.seen(inputs, pose, center, description.metres)
+
+    def _render_exposure(
         self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool
     ) -> Tensor:
-        # the mean radiance of the moments of u, denoised once, which counts as one
-        # render
-        renders = self.renders
+        """Render the mean radiance of the moments of u, denoised once.
+
+        It counts as one render.
+        """
+        is_denoised = self.formation.denoiser == "oidn"
+        renders_before = self.renders
         exposed = torch.zeros(())
         guides = torch.zeros(())
-        for number, moment in enumerate(self.moments):
-            inputs = _traced(self._seen(mount, u, moment.space))
-            noise = seeds.stream(seed, "moment", number)
+        for index, moment in enumerate(self.moments):
+            inputs = _select_scene_inputs(self._camera_inputs(mount, u, moment.space))
+            moment_seed = seeds.stream(seed, "moment", index)
             rows = moment.rows[:, None, None]
             samples = max(1, math.ceil(spp * moment.samples))
             exposed = exposed + rows * self.rendered(
-                inputs, noise, samples, hide, denoised=False
+                inputs, moment_seed, samples, hide, denoised=False
             )
-            if self.formation.denoiser == "oidn":
+            if is_denoised:
                 with torch.no_grad():
-                    noise = seeds.stream(self.root_seed, "guides", noise)
-                    guides = guides + rows * torch.cat(
-                        self.scene.guides(inputs, noise, samples), dim=-1
-                    )
-        self.renders = renders + 1
-        if self.formation.denoiser != "oidn":
+                    guide_seed = seeds.stream(self.root_seed, "guides", moment_seed)
+                    albedo, normal = self.scene.guides(inputs, guide_seed, samples)
+                    guides = guides + rows * torch.cat([albedo, normal], dim=-1)
+        self.renders = renders_before + 1
+        if not is_denoised:
             return exposed
         with torch.no_grad():
             noisy = exposed[..., :3].contiguous()
-            quick = self.formation.quick
             clean = denoise(
                 noisy,
                 guides[..., :3].contiguous(),
                 guides[..., 3:].contiguous(),
-                quick=quick,
+                quick=self.formation.quick,
             )
-            change = torch.cat(
-                [clean - noisy, torch.zeros_like(exposed[..., 3:])], dim=-1
-            )
-        return exposed + change  # whose derivative is that without a denoiser
+            no_coverage = torch.zeros_like(exposed[..., 3:])
+            change = torch.cat([clean - noisy, no_coverage], dim=-1)
+        return exposed + change  # its derivative is that without a denoiser
 
     def finished(
         self,
@@ -471,9 +511,13 @@ class Renderer:
         *,
         display: bool = True,
     ) -> Tensor:
-        """Return the picture of rendered radiance, or the radiance that is to be
-        displayed: exposure and backdrop of scene inputs are added, and what controls do
-        to the finished picture at u.
+        """Return the image of rendered radiance.
+
+        Args:
+            rendered: radiance (H, W, 3), or (H, W, 4) with coverage.
+            inputs: scene inputs, of which exposure and backdrop are applied.
+            u: configuration, for what controls do to the finished image.
+            display: if False, return the radiance that is to be displayed.
         """
         exposure = inputs.get("camera.exposure")
         backdrop = inputs.get("backdrop.color")
@@ -483,11 +527,9 @@ class Renderer:
         if backdrop is not None:
             uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
             radiance = radiance + uncovered * (backdrop / self.formation.gain)
-        return (
-            self.space.picture(u, self.formation.display(radiance))
-            if display
-            else radiance
-        )
+        if not display:
+            return radiance
+        return self.space.picture(u, self.formation.display(radiance))
 
     def rendered(
         self,
@@ -498,14 +540,25 @@ class Renderer:
         *,
         denoised: bool = True,
     ) -> Tensor:
-        """Return linear radiance of scene inputs, (H, W, 3), or (H, W, 4) with coverage
-        if the environment is to `hide` behind a backdrop; with a graph; `denoised` if
-        the formation says so. What is traced counts in `renders`.
+        """Return linear radiance of scene inputs, with a graph.
+
+        What is traced counts in `renders`.
+
+        Args:
+            inputs: of the scene.
+            seed: of the noise.
+            spp: samples per pixel.
+            hide: hide the environment behind a backdrop.
+            denoised: denoise it if the formation requires it.
+
+        Returns:
+            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden.
         """
         if self._predict is not None:
             return self._predict(inputs)
-        called = self, tuple(inputs), seed, spp, hide, denoised, *inputs.values()
-        radiance: Tensor = _Radiance.apply(*called)  # type: ignore[no-untyped-call]
+        radiance: Tensor = _Radiance.apply(  # type: ignore[no-untyped-call]
+            self, tuple(inputs), seed, spp, hide, denoised, *inputs.values()
+        )
         return radiance
 
     def finite(self, values: Tensor) -> Tensor:
@@ -517,23 +570,24 @@ class Renderer:
         return torch.where(finite, values, torch.zeros_like(values))
 
     # ---- differences
-    # ------------------------------------------------------------------------------------------------
 
     def _differenced(self) -> tuple[Group, ...]:
+        """Return the groups that use differences."""
         return self.plan.having(*(BY_DIFFERENCES - self._left_out))
 
     def differences(self, u: Tensor, cotangent: Tensor, seed: int, spp: int) -> Tensor:
-        """Gradient of `sum(cotangent * picture)` for the coordinates that use
-        differences; zero for the others. All renders share one seed (common random
-        numbers), and the picture is taken after the tone curve and after what controls
-        do to it.
+        """Return the gradient of `sum(cotangent * image)` by differences.
+
+        It is zero for coordinates that do not use them. All renders share one seed
+        (common random numbers), and the image is taken after the tone curve and after
+        what controls do to it.
         """
-        noise = seeds.stream(self.root_seed, "differences", seed)
+        noise_seed = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
         derivative = torch.zeros_like(u)
         for group in self._differenced():
             central(
-                lambda at: (cotangent * self._picture(at, noise, spp)).sum(),
+                lambda at: (cotangent * self._render_image(at, noise_seed, spp)).sum(),
                 group,
                 u,
                 derivative,
@@ -541,23 +595,20 @@ class Renderer:
         return self.finite(derivative)
 
     # ---- set-up
-    # -----------------------------------------------------------------------------------------------------
 
     def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
+        """Return half-widths (d,) of differences over which outlines move by a pixel."""
         speeds = torch.zeros(len(self.start))
-        few = [
-            g
-            for g in groups
-            if {*g.valid} - {"adjoint", "image"} and g.size <= MOST_MEASURED
-        ]
-        moving = [
-            number
-            for group in few
-            for number in range(group.begin, group.begin + group.size)
-        ]
-        if motion is not None and moving:
+        coordinates: list[int] = []
+        for group in groups:
+            may_move = {*group.valid} - {"adjoint", "image"}
+            if may_move and group.size <= MOST_MEASURED:
+                coordinates += range(group.begin, group.begin + group.size)
+        if motion is not None and coordinates:
             speeds = motion.speeds(
-                lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving
+                lambda u: self.scene.assembly(self.space.inputs(u)),
+                self.start,
+                coordinates,
             )
         steps = steps_for(speeds)
         for group in groups:
@@ -566,54 +617,61 @@ class Renderer:
         return steps
 
     def _find_routes(self, groups: tuple[Group, ...]) -> dict[str, frozenset[str]]:
-        """Which scene inputs each group of coordinates reaches, found by autograd at a
-        point inside the box.
+        """Find the scene inputs that each group of coordinates reaches.
+
+        They are found by autograd at a point inside the box.
         """
-        routes: dict[str, set[str]] = {group.name: set() for group in groups}
         if not any(set(group.valid) & BY_ADJOINT for group in groups):
             return {}
+        routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
         noise = torch.rand(self.start.shape, generator=generator)
-        at = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
+        u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
-            inputs = self.scene.assembly(self.space.inputs(at))
+            inputs = self.scene.assembly(self.space.inputs(u))
             for name, tensor in inputs.items():
                 if not tensor.requires_grad:
                     continue
                 weights = torch.rand(tensor.shape, generator=generator)
-                (reached,) = torch.autograd.grad(
-                    (tensor * weights).sum(), at, retain_graph=True, allow_unused=True
+                (gradient,) = torch.autograd.grad(
+                    (tensor * weights).sum(), u, retain_graph=True, allow_unused=True
                 )
+                if gradient is None:
+                    continue
                 for group in groups:
-                    if reached is not None and bool(reached[group.coordinates].any()):
+                    if bool(gradient[group.coordinates].any()):
                         routes[group.name].add(name)
-        return {group: frozenset(inputs) for group, inputs in routes.items()}
+        return {name: frozenset(reached) for name, reached in routes.items()}
 
 
 @lru_cache(maxsize=4)
-# which takes a look at every vertex
-def _standing(description: SceneDescription) -> tuple[Tensor, Tensor]:
+def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
+    """Return the camera's pose (4, 4) and the object's center (3,) by default.
+
+    They are cached, since the center takes all vertices.
+    """
     pose = camera_to_world(description)
     center = middle(description)
     return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
 
 
-def _traced(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _select_scene_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the inputs that belong to Mitsuba's scene, not to the finished image."""
     return {name: value for name, value in inputs.items() if name not in ON_PICTURE}
 
 
 def _no_inference() -> AbstractContextManager[object]:
-    """Ordinary mode inside of torch's inference mode; setting it where it is set
-    already would cost time.
+    """Return a context of ordinary mode inside of torch's inference mode.
+
+    To set it where it is set already would cost time.
     """
-    return (
-        torch.inference_mode(False)
-        if torch.is_inference_mode_enabled()
-        else nullcontext()
-    )
+    if torch.is_inference_mode_enabled():
+        return torch.inference_mode(False)
+    return nullcontext()
 
 
-def _tensor(u: Configuration) -> Tensor:
+def _to_tensor(u: Configuration) -> Tensor:
+    """Convert a configuration to a float32 tensor."""
     try:
         return torch.as_tensor(u, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
@@ -624,9 +682,7 @@ def _tensor(u: Configuration) -> Tensor:
 
 
 class _Radiance(torch.autograd.Function):
-    """Mitsuba as one torch operation; the adjoint is rendered only if a gradient is
-    asked for.
-    """
+    """Mitsuba as one torch operation; the adjoint is rendered only for a gradient."""
 
     @staticmethod
     def forward(
@@ -646,20 +702,24 @@ class _Radiance(torch.autograd.Function):
         ctx.hide = hide
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
-        noise = seeds.stream(renderer.root_seed, "primal", seed)
-        if renderer._source is None:
-            wanted = {"hidden" if hide else "path": noise}
-            if denoised and renderer.formation.denoiser == "oidn":
-                wanted["guides"] = seeds.stream(renderer.root_seed, "guides", seed)
-            rendered, *guides = renderer.scene.pictures(inputs, wanted, spp)
+        noise_seed = seeds.stream(renderer.root_seed, "primal", seed)
+        guides: list[Tensor] = []
+        if renderer._source is not None:
+            rendered = renderer._source(inputs, noise_seed, spp)
         else:
-            rendered = renderer._source(inputs, noise, spp)
-            guides = []
+            image_seeds = {"hidden" if hide else "path": noise_seed}
+            if denoised and renderer.formation.denoiser == "oidn":
+                guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
+                image_seeds["guides"] = guide_seed
+            rendered, *guides = renderer.scene.pictures(inputs, image_seeds, spp)
         rendered = renderer.finite(rendered)
         for guide in guides:
-            noisy = rendered[..., :3].contiguous()
-            quick = renderer.formation.quick
-            clean = denoise(noisy, guide[..., :3], guide[..., 3:], quick=quick)
+            clean = denoise(
+                rendered[..., :3].contiguous(),
+                guide[..., :3],
+                guide[..., 3:],
+                quick=renderer.formation.quick,
+            )
             rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         renderer.renders += 1
         return rendered
@@ -667,59 +727,54 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use
-        an adjoint. The denoiser counts as the identity. An input that no coordinate
-        needs is left out.
+        """Return the gradient of `sum(cotangent * radiance)` by an adjoint.
+
+        It is that of the inputs whose coordinates use an adjoint; an input that no
+        coordinate needs is left out. The denoiser counts as the identity.
         """
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
-        noise = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
+        noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.finite(cotangent[..., :3])
         by_input = dict[str, Tensor]()
-        left = list(inputs)
+        remaining = list(inputs)
         # what two reach goes to the more general one
         for estimator in ("material", "adjoint"):
-            groups = [
-                group for group in renderer.plan.groups if group.estimator == estimator
-            ]
-            reached = set[str]().union(
-                *(renderer.routes.get(group.name, ()) for group in groups)
-            )
-            if estimator == "adjoint":
-                reached &= renderer.scene.interior
-            wrt = [name for name in left if name in reached]
+            reached = _reached_inputs(renderer, estimator)
+            wrt = [name for name in remaining if name in reached]
             if not wrt:
                 continue
-            left = [name for name in left if name not in reached]
+            remaining = [name for name in remaining if name not in reached]
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = renderer.scene.material_adjoint(
-                    inputs, cotangent, noise, ctx.spp, meshes=meshes
+                    inputs, cotangent, noise_seed, ctx.spp, meshes=meshes
                 )
             else:
                 method = "hidden" if ctx.hide else "path"
                 gradients = renderer.scene.adjoint(
-                    inputs, cotangent, noise, ctx.spp, wrt=wrt, method=method
+                    inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
                 )
             renderer.gradients += 1
-            by_input |= {
-                name: renderer.finite(gradient) for name, gradient in gradients.items()
-            }
-        return (
-            None,
-            None,
-            None,
-            None,
-            None,
-            None,
-            *(by_input.get(name) for name in ctx.names),
-        )
+            for name, gradient in gradients.items():
+                by_input[name] = renderer.finite(gradient)
+        no_gradients = (None,) * 6  # of the arguments before the tensors
+        return (*no_gradients, *(by_input.get(name) for name in ctx.names))
+
+
+def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
+    """Return the scene inputs that coordinates with an estimator reach.
+
+    Of the interior adjoint, only those that it differentiates correctly count.
+    """
+    reached: frozenset[str] = frozenset()
+    for group in renderer.plan.having(estimator):
+        reached |= renderer.routes.get(group.name, frozenset())
+    return reached & renderer.scene.interior if estimator == "adjoint" else reached
 
 
 class _Differences(torch.autograd.Function):
-    """The identity on the picture; its backward pass adds the derivative of coordinates
-    that use differences.
-    """
+    """The identity on the image, with the derivative by differences in addition."""
 
     @staticmethod
     def forward(
@@ -734,7 +789,6 @@ class _Differences(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        derivative = ctx.renderer.differences(
-            *ctx.saved_tensors, cotangent, ctx.seed, ctx.spp
-        )
+        (u,) = ctx.saved_tensors
+        derivative = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
         return None, None, None, derivative, cotangent

@@ -1,12 +1,13 @@
-"""The parts that a mesh's surface is counted by: the cells of a map, and its faces.
+"""Divide a mesh's surface into parts that can be counted: cells of a map, and faces.
 
 The map is that of the mesh's own texture coordinates, cut into cells. Where these
-cannot tell places of the surface apart (charts lie on each other, faces without area),
+cannot tell points of the surface apart (charts lie on each other, faces without area),
 the mesh is unwrapped anew for it, with xatlas.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,13 @@ from scipy.sparse import coo_array
 
 from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors, grouped
 from advsearch.scene.importing.geometry import Soup, connected, neighbours, unit_vectors
-from advsearch.scene.raster import doubled_areas, pixels_in, rasterised, weights_at
+from advsearch.scene.raster import (
+    Charts,
+    doubled_areas,
+    pixels_in,
+    rasterised,
+    weights_at,
+)
 
 ATLAS_SIZE = 512
 # texels between charts in an atlas of `ATLAS_SIZE`: two in a texture of half that size
@@ -27,8 +34,8 @@ _FLUSH = 1.0 - 1.5e-4
 _PLANE = np.cos(np.radians(10.0))
 # faces that xatlas gets at a time, about; its time grows faster than their number
 _MANY = 20_000
-_LARGE = 200_000  # faces of a mesh from which on that is felt
-_PIECE = 1_500  # faces that xatlas then gets at a time, at most
+_LARGE = 200_000  # faces of a mesh above which that matters
+_PIECE = 1_500  # largest number of faces that xatlas then gets at a time
 # more are no surface but a heap of faces, and xatlas would take minutes over them
 _MOST_PATCHES = 10_000
 # rounds of averaging normals, so that noise does not fray the borders of patches
@@ -36,26 +43,47 @@ _SMOOTHING = 10
 
 
 def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
-    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit
-    square; deterministic. Faces with different numbers in `apart` (F,) get charts of
-    their own. The faces of a mesh in very many pieces become triangles of one size,
-    side by side in a grid.
+    """Return a soup with texture coordinates from xatlas; deterministic.
+
+    The charts do not overlap and lie inside the unit square. The faces of a mesh in
+    very many pieces become triangles of one size, side by side in a grid.
+
+    Args:
+        soup: the faces.
+        apart: (F,) faces with different numbers get charts of their own.
     """
-    patch = _patches(soup)
+    patch = _find_patches(soup)
     if apart is not None:
-        patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[
-            1
-        ].reshape(-1)
-    if int(patch.max()) >= _MOST_PATCHES:  # two faces to each cell of a grid
-        count = len(soup.faces)
-        columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
-        cell = np.arange(count) // 2
-        corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
-        half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
-        inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
-        return replace(soup, uvs=np.asarray((corner + inside) / columns))
+        pairs = patch * (int(apart.max()) + 1) + apart
+        patch = np.unique(pairs, return_inverse=True)[1].reshape(-1)
+    if int(patch.max()) >= _MOST_PATCHES:
+        return replace(soup, uvs=_grid_uvs(len(soup.faces)))
     groups = grouped(patch)
-    for size in (ATLAS_SIZE, 0):  # 0: one atlas, however large
+    atlas = _generate_atlas(soup, groups)
+    uvs = np.empty((len(soup.faces), 3, 2))
+    for index, group in enumerate(groups):
+        _, corners, atlas_uvs = atlas[index]
+        uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
+    # look-ups repeat at the border, where xatlas leaves no gap
+    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
+    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
+
+
+def _grid_uvs(count: int) -> Doubles:
+    """Return texture coordinates (count, 3, 2): two faces in each cell of a grid."""
+    n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
+    face = np.arange(count)
+    cell = face // 2
+    cell_corner = np.stack([cell % n_columns, cell // n_columns], axis=1)[:, None, :]
+    lower_half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
+    is_lower = (face % 2 == 0)[:, None, None]
+    in_cell = np.where(is_lower, lower_half, 1.0 - lower_half)
+    return np.asarray((cell_corner + in_cell) / n_columns)
+
+
+def _generate_atlas(soup: Soup, groups: Sequence[Ints]) -> xatlas.Atlas:
+    """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it."""
+    for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
         for group in groups:
             used, corners = np.unique(soup.faces[group], return_inverse=True)
@@ -64,165 +92,161 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
                 corners.reshape(-1, 3).astype(np.uint32),
             )
         options = xatlas.PackOptions()
-        options.resolution = size
+        options.resolution = resolution
         options.padding = ATLAS_PADDING
         atlas.generate(xatlas.ChartOptions(), options)
         if atlas.atlas_count == 1:
             break
-    result = np.empty((len(soup.faces), 3, 2))
-    for number, group in enumerate(groups):
-        _, corners, uvs = atlas[number]
-        result[group] = np.asarray(uvs, dtype=np.float64)[np.asarray(corners)]
-    # lookups repeat at the border, where xatlas keeps nothing apart
-    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
-    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(result, 0.0, 1.0))
+    return atlas
 
 
-def _patches(soup: Soup) -> Ints:
-    """Cut a mesh that xatlas cannot unwrap well in one piece; return the patch of each
-    face (F,), numbered from 0.
+def _find_patches(soup: Soup) -> Ints:
+    """Cut a mesh that xatlas cannot unwrap well in one piece.
 
     xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely
-    tessellated smooth surface that goes on from face to face around the whole object,
+    tessellated smooth surface that goes on from face to face around the full object,
     which is then flattened like a sheet of paper; where a closed surface leaves no
     border, the process crashes. Such meshes, and large ones for the sake of speed, are
     cut where the surface turns from one of 14 directions to another.
+
+    Returns:
+        The patch of each face (F,), numbered from 0.
     """
-    unit: Doubles = unit_vectors(soup.face_vectors())
+    normals: Doubles = unit_vectors(soup.face_vectors())
+    count = len(normals)
     left, right, _ = neighbours(soup.faces)
-    f = left // 3
-    g = right // 3
-    flush = (unit[f] * unit[g]).sum(axis=1) > _FLUSH
-    plane = connected(len(unit), f[flush], g[flush])
-    mean: Doubles = np.stack([np.bincount(plane, unit[:, k]) for k in range(3)], axis=1)
-    straight = (unit * unit_vectors(mean)[plane]).sum(axis=1) > _PLANE
-    if straight.all() and len(unit) <= _MANY:
-        return np.zeros(len(unit), dtype=np.int64)
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(
-        -1, 3
-    ) / np.sqrt(3.0)
-    own = np.arange(len(unit))
-    links = np.concatenate([f, g, own]), np.concatenate([g, f, own])
-    average = coo_array(
-        (np.ones(len(links[0])), links), shape=(len(unit), len(unit))
-    ).tocsr()
-    smoothed = unit
-    for _ in range(_SMOOTHING):  # the normals of faces with their neighbours'
-        smoothed = np.nan_to_num(unit_vectors(average @ smoothed))
-    facing = smoothed @ np.concatenate([axes, corners]).T
-    direction = facing.argmax(axis=1)
-    same = direction[f] == direction[g]
-    patch = connected(len(unit), f[same], g[same])
-    if len(unit) <= _LARGE:
+    face = left // 3
+    neighbour = right // 3
+    is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _FLUSH
+    plane = connected(count, face[is_flush], neighbour[is_flush])
+    plane_sums: Doubles = np.stack(
+        [np.bincount(plane, normals[:, axis]) for axis in range(3)], axis=1
+    )
+    plane_normals = unit_vectors(plane_sums)[plane]
+    is_straight = (normals * plane_normals).sum(axis=1) > _PLANE
+    if is_straight.all() and count <= _MANY:
+        return np.zeros(count, dtype=np.int64)
+
+    smoothed = _smooth_normals(normals, face, neighbour)
+    direction = (smoothed @ _cut_directions().T).argmax(axis=1)
+    is_same = direction[face] == direction[neighbour]
+    patch = connected(count, face[is_same], neighbour[is_same])
+    if count <= _LARGE:
         return patch
-    cell = _cells(soup.points[soup.faces].mean(axis=1), patch)
-    near = same & (cell[f] == cell[g])
-    return connected(len(unit), f[near], g[near])
+    cell = _halve_patches(soup.points[soup.faces].mean(axis=1), patch)
+    is_same &= cell[face] == cell[neighbour]
+    return connected(count, face[is_same], neighbour[is_same])
 
 
-def _cells(middles: Doubles, patch: Ints) -> Ints:
-    """Halve patches (F,) until they are small; return the cell (F,) of each face, whose
-    middles are (F, 3).
+def _smooth_normals(normals: Doubles, face: Ints, neighbour: Ints) -> Doubles:
+    """Average the normals of faces with their neighbours', in several rounds."""
+    count = len(normals)
+    itself = np.arange(count)
+    rows = np.concatenate([face, neighbour, itself])
+    columns = np.concatenate([neighbour, face, itself])
+    average = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    average = average.tocsr()
+    smoothed = normals
+    for _ in range(_SMOOTHING):
+        smoothed = np.nan_to_num(unit_vectors(average @ smoothed))
+    return smoothed
+
+
+def _cut_directions() -> Doubles:
+    """Return the 14 unit directions of a cube's faces and corners."""
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    return np.concatenate([faces, corners / np.sqrt(3.0)])
+
+
+def _halve_patches(centers: Doubles, patch: Ints) -> Ints:
+    """Halve patches (F,) until they are small.
+
+    Returns:
+        The cell (F,) of each face; faces have centers (F, 3).
     """
     cell = np.zeros(len(patch), dtype=np.int64)
     count = 0
-    left = grouped(patch)
-    while left:
-        group = left.pop()
+    remaining = grouped(patch)
+    while remaining:
+        group = remaining.pop()
         if len(group) > _PIECE:
-            axis = np.ptp(middles[group], axis=0).argmax()
-            order = group[np.argsort(middles[group, axis], kind="stable")]
-            left += [order[: len(order) // 2], order[len(order) // 2 :]]
+            axis = np.ptp(centers[group], axis=0).argmax()
+            order = group[np.argsort(centers[group, axis], kind="stable")]
+            middle = len(order) // 2
+            remaining += [order[:middle], order[middle:]]
         else:
-            cell[group], count = count, count + 1
+            cell[group] = count
+            count += 1
     return cell
 
 
 CELLS = 64  # cells along each side of the map
-# of a mesh, which are counted one by one; smaller ones are not told apart in a picture
+# of a mesh, which are counted one by one; smaller ones cannot be distinguished in an
+# image
 MOST_FACES = 20_000
-# share of the map that charts may cover twice before the mesh is unwrapped anew
+# fraction of the map that charts may cover twice before the mesh is unwrapped anew
 DOUBLED = 0.01
-FLAT = 0.05  # share of the surface that may have no area on the map, likewise
-COVERED = 0.02  # share of the unit square that charts have to cover, likewise
-_FINE = 256  # side of the raster in which charts are looked at
+FLAT = 0.05  # fraction of the surface that may have no area on the map, likewise
+COVERED = 0.02  # fraction of the unit square that charts have to cover, likewise
+_FINE = 256  # width of the raster in which charts are compared
 
 
 class SurfaceParts:
-    """The cells and the faces of a mesh with texture coordinates of whatever kind."""
+    """The parts of a mesh's surface: the cells of a map, and its faces.
+
+    Attributes:
+        mesh: with texture coordinates of any kind.
+        unwrapped: whether the map is not that of the mesh's own texture coordinates.
+        corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the
+            bottom.
+        by_face: whether the faces are parts too.
+        count: number of parts: cells, row by row from v = 1, and then the faces.
+        covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
+        face: (count,) the face at the center of each part; of a cell outside of all
+            charts the nearest one.
+        place: (count, 3) that center, in the mesh's coordinates.
+        at: (count, 2) and its u and v.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._own = mesh.uvs[mesh.faces].astype(np.float64)
-        # whether the map is another one than that of its own texture coordinates
-        self.unwrapped = not _tells_apart(mesh, self._own)
-        # (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the bottom
-        self.corners = self._own
-        if self.unwrapped:
-            low = mesh.vertices.min(axis=0)
-            high = mesh.vertices.max(axis=0)
-            points = (mesh.vertices - low).astype(np.float64) / max(
-                float((high - low).max()), 1e-12
-            )
-            welded, number = np.unique(points, axis=0, return_inverse=True)
-            corners = number.reshape(-1)[mesh.faces.astype(np.int64)]
-            unknown = np.full((len(corners), 3, 3), np.nan)
-            part = np.zeros(len(corners), np.int64)
-            self.corners = unwrapped(
-                Soup(
-                    welded,
-                    corners,
-                    part,
-                    unknown,
-                    unknown[..., :2],
-                    np.ones_like(unknown),
-                )
-            ).uvs
-        own = mesh.faces.reshape(-1)
-        apart = np.arange(len(own), dtype=np.uint32).reshape(-1, 3)
-        uvs = self.corners.reshape(-1, 2).astype(np.float32)
-        charts = rasterised(
-            Mesh(mesh.vertices[own], apart, mesh.normals[own], uvs), CELLS
-        )
-        self.by_face = len(mesh.faces) <= MOST_FACES  # whether the faces are parts too
+        self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
+        self.unwrapped = not _is_one_to_one(mesh, self._mesh_uvs)
+        self.corners = _unwrap_mesh(mesh) if self.unwrapped else self._mesh_uvs
+        charts = _rasterise_map(mesh, self.corners)
+        self.by_face = len(mesh.faces) <= MOST_FACES
         faces = np.arange(len(mesh.faces) if self.by_face else 0)
-        # of the parts: cells, row by row from v = 1, and then the faces
         self.count = CELLS * CELLS + len(faces)
-        # (CELLS, CELLS) whether the middle of a cell lies in a chart
         self.covered = charts.covered
-        middles = mesh.vertices[mesh.faces[faces]].mean(axis=1)
-        # the face in the middle of each part (count,), of a cell beside all charts the
-        # nearest one; that middle (count, 3), in the mesh's coordinates; and its u and
-        # v (count, 2)
         self.face = np.concatenate([charts.face.reshape(-1), faces])
-        self.place = np.concatenate(
-            [charts.positions().reshape(-1, 3), middles]
-        ).astype(np.float64)
+        face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
+        centers = np.concatenate([charts.positions().reshape(-1, 3), face_centers])
+        self.place = centers.astype(np.float64)
         row, column = np.divmod(np.arange(CELLS * CELLS), CELLS)
-        cells = np.stack([(column + 0.5) / CELLS, 1.0 - (row + 0.5) / CELLS], axis=1)
-        self.at = np.concatenate([cells, self.corners[faces].mean(axis=1)])
+        cell_uvs = np.stack([(column + 0.5) / CELLS, 1.0 - (row + 0.5) / CELLS], axis=1)
+        self.at = np.concatenate([cell_uvs, self.corners[faces].mean(axis=1)])
 
     @property
     def kinds(self) -> dict[str, slice]:
         """Which of the parts are cells, and which are faces."""
-        cells = {"cell": slice(0, CELLS * CELLS)}
-        return (
-            {**cells, "face": slice(CELLS * CELLS, self.count)}
-            if self.by_face
-            else cells
-        )
+        kinds = {"cell": slice(0, CELLS * CELLS)}
+        if self.by_face:
+            kinds["face"] = slice(CELLS * CELLS, self.count)
+        return kinds
 
     def cells(self, face: Ints, uv: Doubles) -> Ints:
-        """Return the cells (n,) of places on faces (n,), at the mesh's own texture
-        coordinates (n, 2).
+        """Return the cells (n,) of points on faces.
+
+        Args:
+            face: (n,) index of the face.
+            uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.unwrapped:
             # rows run along v here
-            weights = weights_at(self._own[face], uv[:, 1], uv[:, 0])
-            weights = np.clip(
-                np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3), 0.0, 1.0
-            )
+            weights = weights_at(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
+            weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
+            weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.corners[face])
         cells = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * CELLS)
@@ -230,14 +254,46 @@ class SurfaceParts:
         return np.asarray(row * CELLS + column)
 
 
-def _tells_apart(mesh: Mesh, uvs: Doubles) -> bool:
+def _unwrap_mesh(mesh: Mesh) -> Doubles:
+    """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap."""
+    lower = mesh.vertices.min(axis=0)
+    upper = mesh.vertices.max(axis=0)
+    extent = max(float((upper - lower).max()), 1e-12)
+    points = (mesh.vertices - lower).astype(np.float64) / extent
+    unique_points, index = np.unique(points, axis=0, return_inverse=True)
+    corners = index.reshape(-1)[mesh.faces.astype(np.int64)]
+    unknown = np.full((len(corners), 3, 3), np.nan)
+    part = np.zeros(len(corners), np.int64)
+    soup = Soup(
+        unique_points,
+        corners,
+        part,
+        unknown,
+        unknown[..., :2],
+        np.ones_like(unknown),
+    )
+    return unwrapped(soup).uvs
+
+
+def _rasterise_map(mesh: Mesh, uvs: Doubles) -> Charts:
+    """Rasterise texture coordinates (F, 3, 2) of a mesh's faces into the map's cells."""
+    vertex = mesh.faces.reshape(-1)
+    faces = np.arange(len(vertex), dtype=np.uint32).reshape(-1, 3)
+    flat_uvs = uvs.reshape(-1, 2).astype(np.float32)
+    separate = Mesh(mesh.vertices[vertex], faces, mesh.normals[vertex], flat_uvs)
+    return rasterised(separate, CELLS)
+
+
+def _is_one_to_one(mesh: Mesh, uvs: Doubles) -> bool:
+    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart."""
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
-    surface = np.linalg.norm(
-        face_vectors(mesh.vertices[mesh.faces].astype(np.float64)), axis=1
-    )
-    if surface[np.abs(doubled_areas(uvs)) < 1e-12].sum() > FLAT * surface.sum():
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    areas = np.linalg.norm(face_vectors(corners), axis=1)
+    is_flat = np.abs(doubled_areas(uvs)) < 1e-12
+    if areas[is_flat].sum() > FLAT * areas.sum():
         return False
     _, row, column, _ = pixels_in(uvs * _FINE - 0.5, (_FINE, _FINE), tolerance=-1e-6)
     covered = len(np.unique(row * _FINE + column))
-    return covered >= COVERED * _FINE**2 and len(row) - covered <= DOUBLED * covered
+    doubled = len(row) - covered
+    return covered >= COVERED * _FINE**2 and doubled <= DOUBLED * covered

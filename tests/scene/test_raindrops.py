@@ -75,7 +75,7 @@ def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     u, v, lens = random.random(600), random.random(600), random.random((600, 2))
     place, sample = mi.Point2f(u, v), mi.Point2f(lens[:, 0], lens[:, 1])
     ray, weight = sensor.sample_ray(0.0, 0.5, place, sample)
-    clear, _ = sensor.without_drops(0.0, place)
+    clear, _ = sensor.sample_ray_without_drops(0.0, place)
     to_camera = np.array(sensor.world_transform().matrix).reshape(4, 4)[:3, :3].T
     shift = APERTURE * np.array(mi.warp.square_to_uniform_disk_concentric(sample)).T
     ours, before = (np.array(one.d).T @ to_camera.T for one in (ray, clear))

@@ -25,7 +25,7 @@ from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.surface.arrangement import product
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
 
-ONCE = {"_Radiance", "_Differences", "_Once"}
+ONCE = {"_Radiance", "_Differences", "_OnceDifferentiable"}
 """They refuse a second derivative (`tests/scene/test_renderer.py`)."""
 
 ROUNDED = 2e-3
@@ -54,7 +54,7 @@ def transport() -> Callable[[Tensor], Tensor]:
 
 
 OPERATIONS = {"_Solve": [solved], "LinearMap": [sparse, transport]}
-CURVES = {"_Shown", "_Recomputed"}
+CURVES = {"_SrgbDisplay", "_Recomputed"}
 """Not linear: the tests at the end have them."""
 
 

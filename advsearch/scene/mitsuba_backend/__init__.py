@@ -1,3 +1,1 @@
-"""The one place with Mitsuba's names: variant, libLLVM, dictionary, plugins, scene,
-denoiser.
-"""
+"""Everything that knows Mitsuba: variant, libLLVM, plugins, scene, denoiser."""

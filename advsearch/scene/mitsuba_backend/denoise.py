@@ -1,10 +1,9 @@
-"""Intel Open Image Denoise on the CPU, guided by albedo and shading normals (package
-`mitsuba-oidn`).
+"""Denoise radiance with Intel Open Image Denoise on the CPU (package `mitsuba-oidn`).
 
-Deterministic: the same input gives the same bytes, at any number of threads. It needs
-pixels with independent noise, hence the box filter. A search treats it as the identity
-when it differentiates; that is an approximation, and differences of pictures include it
-exactly.
+It is guided by albedo and shading normals. It is deterministic: the same input gives
+the same bytes, at any number of threads. It needs pixels with independent noise, hence
+the box filter. A search treats it as the identity when it differentiates; that is an
+approximation, and differences of images include it exactly.
 """
 
 from __future__ import annotations
@@ -17,16 +16,14 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
+from advsearch.scene.assets import Ints
 from advsearch.scene.mitsuba_backend.variant import one_at_a_time
 
-# mean logarithmic luminance of a picture as the network sees it (as in Open Image
-# Denoise's `autoexposure`)
-KEY = 0.18
-# pixels along a side of the squares that are averaged, and the least luminance;
-# likewise
-BIN = 16
-DARKEST = 1e-8
-# of red, green and blue (ITU-R BT.709); likewise
+# All four as in Open Image Denoise's `autoexposure`.
+KEY = 0.18  # mean logarithmic luminance of the network's input
+BIN = 16  # width in pixels of the squares that are averaged
+DARKEST = 1e-8  # luminance below which a square does not count
+# luminance of red, green and blue (ITU-R BT.709)
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 
 
@@ -46,28 +43,25 @@ def denoise(
     """
     with one_at_a_time:
         try:
-            # not before `mitsuba()`, which sees to libLLVM
+            # not before `mitsuba()`, which chooses libLLVM
             import mitsuba_oidn
         except ImportError as error:
             raise EnvironmentSetupError(
                 f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, "
                 "or use `denoise=none`"
             ) from error
-        color, guide, direction, output = _buffers(
-            (radiance.shape[0], radiance.shape[1]), threading.get_ident()
-        )
+        resolution = (radiance.shape[0], radiance.shape[1])
+        buffers = _buffers(resolution, threading.get_ident())
+        color_buffer, albedo_buffer, normal_buffer, output = buffers
         gain = _gain(radiance.detach())
-        for buffer, image in (
-            (color, radiance.detach() * gain),
-            (guide, albedo),
-            (direction, normal),
-        ):
-            buffer.copy_(image.detach())
+        color_buffer.copy_(radiance.detach() * gain)
+        albedo_buffer.copy_(albedo.detach())
+        normal_buffer.copy_(normal.detach())
         quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
         mitsuba_oidn.denoise(
-            color,
-            guide,
-            direction,
+            color_buffer,
+            albedo_buffer,
+            normal_buffer,
             hdr=True,
             quality=quality,
             input_scale=1.0,
@@ -78,29 +72,36 @@ def denoise(
 
 @lru_cache(maxsize=8)
 def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
-    """Return what pictures of a size are denoised in, in a thread: the filter is set up
-    anew, for longer than it takes to run, whenever it is given other memory.
+    """Return the buffers in which images of a size are denoised, in a thread.
+
+    With other memory the filter would be set up anew, which takes longer than to run
+    it.
     """
     return [torch.zeros(*resolution, 3) for _ in range(4)]
 
 
 def _gain(radiance: Tensor) -> float:
-    """Return the factor that gives a picture (H, W, 3) the mean logarithmic luminance
-    `KEY`.
+    """Return the factor that gives an image the mean logarithmic luminance `KEY`.
 
     The denoiser would find it by itself, but adds up in an order that depends on the
-    number of threads: by a few units in the last place.
+    number of threads: by a few units in the last place. The image is (H, W, 3).
     """
     luminance = (radiance.cpu().numpy() * LUMINANCE).sum(axis=-1)
-    starts = [
-        np.arange(-(-side // BIN)) * side // -(-side // BIN) for side in luminance.shape
-    ]
-    rows, columns = (
-        np.diff(first, append=side)
-        for first, side in zip(starts, luminance.shape, strict=True)
-    )
-    means = np.add.reduceat(
-        np.add.reduceat(luminance, starts[0], axis=0), starts[1], axis=1
-    ) / np.outer(rows, columns)
+    height, width = luminance.shape
+    row_starts = _bin_starts(height)
+    column_starts = _bin_starts(width)
+    row_counts = np.diff(row_starts, append=height)
+    column_counts = np.diff(column_starts, append=width)
+    row_sums = np.add.reduceat(luminance, row_starts, axis=0)
+    sums = np.add.reduceat(row_sums, column_starts, axis=1)
+    means = sums / np.outer(row_counts, column_counts)
     means = means[means > DARKEST]
-    return float(KEY / np.exp2(np.log2(means).mean())) if means.size else 1.0
+    if not means.size:
+        return 1.0
+    return float(KEY / np.exp2(np.log2(means).mean()))
+
+
+def _bin_starts(size: int) -> Ints:
+    """Return where the squares of `BIN` pixels begin along a side of an image."""
+    n_bins = -(-size // BIN)
+    return np.arange(n_bins) * size // n_bins

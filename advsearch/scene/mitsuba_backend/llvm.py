@@ -34,13 +34,21 @@ from advsearch.trust.code import OWN_FOLDER
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
-    "usr/lib/*/libLLVM*.so*", "usr/lib/libLLVM*.so*", "usr/lib/llvm*/lib/libLLVM*.so*", "usr/lib64/libLLVM*.so*",
-    "usr/lib64/llvm*/lib*/libLLVM*.so*", "usr/local/lib/libLLVM*.so*", "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
-    "usr/local/opt/llvm*/lib/libLLVM*.dylib", "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
+    "usr/lib/*/libLLVM*.so*",
+    "usr/lib/libLLVM*.so*",
+    "usr/lib/llvm*/lib/libLLVM*.so*",
+    "usr/lib64/libLLVM*.so*",
+    "usr/lib64/llvm*/lib*/libLLVM*.so*",
+    "usr/local/lib/libLLVM*.so*",
+    "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "usr/local/opt/llvm*/lib/libLLVM*.dylib",
+    "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
     "Program Files/LLVM/bin/LLVM-C.dll",
-)  # fmt: skip
-"""Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows
-installer put the file.
+)
+"""Where packages put the file.
+
+They are those of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows
+installer.
 """
 _NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
 _NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
@@ -56,45 +64,42 @@ Version = tuple[int, ...]
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file, its version, major first, or (), and why Dr.Jit cannot use it
-    (empty if it can).
-    """
+    """A libLLVM file."""
 
     path: Path
-    version: Version
-    refused: str = ""
+    version: Version  # major first, or ()
+    refused: str = ""  # why Dr.Jit cannot use it; empty if it can
 
     def __str__(self) -> str:
         version = ".".join(map(str, self.version)) or "version unknown"
-        return f"{self.path} ({version}{': ' + self.refused if self.refused else ''})"
+        reason = f": {self.refused}" if self.refused else ""
+        return f"{self.path} ({version}{reason})"
 
 
 def find(
     root: Path = Path("/"), environ: Mapping[str, str] = os.environ
 ) -> list[LibraryFile]:
-    """Every libLLVM of this machine, usable ones first, each group newest first;
-    `DRJIT_LIBLLVM_PATH` is not looked at. Tests give another root of the file system;
-    ``CONDA_PREFIX`` is read from `environ`.
+    """Find every libLLVM of this machine.
+
+    `DRJIT_LIBLLVM_PATH` is not read. Tests give another root of the file system.
+
+    Args:
+        root: of the file system.
+        environ: environment variables, of which ``CONDA_PREFIX`` is read.
+
+    Returns:
+        Usable files first, each group newest first.
     """
-    patterns = list(_PATTERNS)
-    if prefix := environ.get("CONDA_PREFIX", ""):  # an active conda environment
-        inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
-        for folder in (f"{inside}/lib", f"{inside}/Library/bin"):
-            patterns += [
-                f"{folder}/{name}"
-                for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
-            ]
-    paths = [
-        path
-        for pattern in patterns
-        for path in root.glob(pattern)
-        if _NAME.fullmatch(path.name)
-    ]
+    patterns = [*_PATTERNS, *_conda_patterns(environ.get("CONDA_PREFIX", ""))]
+    paths: list[Path] = []
+    for pattern in patterns:
+        matches = root.glob(pattern)
+        paths += [path for path in matches if _NAME.fullmatch(path.name)]
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         paths.append(Path(library))
-    links = {path.resolve(): path for path in paths if path.is_file()}
-    candidates = [examine(path, name_hint=link) for path, link in links.items()]
+    link_of_file = {path.resolve(): path for path in paths if path.is_file()}
+    candidates = [examine(path, name_hint=link) for path, link in link_of_file.items()]
     return sorted(
         candidates,
         key=lambda candidate: (not candidate.refused, candidate.version),
@@ -102,96 +107,126 @@ def find(
     )
 
 
+def _conda_patterns(prefix: str) -> list[str]:
+    """Return patterns for an active conda environment, relative to the root."""
+    if not prefix:
+        return []
+    relative = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
+    names = ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
+    directories = (f"{relative}/lib", f"{relative}/Library/bin")
+    return [f"{directory}/{name}" for directory in directories for name in names]
+
+
 def examine(path: Path, *, name_hint: Path) -> LibraryFile:
-    """Say which version a libLLVM file is, symbolic links resolved, from its name, else
-    from that of the link through which it was found, or else by asking it; and whether
-    Dr.Jit can use it.
+    """Find out the version of a libLLVM file, and whether Dr.Jit can use it.
+
+    The version is in its name, or in that of the link through which it was found;
+    otherwise the library is loaded.
+
+    Args:
+        path: of the file, symbolic links resolved.
+        name_hint: the link through which it was found.
     """
-    own = own_elf_header()
-    head = b""
+    interpreter_header = own_elf_header()
+    header = b""
     try:
         with path.open("rb") as file:
-            head = file.read(20)
+            header = file.read(20)
     except OSError as error:
         return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
-    if own and (head[:4] != b"\x7fELF" or len(head) < 20):
+    if interpreter_header and (header[:4] != b"\x7fELF" or len(header) < 20):
         return LibraryFile(path, (), "it is not a shared library")
-    if own and (head[4:6], head[18:20]) != (own[4:6], own[18:20]):
+    # word size and byte order, and the processor
+    if interpreter_header and (header[4:6], header[18:20]) != (
+        interpreter_header[4:6],
+        interpreter_header[18:20],
+    ):
         return LibraryFile(path, (), "it is for another processor")
     version = version_in(path) or version_in(name_hint) or asked_version(str(path))
     return LibraryFile(path, version, refusal(version))
 
 
 def refusal(version: Version) -> str:
-    """Why Dr.Jit cannot use this version of LLVM; empty when it can."""
+    """Return why Dr.Jit cannot use this version of LLVM; empty if it can."""
     if not version:
         return "it does not tell its version, so it is older than 16 or not LLVM"
     if version[0] < 15:
         return "Dr.Jit refuses versions below 15"
-    return "it aborts the process at the first render" if version[0] < MINIMUM else ""
+    if version[0] < MINIMUM:
+        return "it aborts the process at the first render"
+    return ""
 
 
 def version_in(path: Path) -> Version:
-    """The version in a path like ``libLLVM-19.so.1``, ``libLLVM.so.19.1``,
-    ``llvm/19.1.7/lib/libLLVM.dylib``; or ().
+    """Return the version that a path has, or ().
+
+    Such paths are ``libLLVM-19.so.1``, ``libLLVM.so.19.1`` and
+    ``llvm/19.1.7/lib/libLLVM.dylib``.
     """
-    match = _NAME_VERSION.match(path.name) or _FOLDER_VERSION.search(
-        path.parent.as_posix()
-    )
-    return tuple(int(part) for part in match[1].split(".")) if match else ()
+    directory = path.parent.as_posix()
+    match = _NAME_VERSION.match(path.name) or _FOLDER_VERSION.search(directory)
+    if match is None:
+        return ()
+    return tuple(int(number) for number in match[1].split("."))
 
 
 @functools.cache
 def ensure_llvm() -> LibraryFile:
-    """Choose a libLLVM and name it in ``DRJIT_LIBLLVM_PATH``, which Dr.Jit reads when
-    it is imported.
+    """Choose a libLLVM and set ``DRJIT_LIBLLVM_PATH`` to it for Dr.Jit.
 
-    A file that the variable names already wins, whatever else there is. Call it before
-    the first import of Mitsuba.
+    Dr.Jit reads the variable when it is imported. A file that the variable
+    names already wins, whatever else there is. Call it before the first import of
+    Mitsuba.
 
     Raises:
         EnvironmentSetupError: there is no usable file, or the one that the variable
             names is not usable; the message lists what was found and the command that
             installs a good one.
     """
-    named = os.environ.get(VARIABLE, "")
-    if not named:
-        chosen = newest(find())
-        os.environ[VARIABLE] = str(chosen.path)
-        return chosen
-    path = Path(named)
-    correct = "Correct it, or unset it to let advsearch look for one."
+    variable = os.environ.get(VARIABLE, "")
+    if not variable:
+        library = newest(find())
+        os.environ[VARIABLE] = str(library.path)
+        return library
+    path = Path(variable)
+    advice = "Correct it, or unset it to let advsearch look for one."
     # the dynamic loader looks it up; only the library itself knows its version
-    if os.sep not in named:
-        version = asked_version(named)
-        chosen = LibraryFile(path, version, refusal(version))
+    if os.sep not in variable:
+        version = asked_version(variable)
+        library = LibraryFile(path, version, refusal(version))
     elif path.is_file():
-        chosen = examine(path.resolve(), name_hint=path)
+        library = examine(path.resolve(), name_hint=path)
     else:
         raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM file, got {named!r}, which does not "
-            f"exist. {correct}"
+            f"{VARIABLE}: expected a libLLVM file, got {variable!r}, which does not "
+            f"exist. {advice}"
         )
-    if chosen.refused:
+    if library.refused:
         raise EnvironmentSetupError(
             f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got "
-            f"{chosen}. {correct}"
+            f"{library}. {advice}"
         )
-    return replace(chosen, path=path)
+    return replace(library, path=path)
 
 
 def install_command(
     release: Mapping[str, str] | None = None, system: str = sys.platform
 ) -> str:
-    """The command that installs a good libLLVM here, or a line for each platform; None
-    reads ``/etc/os-release``.
+    """Return the command that installs a good libLLVM here.
+
+    It is a line for each platform if this one is not known.
+
+    Args:
+        release: what identifies the Linux distribution; None reads ``/etc/os-release``.
+        system: as `sys.platform`.
     """
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
-        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19", "Fedora": f"{sudo}dnf install llvm-libs",
-        "Homebrew": "brew install llvm", "conda": "conda install -c conda-forge "
-                                                  "libllvm19",
-    }  # fmt: skip
+        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
+        "Fedora": f"{sudo}dnf install llvm-libs",
+        "Homebrew": "brew install llvm",
+        "conda": "conda install -c conda-forge libllvm19",
+    }
     if os.environ.get("CONDA_PREFIX"):
         return commands["conda"]
     if system == "darwin":
@@ -201,20 +236,23 @@ def install_command(
             release = platform.freedesktop_os_release()
     release = release or {}
     ids = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
-    if "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", release.get("VERSION_ID", "")):
+    version = release.get("VERSION_ID", "")
+    if "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", version):
         return commands["conda"]  # its own packages end with LLVM 15
-    for name, known in (
-        ("Debian, Ubuntu", {"debian", "ubuntu"}),
-        ("Fedora", {"fedora", "rhel"}),
-    ):
-        if known & ids:
-            return commands[name]
+    if ids & {"debian", "ubuntu"}:
+        return commands["Debian, Ubuntu"]
+    if ids & {"fedora", "rhel"}:
+        return commands["Fedora"]
     return "\n".join(f"  {name}: {command}" for name, command in commands.items())
 
 
 def newest(candidates: list[LibraryFile]) -> LibraryFile:
-    """The first usable candidate that can be loaded."""
-    refused = [str(candidate) for candidate in candidates if candidate.refused]
+    """Return the first usable candidate that can be loaded.
+
+    Raises:
+        EnvironmentSetupError: there is none.
+    """
+    rejected = [str(candidate) for candidate in candidates if candidate.refused]
     for candidate in candidates:
         if candidate.refused:
             continue
@@ -222,52 +260,49 @@ def newest(candidates: list[LibraryFile]) -> LibraryFile:
             # Dr.Jit loads the same file next, so this costs nothing
             ctypes.CDLL(str(candidate.path))
         except OSError as error:
-            refused.append(f"{candidate.path} (cannot be loaded: {error})")
+            rejected.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
             return candidate
-    there = "Found: " + "; ".join(refused) + "." if refused else "Found none."
+    found = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
     command = install_command()
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
         f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles "
-        f"its kernels. {there} "
+        f"its kernels. {found} "
         f"Install one with:{separator}{command}{separator}or name a file in {VARIABLE}."
     )
 
 
 @functools.cache
 def own_elf_header() -> bytes:
-    """The first bytes of this interpreter's own file: word size, byte order, processor;
-    empty if it is not ELF.
+    """Return the first bytes of this interpreter's file; empty if it is not ELF.
+
+    They have word size, byte order and processor.
     """
     try:
         with open(sys.executable, "rb") as file:
-            head = file.read(20)
+            header = file.read(20)
     except OSError:
         return b""
-    return head if head[:4] == b"\x7fELF" else b""
+    return header if header[:4] == b"\x7fELF" else b""
 
 
 def asked_version(library: str) -> Version:
-    """Load a library in another process, which a bad one may take down, and ask for its
-    version; () if it has none.
+    """Return the version that a library reports, or () if it reports none.
+
+    It is loaded in another process, which a bad one may take down.
     """
-    command = [
-        sys.executable,
-        "-c",
-        _PROBE,
-        os.path.abspath(library) if os.sep in library else library,
-    ]
+    path = os.path.abspath(library) if os.sep in library else library
     try:
-        printed = subprocess.run(
-            command,
+        output = subprocess.run(
+            [sys.executable, "-c", _PROBE, path],
             capture_output=True,
             text=True,
             timeout=30,
             check=True,
             cwd=OWN_FOLDER,
         ).stdout
-        return tuple(int(part) for part in printed.split())
+        return tuple(int(number) for number in output.split())
     except (OSError, subprocess.SubprocessError, ValueError):
         return ()
 
@@ -275,11 +310,11 @@ def asked_version(library: str) -> Version:
 def main() -> int:
     """Print the libLLVM that advsearch will use, or why there is none (status 3)."""
     try:
-        chosen = ensure_llvm()
+        library = ensure_llvm()
     except AdvsearchError as error:
         print(f"advsearch: {error}", file=sys.stderr)
         return 3
-    print(f"{'.'.join(map(str, chosen.version))} ({chosen.path})")
+    print(f"{'.'.join(map(str, library.version))} ({library.path})")
     return 0
 
 

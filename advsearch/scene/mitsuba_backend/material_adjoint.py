@@ -1,29 +1,29 @@
 """The material form of the geometric adjoint: follow the moving surface, and let its
-place on the film move instead.
+position on the film move instead.
 
 The loss `sum(cotangent * radiance)` is an integral over the film, `integral of W(s)
 L(s) ds`, with W the cotangent as a function of the film position s in pixels. Over the
-visible part M of the moving meshes it is written in coordinates
-m that stick to the surface, where textures, facets and glossy lobes do not slide under the sample:
+visible part M of the moving meshes it is written in coordinates m that stick to the
+surface, where textures, facets and glossy lobes do not slide under the sample:
 
     integral over M of  W(s(m)) L(m) J(m) dm,        J = |N . (p - o)| / z^3
 
-(p: place of the surface point, N: normal of its triangle times the triangle's area, o:
-the eye, z: depth). Then
+(p: the surface point, N: normal of its triangle times the triangle's area, o: the eye,
+z: depth). Then
 
-    d loss = sum over samples of  d[W(s(p)) L J] / J   at fixed m                                          (interior)
-           - integral over outlines of  W L_behind  n . (ds_edge - ds_behind)  dl
-           (outlines)
-           - integral over edges and directions d of  W f J' sin(d, edge) (L_past -
-           L_hit)
-                                                        n . (dp_edge - dp_lit)  dd dl                      (shadows)
+    d loss =   sum over samples of  d[W(s(p)) L J] / J   at fixed m          (interior)
+             - integral over outlines of
+                   W L_behind  n . (ds_edge - ds_behind)  dl                 (outlines)
+             - integral over edges and directions d of
+                   W f J' sin(d, edge) (L_past - L_hit)
+                   n . (dp_edge - dp_lit)  dd dl                             (shadows)
 
 In the interior term the directions of incoming light are fixed in the world, and what
 arrives along them is a constant. L_behind is what an outline hides, and ds_behind its
 motion on the film, zero if it stands still. In the shadow term the line through an edge
 along d ends at a lit point that the camera sees: f is its reflectance towards the
 camera, J' = |N . (p_lit - o)| / z^3 there, with a unit normal, and L_past and L_hit are
-seen on either side.
+the radiances on either side of the edge.
 
 All three are linear in the motion of the vertices, so one backward pass serves any
 number of geometric dimensions.
@@ -77,19 +77,22 @@ LIMITS: Mapping[str, str] = {
     "a deformation that is not rigid reads low, for a reason not found yet":
         "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, 7 "
         "to 13 % with normals held",
-    "shadows of point, spot and directional lights stay where they are": "not measured: derivative 0",
-    "a surface that cuts through another: the line where they meet is taken for fixed": "not measured: about 0",
+    "shadows of point, spot and directional lights stay where they are":
+        "not measured: derivative 0",
+    "a surface that cuts through another: the line where they meet is taken for fixed":
+        "not measured: about 0",
     "a thin lens counts as a pinhole; participating media and what shines on the mesh "
     "itself are left out":
         "not measured",
 }  # fmt: skip
-"""What the estimator does not cover, and what that cost where it was measured. Errors
-are relative, of the mean of several seeds over six pose axes; noise is the standard
-deviation of one estimate.
+"""What the estimator does not cover, and what that costs where it was measured.
+
+Errors are relative, of the mean of several seeds over six pose axes; noise is the
+standard deviation of one estimate.
 """
-# a cotangent whose neighbours are less correlated than this counts as rough
+# a cotangent whose neighbouring pixels are less correlated than this is rough
 ROUGH_COTANGENT = 0.5
-# pixels along a tile that shares its random numbers, for a rough cotangent
+# width in pixels of a tile that shares its random numbers, for a rough cotangent
 ROUGH_TILE = 16
 
 
@@ -106,8 +109,7 @@ def material_adjoint(
     max_depth: int = 6,
     shadow_spp: int = 0,
 ) -> dict[str, Tensor]:
-    """Return the gradient of `sum(cotangent * radiance)` with respect to vertex places
-    and vertex normals.
+    """Return the gradient of `sum(cotangent * radiance)` by vertices and normals.
 
     The scene is only read. Nothing is recorded with `dr.freeze`. The first call for a
     depth makes a path tracer.
@@ -115,12 +117,13 @@ def material_adjoint(
     Args:
         scene, sensor, parameters: Mitsuba's scene, loaded with `optimize=False`, a
             perspective camera of it (a thin lens is taken for a pinhole), and what
-            `mi.traverse` says of it.
+            `mi.traverse` returns for it.
         moving: `NAME.vertices` and `NAME.normals` of each moving mesh, (V, 3) float32,
             world units, as the scene has them.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of
             box-filtered pixels.
-        spp: samples a pixel of the interior term.
+        seed: of all random numbers.
+        spp: samples per pixel of the interior term.
         boundary_spp, shadow_spp: samples of the outlines of each mesh and of the edges
             that cast shadows, in multiples of the number of pixels; 0 leaves them out.
         max_depth: longest light path in segments, of which only the first two move with
@@ -135,88 +138,108 @@ def material_adjoint(
     if spp > 0:
         # The gradient of a rough cotangent has no preferred sign within a few pixels:
         # the noise of the radiance cancels if it is the same there; for a smooth one it
-        # averages out better if it is not
-        values = cotangent.detach().to(torch.float64)
-        right, down = (torch.diff(values, dim=dim).square().mean() for dim in (1, 0))
-        rough = bool(
-            right + down > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
-        )
-        total += _interior(view, seed, spp, ROUGH_TILE if rough else 1)
-    for number, mesh in enumerate([*view.meshes, *view.still]):
-        total += outline_terms(view, mesh, seed, number, boundary_spp)
-        total += shadow_terms(view, mesh, seed, number, shadow_spp)
+        # averages out better if it is not.
+        tile = ROUGH_TILE if _is_rough(cotangent) else 1
+        total += _interior_term(view, seed, spp, tile)
+    for index, mesh in enumerate([*view.meshes, *view.still]):
+        total += outline_terms(view, mesh, seed, index, boundary_spp)
+        total += shadow_terms(view, mesh, seed, index, shadow_spp)
     if dr.grad_enabled(total):
         dr.backward(total)
-    return {
-        name: gradient
-        for mesh in view.meshes
-        for name, gradient in mesh.gradients().items()
-    }
+    gradients = dict[str, Tensor]()
+    for mesh in view.meshes:
+        gradients |= mesh.gradients()
+    return gradients
 
 
-def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
+def _is_rough(cotangent: Tensor) -> bool:
+    """Return whether neighbouring pixels of a cotangent are hardly correlated."""
+    values = cotangent.detach().to(torch.float64)
+    right = torch.diff(values, dim=1).square().mean()
+    down = torch.diff(values, dim=0).square().mean()
+    return bool(right + down > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean())
+
+
+def _interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
+    """Return a value whose gradient by the vertices is the interior term."""
     with dr.suspend_grad():
-        film, hit, sampler = _first_hits(view, seed, spp, tile)
+        film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
         if dr.width(film) == 0:
             return mi.Float(0)
         si = hit.compute_surface_interaction(view.camera.ray(film), mi.RayFlags.All)
     attached = view.follow(hit)[:3]
-    loose = [type(value)(dr.detach(value)) for value in attached]
-    dr.enable_grad(loose)
-    place, facet, bent = loose
-    # Sum of W L J / J over all samples, attached to these places and normals
-    spread = dr.dot(facet, place - view.camera.eye) / view.camera.depth(place) ** 3
+    leaves = [type(value)(dr.detach(value)) for value in attached]
+    dr.enable_grad(leaves)
+    point, facet, shading_normal = leaves
+
+    # Sum of W L J / J over all samples, attached to these points and normals.
+    jacobian = dr.dot(facet, point - view.camera.eye) / view.camera.depth(point) ** 3
     weight = view.weight(
-        dr.replace_grad(film, view.camera.project(place)), mi.Bool(True)
+        dr.replace_grad(film, view.camera.project(point)), mi.Bool(True)
     )
-    radiance = _reflected(view, _attached(view, si, place, facet, bent), si, sampler)
-    dr.backward(dr.sum(dr.sum(weight * radiance) * _relative(spread)))
+    moving_si = _attach_interaction(view, si, point, facet, shading_normal)
+    radiance = _sample_reflected(view, moving_si, si, sampler)
+    dr.backward(dr.sum(dr.sum(weight * radiance) * _relative(jacobian)))
+
+    # From there on to the vertices, without samples whose gradient is not finite.
     total = mi.Float(0)
-    for value, free in zip(attached, loose, strict=True):
-        pull = dr.grad(free)
-        usable = dr.all(dr.isfinite(pull))
-        total += dr.sum(dr.select(usable, dr.dot(value, dr.select(usable, pull, 0)), 0))
+    for value, leaf in zip(attached, leaves, strict=True):
+        gradient = dr.grad(leaf)
+        usable = dr.all(dr.isfinite(gradient))
+        product = dr.dot(value, dr.select(usable, gradient, 0))
+        total += dr.sum(dr.select(usable, product, 0))
     return total / spp
 
 
-def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, Any, Any]:
-    """Film positions that see a moving mesh, the hits, and the random numbers from
-    there on.
+def _sample_first_hits(
+    view: FilmView, seed: int, spp: int, tile: int
+) -> tuple[Any, Any, Any]:
+    """Sample film positions that see a moving mesh.
 
-    The film is cut into cells between pixel centres, `spp` samples in each, stratified.
+    The film is cut into cells between pixel centers, with `spp` stratified samples in
+    each. Cells in a tile share their random numbers.
+
+    Returns:
+        Film positions, their hits, and a sampler with the random numbers from there on.
     """
-    columns = view.camera.width + 1
-    rows = view.camera.height + 1
-    lane = dr.arange(mi.UInt32, columns * rows * spp)
+    n_columns = view.camera.width + 1
+    n_rows = view.camera.height + 1
+    lane = dr.arange(mi.UInt32, n_columns * n_rows * spp)
     cell = lane // spp
     sample = lane % spp
-    column = cell % columns
-    row = cell // columns
-    tiles = -(-columns // tile)
-    group = (row // tile * tiles + column // tile) * spp + sample
-    sampler = sampler_of(stream_of(seed, 0), tiles * -(-rows // tile) * spp, group)
-    across = max(n for n in range(1, int(spp**0.5) + 1) if spp % n == 0)
-    strata = mi.Point2f(sample % across, sample // across)
-    film = (
-        mi.Point2f(column, row)
-        - 0.5
-        + (strata + sampler.next_2d()) / mi.Point2f(across, spp // across)
-    )
+    column = cell % n_columns
+    row = cell // n_columns
+
+    tiles_across = -(-n_columns // tile)
+    n_tiles = tiles_across * -(-n_rows // tile)
+    tile_index = row // tile * tiles_across + column // tile
+    sampler = sampler_of(stream_of(seed, 0), n_tiles * spp, tile_index * spp + sample)
+
+    strata_across = _largest_divisor(spp)
+    strata_shape = mi.Point2f(strata_across, spp // strata_across)
+    stratum = mi.Point2f(sample % strata_across, sample // strata_across)
+    film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
     hit = view.scene.ray_intersect_preliminary(view.camera.ray(film), coherent=True)
-    on = mi.Bool(False)
+    on_moving = mi.Bool(False)
     for mesh in view.meshes:
-        on |= hit.is_valid() & (hit.shape == mesh.shape)
-    dr.eval(on, film, hit, sampler)
-    kept = dr.compress(on)
-    film, hit, sampler.rng = (
-        dr.gather(type(value), value, kept) for value in (film, hit, sampler.rng)
-    )
+        on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
+    dr.eval(on_moving, film, hit, sampler)
+    selected = dr.compress(on_moving)
+    film = dr.gather(type(film), film, selected)
+    hit = dr.gather(type(hit), hit, selected)
+    sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected)
     return film, hit, sampler
 
 
+def _largest_divisor(count: int) -> int:
+    """Return the largest divisor of a count that is at most its square root."""
+    return max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
+
+
 def _relative(value: Any) -> Any:
-    """1 with the relative gradient of a value; without gradient where the value is all
-    but zero.
+    """Return 1 with the relative gradient of a value.
+
+    There is no gradient where the value is all but zero.
     """
     fixed = dr.detach(value)
     usable = dr.abs(fixed) > 1e-20
@@ -226,82 +249,114 @@ def _relative(value: Any) -> Any:
     )
 
 
-def _attached(view: FilmView, si: Any, place: Any, facet: Any, bent: Any) -> Any:
-    """Mitsuba's surface interaction, moving with the surface and turning with its
-    normals.
-    """
+def _attach_interaction(
+    view: FilmView, si: Any, point: Any, facet: Any, shading_normal: Any
+) -> Any:
+    """Return Mitsuba's surface interaction, attached to a point and its normals."""
 
-    def turned(fixed: Any, normal: Any) -> Any:
-        """A normal with the gradient of ours, which may point the other way."""
-        return dr.replace_grad(
-            fixed, dr.mulsign(dr.normalize(normal), dr.dot(dr.detach(normal), fixed))
-        )
+    def attach_normal(fixed: Any, normal: Any) -> Any:
+        """Attach a normal to ours, which may point to the other side."""
+        sign = dr.dot(dr.detach(normal), fixed)
+        return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), sign))
 
-    at = mi.SurfaceInteraction3f(si)
-    at.p = dr.replace_grad(si.p, place)
-    at.n = turned(si.n, facet)
-    normal = turned(si.sh_frame.n, bent)
+    moving_si = mi.SurfaceInteraction3f(si)
+    moving_si.p = dr.replace_grad(si.p, point)
+    moving_si.n = attach_normal(si.n, facet)
+    normal = attach_normal(si.sh_frame.n, shading_normal)
     s = si.sh_frame.s
     s = dr.replace_grad(s, dr.normalize(dr.fma(-normal, dr.dot(normal, s), s)))
-    at.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
-    at.wi = dr.replace_grad(
-        si.wi, at.sh_frame.to_local(dr.normalize(view.camera.eye - place))
-    )
-    return at
+    moving_si.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
+    to_eye = dr.normalize(view.camera.eye - point)
+    moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
+    return moving_si
 
 
-def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
-    """One sample of the light reflected towards the camera, from directions fixed in
-    the world.
+def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> Any:
+    """Sample the light reflected towards the camera.
+
+    Directions of incoming light are fixed in the world: they are sampled at `si`, which
+    is detached; `moving_si` is the same interaction, attached.
     """
-    context = mi.BSDFContext()
-    bsdf = si.bsdf()
-    mis_weight = mi.ad.integrators.common.mis_weight
-    with dr.suspend_grad():  # both directions are drawn where the surface is, and stay
+    with dr.suspend_grad():
         active = mi.Bool(view.max_depth > 1)
-        active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, em_weight = view.scene.sample_emitter_direction(
-            si, sampler.next_2d(), True, active_em
-        )
-        active_em &= ds.pdf != 0.0
-        bsdf_sample, bsdf_weight = bsdf.sample(
-            context, si, sampler.next_1d(), sampler.next_2d(), active
-        )
-        active &= dr.any(bsdf_weight != 0.0)
+        ds, em_weight, active_em = _sample_light(view, si, sampler, active)
+        bsdf_sample, incoming, active = _sample_incoming(view, si, sampler, active)
         wo = si.to_world(bsdf_sample.wo)
         smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-        ray = si.spawn_ray(wo)
-        # with all of what the next surface emits
-        L = view.radiance(ray, sampler, view.max_depth - 1, active)
-        si_next = view.scene.ray_intersect(ray, active)
-        ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
-        em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & smooth)
-        L -= (1.0 - mis_weight(bsdf_sample.pdf, em_pdf)) * ds_next.emitter.eval(
-            si_next, active & smooth
-        )
-        arriving = bsdf_weight * L
+    direct = _reflect_light(view, moving_si, si, ds, em_weight, active_em)
 
-    # ---- light that was sampled, from the moving point: its distance and the BSDF
-    # change, unless it is infinitely far
-    near = active_em & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-    surface = near & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
-    ds.d = dr.select(near, dr.replace_grad(ds.d, dr.normalize(ds.p - at.p)), ds.d)
-    shining = view.scene.eval_emitter_direction(at, ds, near)
-    shining = dr.select(near, shining / dr.select(near, ds.pdf, 1.0), em_weight)
-    fall = dr.dot(ds.n, ds.d) / dr.select(surface, dr.squared_norm(ds.p - at.p), 1.0)
-    em_weight = dr.replace_grad(em_weight, shining) * dr.select(
-        surface, _relative(fall), 1.0
+    # Light along the sampled direction is a constant, of which the BSDF passes more or
+    # less; a mirror's stays.
+    bsdf_value = si.bsdf().eval(
+        mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & smooth
     )
-    bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(
-        context, at, at.to_local(ds.d), active_em
-    )
-    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf_em))
-    total = dr.select(active_em, bsdf_value_em * em_weight * mis, 0.0)
-
-    # ---- light along the sampled direction: a constant, of which the BSDF passes more
-    # or less; a mirror's stays
-    bsdf_value = bsdf.eval(context, at, at.to_local(wo), active & smooth)
     relative = mi.Color3f(
         *(_relative(dr.select(smooth, channel, 1.0)) for channel in bsdf_value)
     )
-    return total + dr.select(active, arriving * relative, 0.0)
+    return direct + dr.select(active, incoming * relative, 0.0)
+
+
+def _sample_light(
+    view: FilmView, si: Any, sampler: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """Sample a direction to an emitter; return it, its weight, and where there is one."""
+    is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+    active_em = active & is_smooth
+    ds, em_weight = view.scene.sample_emitter_direction(
+        si, sampler.next_2d(), True, active_em
+    )
+    active_em &= ds.pdf != 0.0
+    return ds, em_weight, active_em
+
+
+def _sample_incoming(
+    view: FilmView, si: Any, sampler: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """Sample a direction by the BSDF, and the light that arrives along it.
+
+    Returns:
+        The BSDF sample; its weight times the radiance, without the part of direct light
+        that is sampled at emitters; and where there is a sample.
+    """
+    bsdf_sample, bsdf_weight = si.bsdf().sample(
+        mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+    )
+    active = active & dr.any(bsdf_weight != 0.0)
+    smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+    ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
+    # with all of what the next surface emits
+    L = view.radiance(ray, sampler, view.max_depth - 1, active)
+    si_next = view.scene.ray_intersect(ray, active)
+    ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
+    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & smooth)
+    mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
+    L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & smooth)
+    return bsdf_sample, bsdf_weight * L, active
+
+
+def _reflect_light(
+    view: FilmView, moving_si: Any, si: Any, ds: Any, em_weight: Any, active: Any
+) -> Any:
+    """Return reflected light that was sampled at emitters, from the moving point.
+
+    Its distance and the BSDF change, unless the emitter is infinitely far.
+    """
+    flags = ds.emitter.flags()
+    near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+    is_surface = near & mi.has_flag(flags, mi.EmitterFlags.Surface)
+    to_light = ds.p - moving_si.p
+    ds.d = dr.select(near, dr.replace_grad(ds.d, dr.normalize(to_light)), ds.d)
+    attached = view.scene.eval_emitter_direction(moving_si, ds, near)
+    attached = dr.select(near, attached / dr.select(near, ds.pdf, 1.0), em_weight)
+    falloff = dr.dot(ds.n, ds.d) / dr.select(
+        is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
+    )
+    em_weight = dr.replace_grad(em_weight, attached) * dr.select(
+        is_surface, _relative(falloff), 1.0
+    )
+    bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
+        mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active
+    )
+    mis_weight = mi.ad.integrators.common.mis_weight
+    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf))
+    return dr.select(active, bsdf_value * em_weight * mis, 0.0)

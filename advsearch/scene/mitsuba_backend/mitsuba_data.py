@@ -1,6 +1,4 @@
-"""What added parts need of Mitsuba: its names of a scene's numbers and colors, the
-tables of its sky, its files.
-"""
+"""Read Mitsuba's own data: keys of a scene's numbers and colors, tables of its sky."""
 
 from __future__ import annotations
 
@@ -25,38 +23,41 @@ from advsearch.scene.mitsuba_backend.writing import write_scene as write_scene
 from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 
-# height and width of the picture of a scene that is only asked for its names
-SMALL = (8, 8)
-BEHIND = ("differences",)  # valid estimators of what Mitsuba has no derivative of
-STILL = ("adjoint", *BEHIND)  # of what Mitsuba can differentiate and moves no outline
-# of what Mitsuba can differentiate, but for what changes at an outline or all at once
+SMALL = (8, 8)  # height and width of a scene of which only the keys are read
+BEHIND = ("differences",)  # valid estimators where Mitsuba has no derivative
+STILL = ("adjoint", *BEHIND)  # where Mitsuba has one, and no outline moves
+# where Mitsuba has one, but for what changes at an outline or all at once
 UNSURE = (*BEHIND, "adjoint")
 
 
 def plugin_numbers(
     description: SceneDescription, name: str, keys: tuple[str, ...]
 ) -> tuple[PluginNumber, ...]:
-    """Return some numbers and colours of a scene by Mitsuba's names, each once;
-    `KEY.red` is a channel of the colour KEY. Their inputs begin with the name of the
-    part that they will be in, but for those that the scene has as other inputs.
+    """Return some numbers and colors of a scene by Mitsuba's keys, each once.
+
+    `KEY.red` is a channel of the color KEY.
+
+    Args:
+        description: the scene.
+        name: of the part that they will be in, with which their inputs begin, but for
+            those that the scene has as other inputs.
+        keys: Mitsuba's.
 
     Raises:
         UnknownNameError: the scene has no such key; the message has near ones.
-        InputError: it is something else than a number or a colour.
+        InputError: it is something else than a number or a color.
     """
-    numbers, others = _all(description)
-    channels = {
-        f"{key}.{channel}": key
-        for key in numbers
-        for channel in CHANNELS
-        if len(numbers[key].values) > 1
-    }
-    keys = tuple(dict.fromkeys(channels.get(key, key) for key in keys))
+    numbers, other_types = _find_numbers(description)
+    color_of_channel: dict[str, str] = {}
+    for key, plugin_number in numbers.items():
+        if len(plugin_number.values) > 1:
+            color_of_channel |= {f"{key}.{channel}": key for channel in CHANNELS}
+    keys = tuple(dict.fromkeys(color_of_channel.get(key, key) for key in keys))
     for key in keys:
-        if key in others:
+        if key in other_types:
             raise InputError(
                 f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba "
-                f"has {others[key]} there; other "
+                f"has {other_types[key]} there; other "
                 "controls may move it, such as pose and texture"
             )
         if key not in numbers:
@@ -68,47 +69,53 @@ def plugin_numbers(
 
 
 @lru_cache(maxsize=1)
-def _all(
+def _find_numbers(
     description: SceneDescription,
 ) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Every number and colour of a scene by its key, with an input if it has one; and
-    the type of the rest.
+    """Find all numbers and colors of a scene.
+
+    Returns:
+        They by their key, with an input if they have one; and the type of the rest.
     """
     scene = MitsubaScene(description, SMALL)
     inputs = {
         key: name
-        for name, (key, takes) in scene.declared.items()
-        if takes.write in (number, color)
+        for name, (key, scene_input) in scene.declared.items()
+        if scene_input.write in (number, color)
     }
     numbers: dict[str, PluginNumber] = {}
-    others: dict[str, str] = {}
+    other_types: dict[str, str] = {}
     for key in scene.parameters.keys():
         value = scene.parameters[key]
-        flags = scene.parameters.flags(key)
-        plain = isinstance(value, float)
-        if not (
-            plain
-            or (isinstance(value, mi.Float) and len(value) == 1)
-            or isinstance(value, mi.Color3f)
-        ):
-            others[key] = f"a {type(value).__name__}"
+        is_plain = isinstance(value, float)
+        is_number = isinstance(value, mi.Float) and len(value) == 1
+        if is_plain:
+            values: tuple[float, ...] = (value,)
+        elif is_number or isinstance(value, mi.Color3f):
+            values = tuple(map(float, np.array(value).reshape(-1)))
+        else:
+            other_types[key] = f"a {type(value).__name__}"
             continue
-        still = flags == mi.ParamFlags.Differentiable.value
-        valid = (
-            BEHIND
-            if flags & mi.ParamFlags.NonDifferentiable.value
-            else STILL
-            if still
-            else UNSURE
+        estimators = _valid_estimators(scene.parameters.flags(key))
+        numbers[key] = PluginNumber(
+            key, values, inputs.get(key, ""), estimators, is_plain
         )
-        values = (value,) if plain else tuple(map(float, np.array(value).reshape(-1)))
-        numbers[key] = PluginNumber(key, values, inputs.get(key, ""), valid, plain)
-    return numbers, others
+    return numbers, other_types
+
+
+def _valid_estimators(flags: int) -> tuple[str, ...]:
+    """Return the estimators that are valid for a parameter with Mitsuba's flags."""
+    if flags & mi.ParamFlags.NonDifferentiable.value:
+        return BEHIND
+    if flags == mi.ParamFlags.Differentiable.value:
+        return STILL
+    return UNSURE
 
 
 def sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
-    """Read the RGB coefficients of Hosek and Wilkie's sky and sun that Mitsuba ships
-    for its `sunsky` plugin.
+    """Read the coefficients of Hosek and Wilkie's sky and sun that Mitsuba brings.
+
+    They are the RGB ones of its `sunsky` plugin.
 
     Returns:
         (10 turbidities, 2 ground albedos, 6 control points, 3 channels, 9) shape of the

@@ -1,8 +1,7 @@
-"""Plugins of our own for Mitsuba: a path tracer for haze, guides of the denoiser, a
-camera with a lens.
+"""Custom Mitsuba plugins: a path tracer for haze, denoiser guides, a camera with a lens.
 
-Import this only inside Mitsuba's scenes: it registers them, which takes the variant
-that `variant.mitsuba` sets.
+Import this only where a Mitsuba scene is built: it registers the plugins, which needs
+the variant that `variant.mitsuba` sets.
 """
 
 from __future__ import annotations
@@ -13,126 +12,127 @@ from typing import Any
 import numpy as np
 import torch
 
-from advsearch.scene.assets import Floats, Ints
+from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.camera_model import NUMBERS, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Raindrops on a sheet of glass before the camera: small lenses through which rays are
-# refracted.
+# Raindrops on a sheet of glass before the camera: small lenses that refract rays.
 #
-# A drop is a spherical cap of water on the outer side of the sheet. A ray that leaves
-# the camera in the direction d meets the sheet at a distance of D, shifted by its place
-# in the aperture (the camera is focused far away, so that drops are blurred as in a
-# photograph), is refracted into the water (Snell's law; the sheet itself is plane and
-# changes no direction), and out of it at the cap, or is lost where it would be
-# reflected there. Where caps overlap, the higher one counts. The light that passes is
-# Fresnel's, unpolarised (Born and Wolf, Principles of Optics, section 1.5).
+# A drop is a spherical cap of water on the outer side of the sheet. A camera ray in
+# direction d meets the sheet at DISTANCE, shifted by its position in the aperture (the
+# camera is focused far away, so that drops are blurred as in a photograph). It is
+# refracted into the water (Snell's law; the sheet itself is plane and changes no
+# direction) and out of it at the cap, or is lost where it would be totally reflected.
+# Where caps overlap, the higher one counts. The transmittance is Fresnel's for
+# unpolarised light (Born and Wolf, Principles of Optics, section 1.5).
 #
 # Only directions change: the scene is taken to be far away compared to the sheet.
 
 WATER = 1.33  # index of refraction
-# of the sheet from the camera, and radius of the camera's aperture, millimetres
-DISTANCE = 60.0
-APERTURE = 1.0
-# angles between a drop's surface and the glass at its rim, degrees
+DISTANCE = 60.0  # of the sheet from the camera, millimetres
+APERTURE = 1.0  # radius of the camera's aperture, millimetres
+# range of angles between a drop's surface and the glass at its rim, degrees
 CONTACT = (25.0, 42.0)
-SPREAD = 0.45  # of the logarithm of radii
-BEYOND = 1.1  # how far over the edge of the picture the drops go, in half widths
-GRID = 1024  # along a side of the grid that says which drop is where
+SPREAD = 0.45  # standard deviation of the logarithm of radii
+BEYOND = 1.1  # half width of the square with drops, in half widths of the image
+GRID = 1024  # cells along each side of the grid that holds the drop of a position
 
 
 def raindrops(
     count: int, size: float, seed: int, tangent: float
 ) -> tuple[float, Floats, Ints]:
-    """Make drops on a square of the sheet for a camera with the tangent of half its
-    field of view along the larger side, with a median radius of `size`; the seed says
-    where they are, and how large. All in millimetres.
+    """Sample raindrops on a square of the glass sheet before a camera.
+
+    Args:
+        count: how many drops.
+        size: median radius of a drop on the sheet, millimetres.
+        seed: of the positions and radii.
+        tangent: tangent of half the camera's field of view along its larger side.
 
     Returns:
-        Half a side of the square, in whose middle the camera looks; (N, 4) float32, of
-        each drop the x and y of its middle, its radius on the sheet and that of its
-        curvature; and (GRID, GRID) the number of the drop that is highest in the middle
-        of each cell, rows along y, or N for none.
+        Half the width of the square, millimetres; the camera looks at its center.
+        (count, 4) float32, for each drop the x and y of its center, its radius on the
+        sheet and the radius of its curvature, millimetres.
+        (GRID, GRID) index of the drop that is highest at the center of each cell, rows
+        along y; `count` where there is none.
     """
     random = np.random.default_rng(seed)
-    half = BEYOND * DISTANCE * tangent
-    places = random.uniform(-half, half, (count, 2))
+    half_width = BEYOND * DISTANCE * tangent
+    centers = random.uniform(-half_width, half_width, (count, 2))
     radii = size * np.exp(SPREAD * random.standard_normal(count).clip(-2.5, 2.5))
-    curvature = radii / np.sin(np.radians(random.uniform(*CONTACT, count)))
-    at = (np.arange(GRID) + 0.5) / GRID * 2.0 * half - half
-    grid = np.full((GRID, GRID), count)
-    height = np.zeros((GRID, GRID))
-    for number, ((x, y), radius, curve) in enumerate(
-        zip(places, radii, curvature, strict=True)
-    ):
-        rows, columns = (
-            np.flatnonzero(np.abs(at - middle) <= radius) for middle in (y, x)
-        )
-        away = (at[rows] - y)[:, None] ** 2 + (at[columns] - x)[None] ** 2
-        tall = np.sqrt(np.maximum(curve**2 - away, 0.0)) - math.sqrt(
-            curve**2 - radius**2
-        )
-        place = np.ix_(rows, columns)
-        above = (away < radius**2) & (tall > height[place])
-        grid[place] = np.where(above, number, grid[place])
-        height[place] = np.where(above, tall, height[place])
-    return half, np.column_stack([places, radii, curvature]).astype(np.float32), grid
+    contact_angles = np.radians(random.uniform(*CONTACT, count))
+    curvature_radii = radii / np.sin(contact_angles)
+    drops = np.column_stack([centers, radii, curvature_radii])
+    return half_width, drops.astype(np.float32), _find_highest_drops(drops, half_width)
+
+
+def _find_highest_drops(drops: Doubles, half_width: float) -> Ints:
+    """Return the index of the highest drop in each cell, as in `raindrops`."""
+    cell_centers = (np.arange(GRID) + 0.5) / GRID * 2.0 * half_width - half_width
+    highest_drop = np.full((GRID, GRID), len(drops))
+    highest = np.zeros((GRID, GRID))
+    for index, (x, y, radius, curvature_radius) in enumerate(drops):
+        rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
+        columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
+        dy = cell_centers[rows] - y
+        dx = cell_centers[columns] - x
+        distance_squared = dy[:, None] ** 2 + dx[None] ** 2
+
+        # A cap of a sphere: its height over the sphere's cut with the sheet.
+        cut_height = math.sqrt(curvature_radius**2 - radius**2)
+        sphere_height = np.sqrt(np.maximum(curvature_radius**2 - distance_squared, 0.0))
+        height = sphere_height - cut_height
+
+        cells = np.ix_(rows, columns)
+        is_higher = (distance_squared < radius**2) & (height > highest[cells])
+        highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
+        highest[cells] = np.where(is_higher, height, highest[cells])
+    return highest_drop
 
 
 common: Any = mi.ad.integrators.common
 PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 NO_EXTINCTION = 1e-20
 MOST_SCATTERINGS = 8
-"""Longest chain of scatterings in the haze along a path. They do not count as bounces
-off surfaces, so that haze of density 0 is no haze. Where the haze's optical radius is
-1.2, what is cut off is below 1 % of the light.
+"""Largest number of scatterings in the haze along a path.
+
+They do not count as bounces off surfaces, so that haze of density 0 is no haze. Where
+the haze's optical radius is 1.2, what is cut off is below 1 % of the light.
 """
 
 
 class HazePath(common.RBIntegrator):  # type: ignore[misc]
-    """The integrator `advsearch_haze`: a path tracer for a uniform haze in a ball
-    around the scene, with its adjoint.
+    """Trace paths through a uniform haze in a ball around the scene, with an adjoint.
 
-        L(x, w) = e^(-s l) L_o + integral_0^l s a e^(-s t) L_i(x + t w) dt,      L_i = mean over the sphere of L
+    It is the integrator `advsearch_haze`:
+
+        L(x, w) = e^(-s l) L_o + integral_0^l s a e^(-s t) L_i(x + t w) dt
+        L_i = mean of L over the sphere of directions
 
     with extinction s (grey, per object size), single-scattering albedo a (per channel),
     l the length of the segment inside the ball, and L_o what leaves the next surface or
-    comes from outside. Distances are sampled in proportion to `s e^(-s t)`, light from
-    emitters through the haze is worked out exactly, and the derivative is path replay
-    backpropagation (Vicini et al. 2021, Path Replay Backpropagation, sections 4 and 5)
-    with detached samples.
+    comes from outside. Distances are sampled in proportion to `s e^(-s t)`, the
+    transmittance of the haze towards emitters is exact, and the derivative is path
+    replay backpropagation (Vicini et al. 2021, Path Replay Backpropagation, sections 4
+    and 5) with detached samples.
 
-    Why not Mitsuba's `prbvolpath`: it starts every path outside of all media, so a
-    camera inside haze sees none up to the first surface (its source says so: "TODO:
-    support sensors inside media"). Knowing that there is one uniform medium in one ball
-    also spares the boundary's intersections and the walk through them towards emitters.
+    Why not Mitsuba's `prbvolpath`: it starts every path outside of all media, so that a
+    camera inside haze sees none up to the first surface (its source has the note "TODO:
+    support sensors inside media"). To know that there is one uniform medium in one ball
+    also saves the intersections with the ball's surface.
 
-    Derivatives are right for the haze's colour, for emission and for everything that
-    surfaces look up; for the density where it is greater than 0. Moving geometry has
-    none.
+    Derivatives are right for the haze's color, for emission, for everything that
+    surfaces look up, and for the density where it is greater than 0. Moving geometry
+    has none.
 
-    Properties beside those of `prb`: `medium`, a homogeneous medium with grey
-    extinction, and `radius`, that of the ball around the origin which it fills.
+    Properties in addition to those of `prb`: `medium`, a homogeneous medium with grey
+    extinction, and `radius`, that of the ball around the origin which the medium fills.
     """
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.haze = props["medium"]
         self.radius = props["radius"]
-
-    def stretch(self, origin: Any, towards: Any, distance: Any) -> tuple[Any, Any]:
-        """Return where the haze begins on a segment, and for how long it lasts (0 if it
-        misses the ball).
-        """
-        middle = -dr.dot(origin, towards)
-        half = dr.sqrt(
-            dr.maximum(
-                dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0
-            )
-        )
-        begin = dr.maximum(middle - half, 0.0)
-        return begin, dr.maximum(dr.minimum(middle + half, distance) - begin, 0.0)
 
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(
@@ -146,6 +146,11 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         active: Any,
         **rest: Any,
     ) -> Any:
+        """Sample paths, or in the adjoint modes replay them and backpropagate.
+
+        Arguments and results are those of `mi.ad.integrators.common.RBIntegrator`; the
+        names are those of Mitsuba's `prb`.
+        """
         primal = mode == dr.ADMode.Primal
         context = mi.BSDFContext()
 
@@ -160,50 +165,26 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         prev_pdf = mi.Float(1)
         prev_delta = mi.Bool(True)
 
-        longest = self.max_depth + MOST_SCATTERINGS
-        while dr.hint(active, max_iterations=longest, label=f"Haze path ({mode.name})"):
-            # ---- the next event: a surface, the outside, or the haze in between
-            # -------------------------------------
-            first = bounces + scatterings == 0
-            si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
-            if dr.hint(self.hide_emitters, mode="scalar"):
-                skipped = active & first & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711
-                beyond = self.skip_area_emitters(
-                    scene, si.spawn_ray(ray.d), True, skipped
-                )
-                si[skipped] = beyond.compute_surface_interaction(
-                    ray, mi.RayFlags.All, skipped
-                )
-            begin, length = self.stretch(ray.o, ray.d, si.t)
+        max_events = self.max_depth + MOST_SCATTERINGS
+        while dr.hint(
+            active, max_iterations=max_events, label=f"Haze path ({mode.name})"
+        ):
+            # ---- the next event: a surface, the outside, or the haze before it
+            is_first = bounces + scatterings == 0
+            si = self._intersect(scene, ray, is_first, active)
+            haze_start, haze_length = self._haze_segment(ray.o, ray.d, si.t)
             with dr.resume_grad(when=not primal):
-                scattering, _, extinction = self.haze.get_scattering_coefficients(
-                    dr.zeros(mi.MediumInteraction3f)
+                scattered, flight, weight, albedo, extinction = self._sample_flight(
+                    sampler, haze_length, active
                 )
-                extinction = extinction[0]  # it is grey
-                flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
-                    dr.detach(extinction), NO_EXTINCTION
-                )
-                scattered = active & (flight < length)
-                passed = dr.exp(-extinction * dr.minimum(flight, length))
-                weight = dr.select(scattered, scattering * passed, passed)
-            albedo = dr.detach(scattering) / dr.maximum(
-                dr.detach(extinction), NO_EXTINCTION
-            )
             β = dr.select(scattered, β * albedo, β)
             at_surface = active & ~scattered
-
-            here = dr.zeros(mi.Interaction3f)
-            here.t = dr.select(scattered, begin + flight, si.t)
-            here.p = dr.select(scattered, ray(begin + flight), si.p)
-            here.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
-            here.time = ray.time
-            here.wavelengths = ray.wavelengths
+            event = _make_event(ray, si, scattered, haze_start + flight)
 
             # ---- emission of the surface or of the outside
-            # ----------------------------------------------------------
             active_e = at_surface
             if dr.hint(self.hide_emitters, mode="scalar"):
-                active_e = at_surface & ~(first & ~si.is_valid())
+                active_e = at_surface & ~(is_first & ~si.is_valid())
             ds = mi.DirectionSample3f(scene, si, prev)
             mis = common.mis_weight(
                 prev_pdf, scene.pdf_emitter_direction(prev, ds, active_e & ~prev_delta)
@@ -211,8 +192,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             with dr.resume_grad(when=not primal):
                 Le = β * mis * ds.emitter.eval(si, active_e)
 
-            # ---- light that emitters send here, through the haze
-            # ----------------------------------------------------
+            # ---- direct light of emitters, through the haze
             may_bounce = si.is_valid() & (bounces + 1 < self.max_depth)
             may_scatter = scatterings < MOST_SCATTERINGS
             active_next = active & (
@@ -223,21 +203,10 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             active_em = active_next & (
                 scattered | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             )
-            ds_em, em_weight = scene.sample_emitter_direction(
-                here, sampler.next_2d(), True, active_em
-            )
-            active_em &= ds_em.pdf != 0.0
-            outside = mi.has_flag(ds_em.emitter.flags(), mi.EmitterFlags.Infinite)
-            _, hazy = self.stretch(
-                here.p, ds_em.d, dr.select(outside, dr.inf, ds_em.dist)
+            ds_em, em_weight, em_haze_length, active_em = self._sample_emitter(
+                scene, sampler, event, active_em, primal
             )
             with dr.resume_grad(when=not primal):
-                if dr.hint(not primal, mode="scalar"):
-                    attached = scene.eval_emitter_direction(here, ds_em, active_em)
-                    em_weight = dr.replace_grad(
-                        em_weight,
-                        attached * dr.select(active_em, dr.rcp(ds_em.pdf), 0.0),
-                    )
                 bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(
                     context, si, si.to_local(ds_em.d), active_em & at_surface
                 )
@@ -246,37 +215,40 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
                 mis = dr.select(
                     ds_em.delta, 1.0, common.mis_weight(ds_em.pdf, bsdf_pdf_em)
                 )
+                transmittance = dr.exp(-extinction * em_haze_length)
                 Lr_dir = dr.select(
                     active_em,
-                    β * mis * bsdf_value_em * em_weight * dr.exp(-extinction * hazy),
+                    β * mis * bsdf_value_em * em_weight * transmittance,
                     0.0,
                 )
 
-            # ---- the direction to go on
-            # -----------------------------------------------------------------------------
+            # ---- the direction in which the path goes on
             bsdf_sample, bsdf_weight = bsdf.sample(
                 context, si, sampler.next_1d(), sampler.next_2d(), at_surface
             )
-            anywhere = mi.warp.square_to_uniform_sphere(sampler.next_2d())
-            towards = dr.select(scattered, anywhere, si.to_world(bsdf_sample.wo))
+            scattered_direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+            direction = dr.select(
+                scattered, scattered_direction, si.to_world(bsdf_sample.wo)
+            )
             L = (L + Le + Lr_dir) if primal else (L - Le - Lr_dir)
             β = dr.select(scattered, β, β * bsdf_weight)
             active_next &= dr.max(β) != 0.0
 
             # ---- derivatives
-            # ----------------------------------------------------------------------------------------
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
                     reflected = bsdf.eval(
                         context, si, bsdf_sample.wo, active_next & at_surface
                     )
-                    further = dr.select(at_surface, L * dr.relative_grad(reflected), L)
-                    Lo = (Le + Lr_dir + further) * dr.relative_grad(weight)
+                    L_further = dr.select(
+                        at_surface, L * dr.relative_grad(reflected), L
+                    )
+                    Lo = (Le + Lr_dir + L_further) * dr.relative_grad(weight)
                     if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                         dr.backward_from(δL * Lo)
 
-            ray = here.spawn_ray(towards)
-            prev = here
+            ray = event.spawn_ray(direction)
+            prev = event
             prev_pdf = dr.select(scattered, PHASE, bsdf_sample.pdf)
             prev_delta = ~scattered & mi.has_flag(
                 bsdf_sample.sampled_type, mi.BSDFFlags.Delta
@@ -287,104 +259,244 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 
         return (L if primal else δL, bounces + scatterings != 0, [], L)
 
+    def _intersect(self, scene: Any, ray: Any, is_first: Any, active: Any) -> Any:
+        """Return the next surface, behind visible emitters where those are hidden."""
+        si = scene.ray_intersect(ray, mi.RayFlags.All, is_first, active)
+        if self.hide_emitters:
+            is_emitter = si.shape.emitter() != None  # noqa: E711 (for each lane)
+            skipped = active & is_first & si.is_valid() & is_emitter
+            next_hit = self.skip_area_emitters(
+                scene, si.spawn_ray(ray.d), True, skipped
+            )
+            si[skipped] = next_hit.compute_surface_interaction(
+                ray, mi.RayFlags.All, skipped
+            )
+        return si
+
+    def _haze_segment(
+        self, origin: Any, direction: Any, max_distance: Any
+    ) -> tuple[Any, Any]:
+        """Return where the haze starts on a segment, and its length (0 for a miss)."""
+        middle = -dr.dot(origin, direction)
+        half = dr.sqrt(
+            dr.maximum(
+                dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0
+            )
+        )
+        start = dr.maximum(middle - half, 0.0)
+        return start, dr.maximum(dr.minimum(middle + half, max_distance) - start, 0.0)
+
+    def _sample_flight(
+        self, sampler: Any, haze_length: Any, active: Any
+    ) -> tuple[Any, Any, Any, Any, Any]:
+        """Sample how far light flies through the haze before it is scattered.
+
+        Returns:
+            Whether it is scattered within the haze; the distance; the weight (attached
+            to the haze's parameters; only its relative gradient counts); the detached
+            albedo per channel; and the extinction, which is grey.
+        """
+        scattering, _, extinction = self.haze.get_scattering_coefficients(
+            dr.zeros(mi.MediumInteraction3f)
+        )
+        extinction = extinction[0]
+        flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
+            dr.detach(extinction), NO_EXTINCTION
+        )
+        scattered = active & (flight < haze_length)
+        transmittance = dr.exp(-extinction * dr.minimum(flight, haze_length))
+        weight = dr.select(scattered, scattering * transmittance, transmittance)
+        albedo = dr.detach(scattering) / dr.maximum(
+            dr.detach(extinction), NO_EXTINCTION
+        )
+        return scattered, flight, weight, albedo, extinction
+
+    def _sample_emitter(
+        self, scene: Any, sampler: Any, event: Any, active: Any, primal: bool
+    ) -> tuple[Any, Any, Any, Any]:
+        """Sample a direction to an emitter from an event of the path.
+
+        Returns:
+            Mitsuba's direction sample; radiance over density, attached to the emitter's
+            parameters if not `primal`; the length of the haze in between; and in which
+            lanes there is a sample.
+        """
+        ds, weight = scene.sample_emitter_direction(
+            event, sampler.next_2d(), True, active
+        )
+        active = active & (ds.pdf != 0.0)
+        is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        distance = dr.select(is_outside, dr.inf, ds.dist)
+        _, haze_length = self._haze_segment(event.p, ds.d, distance)
+        if not primal:
+            with dr.resume_grad():
+                attached = scene.eval_emitter_direction(event, ds, active)
+                weight = dr.replace_grad(
+                    weight, attached * dr.select(active, dr.rcp(ds.pdf), 0.0)
+                )
+        return ds, weight, haze_length, active
+
+
+def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
+    """Return the interaction at a surface, or where the haze scatters the light."""
+    event = dr.zeros(mi.Interaction3f)
+    event.t = dr.select(scattered, distance, si.t)
+    event.p = dr.select(scattered, ray(distance), si.p)
+    event.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
+    event.time = ray.time
+    event.wavelengths = ray.wavelengths
+    return event
+
 
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
 
 
 class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
-    """The integrator `advsearch_guides`: diffuse reflectance and shading normal, three
-    channels each, of the first hit that light does not pass. Mitsuba's `aov` takes the
-    first one, and the outline of what is cut off would show.
+    """Render what guides the denoiser: diffuse reflectance and shading normal.
+
+    It is the integrator `advsearch_guides`: three channels each, of the first hit that
+    light does not pass. Mitsuba's `aov` takes the very first hit, and the outline of
+    what is cut off would show.
     """
 
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> Any:
-        going = mi.Bool(active)
+        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`."""
+        active = mi.Bool(active)
         ray = mi.Ray3f(ray)
         covered = mi.Bool(False)
         albedo = mi.Spectrum(0.0)
         normal = mi.Normal3f(0.0)
-        while going:
-            si = scene.ray_intersect(ray, going)
-            going &= si.is_valid()
+        while active:
+            si = scene.ray_intersect(ray, active)
+            active &= si.is_valid()
             bsdf = si.bsdf()
-            clear = dr.max(bsdf.eval_null_transmission(si, going))
-            passes = going & (sampler.next_1d(going) < clear)
-            seen = going & ~passes
-            albedo[seen] = bsdf.eval_diffuse_reflectance(si, seen)
-            normal[seen] = si.sh_frame.n
-            covered |= seen
+            transmittance = dr.max(bsdf.eval_null_transmission(si, active))
+            passes = active & (sampler.next_1d(active) < transmittance)
+            stops = active & ~passes
+            albedo[stops] = bsdf.eval_diffuse_reflectance(si, stops)
+            normal[stops] = si.sh_frame.n
+            covered |= stops
             ray = si.spawn_ray(ray.d)
-            going = passes
+            active = passes
         return albedo, covered, [*albedo, *normal]
 
     def aov_names(self) -> list[str]:
-        return [
-            f"{name}.{channel}" for name in ("albedo", "normal") for channel in "XYZ"
-        ]
+        names = ("albedo", "normal")
+        return [f"{name}.{channel}" for name in names for channel in "XYZ"]
 
 
 mi.register_integrator("advsearch_guides", Guides)
 
 
-CELLS = (128, 512)  # fewest and most cells along a side of the grid
+MIN_CELLS = 128  # along a side of the grid of ray directions
+MAX_CELLS = 512
+NO_DROP = (0.0, 0.0, -1.0, 1.0)  # center, radius and curvature: a drop without inside
 
 
-def _transmitted(before: Any, behind: Any, first: float, second: float) -> Any:
-    """Fresnel's share of unpolarised light that passes from a medium with the index of
-    refraction `first` into one with `second`, where the angles to the normal have these
-    cosines.
+def _transmittance(
+    cos_incident: Any, cos_refracted: Any, ior_incident: float, ior_refracted: float
+) -> Any:
+    """Return Fresnel's transmittance of unpolarised light between two media.
+
+    Args:
+        cos_incident, cos_refracted: cosines of the angles to the normal.
+        ior_incident, ior_refracted: indices of refraction of the two media.
     """
-    across = (first * before - second * behind) / (first * before + second * behind)
-    along = (second * before - first * behind) / (second * before + first * behind)
-    return 1.0 - 0.5 * (across * across + along * along)
+    s_polarised = (ior_incident * cos_incident - ior_refracted * cos_refracted) / (
+        ior_incident * cos_incident + ior_refracted * cos_refracted
+    )
+    p_polarised = (ior_refracted * cos_incident - ior_incident * cos_refracted) / (
+        ior_refracted * cos_incident + ior_incident * cos_refracted
+    )
+    return 1.0 - 0.5 * (s_polarised * s_polarised + p_polarised * p_polarised)
+
+
+def _refract_through_drop(
+    direction: Any, dx: Any, dy: Any, drop: Any
+) -> tuple[Any, Any, Any]:
+    """Refract rays into a drop's flat side and out of its cap.
+
+    Args:
+        direction: unit direction before the drop.
+        dx, dy: where the ray enters, from the drop's center, millimetres.
+        drop: center, radius and curvature radius, as in `raindrops`.
+
+    Returns:
+        The direction behind the drop, not normalised; the fraction of the light that
+        passes; and whether the ray is lost by total reflection.
+    """
+    inner = mi.Vector3f(direction.x / WATER, direction.y / WATER, 0.0)
+    inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
+
+    # From the center of curvature: where the ray enters, and where it leaves.
+    entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
+    along = dr.dot(entry, inner)
+    exit_distance = (
+        dr.safe_sqrt(along * along - dr.squared_norm(entry) + drop.w * drop.w) - along
+    )
+    exit_point = entry + inner * exit_distance
+    normal = exit_point / drop.w
+
+    cos_inside = dr.dot(inner, normal)
+    cos_outside_squared = 1.0 - WATER * WATER * (1.0 - cos_inside * cos_inside)
+    cos_outside = dr.safe_sqrt(cos_outside_squared)
+    outer = WATER * inner + (cos_outside - WATER * cos_inside) * normal
+    transmitted = _transmittance(direction.z, inner.z, 1.0, WATER) * _transmittance(
+        cos_inside, cos_outside, WATER, 1.0
+    )
+    is_lost = (cos_outside_squared <= 0.0) | (outer.z <= 0.0)
+    return outer, transmitted, is_lost
 
 
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
-    """The sensor `advsearch_camera`: a `CameraModel` at a place.
+    """Sample rays of a `CameraModel` at a pose: the sensor `advsearch_camera`.
 
-    The directions of rays are kept on a grid over the picture, from Newton's method,
+    The directions of rays are stored on a grid over the image, from Newton's method,
     and in between are bilinear: the grid is so fine that this is off by less than a
-    hundredth of a pixel, but for the last pixels before a fold. Every sample of a
-    picture has a ray of its own, so that edges are as sharp as a pinhole's.
+    hundredth of a pixel, but for the last pixels before a fold. Every sample of an
+    image has a ray of its own, so that edges are as sharp as a pinhole's.
 
-    Drops of rain before it bend the rays:
-    `advsearch.scene.mitsuba_backend.own_plugins`.
+    Raindrops before the camera bend the rays, see the comment at the top.
 
     Parameters: `to_world`; `lens`, its numbers in the order of `NUMBERS`.
     """
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        numbers = tuple(float(props[name]) for name in NUMBERS)
+        values = tuple(float(props[name]) for name in NUMBERS)
         self._model = CameraModel(
-            str(props["kind"]), numbers, reach=float(props["reach"])
+            str(props["kind"]), values, reach=float(props["reach"])
         )
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
         self._cells = tuple(
-            max(CELLS[0], min(CELLS[1], int(side))) for side in self.film().crop_size()
+            max(MIN_CELLS, min(MAX_CELLS, int(size)))
+            for size in self.film().crop_size()
         )
         self.pose = mi.Transform4f(super().world_transform())
-        self.lens = mi.TensorXf(list(numbers), (len(NUMBERS),))
+        self.lens = mi.TensorXf(list(values), (len(NUMBERS),))
         self._make_rays()
-        self._half = 0.0  # of the square with drops, where there are some
+        self._half = 0.0  # width of the square with drops; 0 without drops
         if "drops" in props:
-            asked = (
-                int(props["drops"]),
-                float(props["drop_size"]),
-                int(props["drop_seed"]),
-            )
-            self._half, drops, grid = raindrops(*asked, float(props["drop_tangent"]))
-            self._which = mi.UInt32(grid.reshape(-1).astype("uint32"))
-            none = [[0.0, 0.0, -1.0, 1.0]]  # a drop without inside, where there is none
-            self._caps = mi.Float(
-                np.concatenate([drops, none]).astype("float32").reshape(-1)
-            )
-            dr.eval(self._which, self._caps)
-            self.m_needs_sample_3 = True
+            self._make_drops(props)
+
+    def _make_drops(self, props: Any) -> None:
+        """Sample the raindrops that the sensor's properties describe."""
+        self._half, drops, grid = raindrops(
+            int(props["drops"]),
+            float(props["drop_size"]),
+            int(props["drop_seed"]),
+            float(props["drop_tangent"]),
+        )
+        self._drop_of_cell = mi.UInt32(grid.reshape(-1).astype("uint32"))
+        # The grid has the index after the last drop where there is none.
+        table = np.concatenate([drops, [NO_DROP]]).astype("float32")
+        self._drops = mi.Float(table.reshape(-1))
+        dr.eval(self._drop_of_cell, self._drops)
+        self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
         super().traverse(cb)
@@ -402,121 +514,122 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray_differential(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> Any:
-        """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray
-        of weight 0 that hits nothing.
+        """Sample rays and weights; see `mi.Sensor.sample_ray_differential`.
+
+        Where the lens has no direction, the ray has weight 0 and hits nothing.
         """
-        ahead, inside = self._looked_up(sample2)
-        passed = mi.Float(1.0)
+        direction, is_inside = self._look_up_direction(sample2)
+        transmitted = mi.Float(1.0)
         if self._half > 0.0:
-            ahead, passed = self._through_drops(ahead, sample3)
-        weight = dr.select(inside, passed, 0.0)
-        # all of it, or it would be ragged for derivatives
+            direction, transmitted = self._bend_by_drops(direction, sample3)
+        weight = dr.select(is_inside, transmitted, 0.0)
+        # Every field is set: a ragged ray has no derivatives.
         ray = dr.zeros(mi.RayDifferential3f)
         ray.time = time
-        ray.o = self.pose @ mi.Point3f(self._near * ahead)
-        ray.d = self.pose @ mi.Vector3f(ahead)
+        ray.o = self.pose @ mi.Point3f(self._near * direction)
+        ray.d = self.pose @ mi.Vector3f(direction)
         ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
         return ray, mi.Spectrum(weight)
 
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
     ) -> Any:
+        """Sample rays and weights; see `mi.Sensor.sample_ray`."""
         ray, weight = self.sample_ray_differential(
             time, sample1, sample2, sample3, active
         )
         return mi.Ray3f(ray), weight
 
-    def without_drops(self, time: Any, place: Any) -> Any:
-        """`sample_ray` where no drop is before the camera: what is true of a picture is
-        so of the scene.
+    def sample_ray_without_drops(self, time: Any, position: Any) -> Any:
+        """Sample rays as if no drop were before the camera.
+
+        Ground truth such as depth is that of the scene behind the drops.
         """
-        half = self._half
+        half_width = self._half
         self._half = 0.0
         try:
-            return self.sample_ray(time, 0.5, place, mi.Point2f(0.5))
+            return self.sample_ray(time, 0.5, position, mi.Point2f(0.5))
         finally:
-            self._half = half
+            self._half = half_width
 
-    def _through_drops(self, ahead: Any, sample: Any) -> tuple[Any, Any]:
+    def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
+        """Refract the rays that meet a drop.
+
+        Returns:
+            The unit directions, and the fraction of the light that passes (1 without a
+            drop, 0 where a drop reflects it inside).
+        """
         lens = APERTURE * mi.warp.square_to_uniform_disk_concentric(sample)
-        half = self._half
-        reach = DISTANCE / dr.maximum(ahead.z, 1e-3)
-        x = ahead.x * reach + lens.x
-        y = ahead.y * reach + lens.y
-        column, row = ((at + half) * (GRID / (2.0 * half)) for at in (x, y))
-        there = (
-            (ahead.z > 0.1)
-            & (column >= 0.0)
-            & (column < GRID)
-            & (row >= 0.0)
-            & (row < GRID)
-        )
-        cell = mi.UInt32(dr.clip(row, 0.0, GRID - 1.0)) * GRID + mi.UInt32(
-            dr.clip(column, 0.0, GRID - 1.0)
-        )
-        cap = dr.gather(
-            mi.Vector4f, self._caps, dr.gather(mi.UInt32, self._which, cell, there)
-        )
-        dx = x - cap.x
-        dy = y - cap.y
-        wet = there & (cap.z > 0.0) & (dx * dx + dy * dy < cap.z * cap.z)
+        reach = DISTANCE / dr.maximum(direction.z, 1e-3)
+        x = direction.x * reach + lens.x
+        y = direction.y * reach + lens.y
+        drop, dx, dy, is_hit = self._find_drop(x, y, direction.z > 0.1)
+        refracted, transmitted, is_lost = _refract_through_drop(direction, dx, dy, drop)
+        weight = dr.select(is_hit, dr.select(is_lost, 0.0, transmitted), 1.0)
+        bent = dr.select(is_hit & ~is_lost, dr.normalize(refracted), direction)
+        return bent, weight
 
-        inner = mi.Vector3f(ahead.x / WATER, ahead.y / WATER, 0.0)
-        inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
-        # from the middle of the curvature
-        start = mi.Vector3f(dx, dy, dr.safe_sqrt(cap.w * cap.w - cap.z * cap.z))
-        along = dr.dot(start, inner)
-        out = start + inner * (
-            dr.safe_sqrt(along * along - dr.squared_norm(start) + cap.w * cap.w) - along
+    def _find_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Find the drop at a point of the sheet, in millimetres.
+
+        Returns:
+            The drop's four numbers, as in `raindrops`; the point's x and y from the
+            drop's center; and whether there is a drop at all.
+        """
+        half_width = self._half
+        cells_per_mm = GRID / (2.0 * half_width)
+        column = (x + half_width) * cells_per_mm
+        row = (y + half_width) * cells_per_mm
+        on_grid = (
+            active & (column >= 0.0) & (column < GRID) & (row >= 0.0) & (row < GRID)
         )
-        normal = out / cap.w
-        cosine = dr.dot(inner, normal)
-        beyond = 1.0 - WATER * WATER * (1.0 - cosine * cosine)
-        leaving = dr.safe_sqrt(beyond)
-        outer = WATER * inner + (leaving - WATER * cosine) * normal
-        passed = _transmitted(ahead.z, inner.z, 1.0, WATER) * _transmitted(
-            cosine, leaving, WATER, 1.0
-        )
-        lost = (beyond <= 0.0) | (outer.z <= 0.0)  # reflected inside
-        weight = dr.select(wet, dr.select(lost, 0.0, passed), 1.0)
-        return dr.select(wet & ~lost, dr.normalize(outer), ahead), weight
+        row_index = mi.UInt32(dr.clip(row, 0.0, GRID - 1.0))
+        column_index = mi.UInt32(dr.clip(column, 0.0, GRID - 1.0))
+        cell = row_index * GRID + column_index
+        drop_index = dr.gather(mi.UInt32, self._drop_of_cell, cell, on_grid)
+        drop = dr.gather(mi.Vector4f, self._drops, drop_index)
+        dx = x - drop.x
+        dy = y - drop.y
+        is_hit = on_grid & (drop.z > 0.0) & (dx * dx + dy * dy < drop.z * drop.z)
+        return drop, dx, dy, is_hit
 
     def _make_rays(self) -> None:
-        wide, tall = self._cells
-        across, down = (
-            torch.linspace(0.0, 1.0, cells + 1, dtype=torch.float64)
-            for cells in (wide, tall)
-        )
-        places = torch.stack(
-            torch.meshgrid(across, down, indexing="xy"), dim=-1
-        ).reshape(-1, 2)
+        """Compute the grid of ray directions from the lens's numbers."""
+        n_columns, n_rows = self._cells
+        x = torch.linspace(0.0, 1.0, n_columns + 1, dtype=torch.float64)
+        y = torch.linspace(0.0, 1.0, n_rows + 1, dtype=torch.float64)
+        positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         with torch.no_grad():
-            table = self._model.with_numbers(self.lens.torch().cpu()).table(places)
+            model = self._model.with_numbers(self.lens.torch().cpu())
+            table = model.table(positions.reshape(-1, 2))
         self.rays = mi.Float(table.reshape(-1).contiguous())
         dr.eval(self.rays)
 
-    def _looked_up(self, place: Any) -> tuple[Any, Any]:
-        """Direction at a place in the picture, and whether the lens sees anything
-        there.
+    def _look_up_direction(self, position: Any) -> tuple[Any, Any]:
+        """Return the unit direction at a position in [0, 1]^2 of the image.
+
+        The second value is whether the lens has a direction there at all.
         """
-        wide, tall = self._cells
-        x = place.x * wide
-        y = place.y * tall
-        column = dr.clip(mi.Int32(dr.floor(x)), 0, wide - 1)
-        row = dr.clip(mi.Int32(dr.floor(y)), 0, tall - 1)
-        right = x - mi.Float(column)
-        down = y - mi.Float(row)
-        first = mi.UInt32(row * (wide + 1) + column)
-        upper, lower = (
-            dr.lerp(
-                dr.gather(mi.Vector4f, self.rays, at),
-                dr.gather(mi.Vector4f, self.rays, at + 1),
-                right,
-            )
-            for at in (first, first + (wide + 1))
-        )
-        ray = dr.lerp(upper, lower, down)
+        n_columns, n_rows = self._cells
+        x = position.x * n_columns
+        y = position.y * n_rows
+        column = dr.clip(mi.Int32(dr.floor(x)), 0, n_columns - 1)
+        row = dr.clip(mi.Int32(dr.floor(y)), 0, n_rows - 1)
+        x_fraction = x - mi.Float(column)
+        y_fraction = y - mi.Float(row)
+        upper_left = mi.UInt32(row * (n_columns + 1) + column)
+        upper = self._lerp_rays(upper_left, x_fraction)
+        lower = self._lerp_rays(upper_left + (n_columns + 1), x_fraction)
+        ray = dr.lerp(upper, lower, y_fraction)
         return dr.normalize(mi.Vector3f(ray.x, ray.y, ray.z)), ray.w > 0.0
+
+    def _lerp_rays(self, left: Any, fraction: Any) -> Any:
+        """Interpolate between an entry of the grid and the next one in its row."""
+        return dr.lerp(
+            dr.gather(mi.Vector4f, self.rays, left),
+            dr.gather(mi.Vector4f, self.rays, left + 1),
+            fraction,
+        )
 
 
 mi.register_sensor("advsearch_camera", ModelledCamera)

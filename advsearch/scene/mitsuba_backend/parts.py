@@ -1,6 +1,4 @@
-"""What a described scene is inside Mitsuba: plugins and inputs of each part, of camera,
-environment and ground.
-"""
+"""Translate a described scene to Mitsuba: plugins and inputs of each part."""
 
 from __future__ import annotations
 
@@ -33,27 +31,31 @@ from advsearch.scene.mitsuba_backend.variant import (
 )
 
 Write = Callable[[Any], Any]
-"""From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the
-Mitsuba parameter takes.
+"""Converts a Dr.Jit `TensorXf` to the type that the Mitsuba parameter takes.
+
+Gradients may be enabled.
 """
 # a single number, or a vertex buffer, which Mitsuba takes flat
 number: Write = attrgetter("array")
 
 
 def plain_number(value: Any) -> float:
-    """A single number that is the same for all light paths."""
+    """Return a single number that is a constant of the kernel."""
     return float(value.array[0])
 
 
 def color(value: Any) -> Any:
+    """Convert three numbers to a Mitsuba color."""
     return mi.Color3f(*_entries(value, 3))
 
 
 def point(value: Any) -> Any:
+    """Convert three numbers to a Mitsuba point."""
     return mi.Point3f(*_entries(value, 3))
 
 
 def transform(value: Any) -> Any:
+    """Convert a (4, 4) matrix to a Mitsuba transform."""
     entries = _entries(value, 16)
     return mi.Transform4f(
         mi.Matrix4f([entries[4 * row : 4 * row + 4] for row in range(4)])
@@ -61,20 +63,20 @@ def transform(value: Any) -> Any:
 
 
 def as_torch(value: Any) -> Tensor:
-    """Return a Dr.Jit value as a torch tensor with memory of its own."""
-    # Dr.Jit's own conversion gives a colour six entries
+    """Convert a Dr.Jit value to a torch tensor with memory of its own."""
+    # Dr.Jit's own conversion gives a color six entries
     if isinstance(value, (mi.Color3f, mi.Point3f)):
         return torch.cat([as_torch(component) for component in value])
     value = getattr(value, "matrix", value)
-    tensor: Tensor = (
-        value.torch()
-        if hasattr(value, "torch")
-        else torch.tensor(np.array(value, dtype=np.float32))
-    )
+    if hasattr(value, "torch"):
+        tensor: Tensor = value.torch()
+    else:
+        tensor = torch.tensor(np.array(value, dtype=np.float32))
     return tensor.clone()
 
 
 def _entries(value: Any, count: int) -> list[Any]:
+    """Return the first entries of a Dr.Jit tensor, one array for each."""
     return [
         dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)
     ]
@@ -95,34 +97,29 @@ class SceneInput:
     shape: tuple[int, ...] | None = None
     # Mitsuba's object that has the parameter, where `key` alone may mean several
     owner: Any = None
-    # the range that is rendered; a value beyond is moved to its nearer end, and keeps
-    # its derivative
+    # the range that is rendered; a value beyond is clamped to it, and keeps its
+    # derivative
     within: tuple[float, float] | None = None
 
     def rendered(self, value: Tensor) -> Tensor:
-        """Return what is set for a value: float32 with memory in order."""
+        """Return what is set for a value: contiguous float32 within the range."""
         value = value.detach().to(torch.float32).contiguous()
         return value.clamp(*self.within) if self.within else value
 
 
 def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
-    """Return the one parameter that an input means, or None if the scene has none
-    such.
-    """
-    before, star, after = scene_input.key.partition("*")
-    keys = [
-        str(key)
-        for key in parameters.keys()
-        if (
-            key.startswith(before) and key.endswith(after)
-            if star
-            else key == scene_input.key
-        )
-        and (
-            scene_input.owner is None
-            or parameters.properties[key][2] is scene_input.owner
-        )
-    ]
+    """Return the one parameter of Mitsuba that an input means; None without one."""
+    prefix, star, suffix = scene_input.key.partition("*")
+
+    def matches(key: str) -> bool:
+        if star and not (key.startswith(prefix) and key.endswith(suffix)):
+            return False
+        if not star and key != scene_input.key:
+            return False
+        owner = scene_input.owner
+        return owner is None or parameters.properties[key][2] is owner
+
+    keys = [str(key) for key in parameters.keys() if matches(key)]
     if len(keys) > 1:
         raise RuntimeError(
             f"expected one Mitsuba parameter {scene_input.key}, found {keys}"
@@ -133,7 +130,7 @@ def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
 SURFACE_KEYS = {
     name: f"{name}.value" for name in ("roughness", "metallic", "clearcoat")
 } | {"specular": "specular"}
-"""Where the principled surface has its numbers."""
+"""Keys of the principled surface's numbers."""
 IDLE_LOBES: Plugin = {
     name: {"type": "uniform", "value": 0.0} for name in ("clearcoat", "sheen")
 }
@@ -142,21 +139,23 @@ IDLE_LOBES: Plugin = {
 
 @dataclass(frozen=True)
 class Translation:
-    """A part inside Mitsuba: entries of the scene's dictionary by name, of which one
-    that the scene has already ("environment") is replaced; what may be set, with base
-    values that `plugins` made; and entries that replace those of the path integrator's
-    dictionary (another type, for a medium).
-    """
+    """A part of a scene inside Mitsuba."""
 
+    # entries of the scene's dictionary by name; one that the scene has already
+    # ("environment") is replaced
     plugins: Plugin
+    # what may be set; the base values are those of `plugins`
     inputs: tuple[SceneInput, ...] = ()
+    # entries that replace those of the path integrator's dictionary (another type, for
+    # a medium)
     integrator: Plugin = field(default_factory=dict)
 
 
 @singledispatch
 def translation(part: parts.ScenePart) -> Translation:
-    """Return what a part is inside Mitsuba. Further kinds of parts are registered:
-    `@translation.register`.
+    """Return what a part is inside Mitsuba.
+
+    Further kinds of parts are registered: `@translation.register`.
     """
     raise TypeError(
         f"part {part.name}: {type(part).__name__} has no translation for "
@@ -166,47 +165,36 @@ def translation(part: parts.ScenePart) -> Translation:
 
 @translation.register
 def mesh_translation(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
-    """A mesh; `lobes` are further entries of the principled plugin, such as
-    `IDLE_LOBES`.
+    """Return what a mesh is inside Mitsuba.
+
+    `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`.
     """
     name = part.name
-    count = len(part.mesh.vertices)
+    shape = (len(part.mesh.vertices), 3)
+    vertices_key = f"{name}.{meshes.POSITIONS}"
+    normals_key = f"{name}.{meshes.NORMALS}"
     inputs = [
-        SceneInput(
-            f"{name}.vertices", f"{name}.{meshes.POSITIONS}", number, shape=(count, 3)
-        ),
-        SceneInput(
-            f"{name}.normals", f"{name}.{meshes.NORMALS}", number, shape=(count, 3)
-        ),
+        SceneInput(f"{name}.vertices", vertices_key, number, shape=shape),
+        SceneInput(f"{name}.normals", normals_key, number, shape=shape),
     ]
     if part.surface is None:
         surface = meshes.principled(part, lobes)
-        inputs.append(
-            SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True)
-        )
-        inputs += [
-            SceneInput(
-                f"{name}.{what}",
-                f"{name}.*.{key}",
-                number,
-                True,
-                (1,),
-                within=meshes.RENDERED.get(what),
-            )
-            for what, key in SURFACE_KEYS.items()
-        ]
+        inputs += _principled_inputs(name)
     else:
 
         def fill(options: Mapping[str, object]) -> object:
-            made = mi.load_dict(
+            texture = mi.load_dict(
                 meshes.base_texture(part.base_color, options), optimize=False
             )
             inputs.append(
                 SceneInput(
-                    f"{name}.base_color", f"{name}.*.data", interior=True, owner=made
+                    f"{name}.base_color",
+                    f"{name}.*.data",
+                    interior=True,
+                    owner=texture,
                 )
             )
-            return made
+            return texture
 
         surface = meshes.own_surface(part.surface, fill)
     if meshes.textured_emission(part):
@@ -217,62 +205,86 @@ def mesh_translation(part: parts.MeshPart, lobes: Plugin | None = None) -> Trans
         )
     elif part.emission is not None:
         inputs.append(_light(name, "radiance", "emitter.radiance"))
-    return Translation(
-        {
-            name: meshes.mitsuba_mesh(
-                name, part.mesh, part.to_world, surface, meshes.emitter(part)
-            )
-        },
-        tuple(inputs),
+    mesh = meshes.mitsuba_mesh(
+        name, part.mesh, part.to_world, surface, meshes.emitter(part)
     )
+    return Translation({name: mesh}, tuple(inputs))
 
 
-def _light(name: str, what: str, key: str) -> SceneInput:
-    return SceneInput(f"{name}.{what}", f"{name}.{key}.value", color, True, (3,))
+def _principled_inputs(name: str) -> list[SceneInput]:
+    """Return the inputs of a mesh's principled surface."""
+    base_color = SceneInput(
+        f"{name}.base_color", f"{name}.*.base_color.data", interior=True
+    )
+    return [base_color] + [
+        SceneInput(
+            f"{name}.{parameter}",
+            f"{name}.*.{key}",
+            number,
+            interior=True,
+            shape=(1,),
+            within=meshes.RENDERED.get(parameter),
+        )
+        for parameter, key in SURFACE_KEYS.items()
+    ]
 
 
-def _pose(name: str, what: str) -> SceneInput:
-    return SceneInput(f"{name}.{what}", f"{name}.to_world", transform, shape=(4, 4))
+def _light(name: str, parameter: str, key: str) -> SceneInput:
+    """Return the input of a part's light, a color."""
+    return SceneInput(f"{name}.{parameter}", f"{name}.{key}.value", color, True, (3,))
+
+
+def _pose(name: str, parameter: str) -> SceneInput:
+    """Return the input of a part's pose."""
+    return SceneInput(
+        f"{name}.{parameter}", f"{name}.to_world", transform, shape=(4, 4)
+    )
 
 
 @translation.register
 def _plugin(part: parts.PluginPart) -> Translation:
-    return Translation(
-        {part.name: meshes.loadable(part.plugin)},
-        (),
-        {"type": "prbvolpath"} if part.volumetric else {},
-    )
+    integrator = {"type": "prbvolpath"} if part.volumetric else {}
+    plugins = {part.name: meshes.loadable(part.plugin)}
+    return Translation(plugins, integrator=integrator)
 
 
 @translation.register
 def _numbers(part: parts.PluginNumbers) -> Translation:
-    inputs = []
-    for own in part.numbers:
-        if own.input.startswith(f"{part.name}."):
-            write = (
-                plain_number if own.plain else color if len(own.values) == 3 else number
-            )
-            surface = next(
-                (
-                    name
-                    for name, key in SURFACE_KEYS.items()
-                    if own.key.endswith(f".{key}")
-                ),
-                "",
-            )
-            exact = "adjoint" in own.valid
-            shape = (len(own.values),)
-            inputs.append(
-                SceneInput(
-                    own.input,
-                    own.key,
-                    write,
-                    exact,
-                    shape,
-                    within=meshes.RENDERED.get(surface),
-                )
-            )
-    return Translation({}, tuple(inputs))
+    return Translation(
+        {},
+        tuple(
+            _plugin_number_input(plugin_number)
+            for plugin_number in part.numbers
+            if plugin_number.input.startswith(f"{part.name}.")
+        ),
+    )
+
+
+def _plugin_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
+    """Return the input of a number or a color of a Mitsuba scene."""
+    write: Write
+    if plugin_number.plain:
+        write = plain_number
+    elif len(plugin_number.values) == 3:
+        write = color
+    else:
+        write = number
+    surface_parameters = [
+        parameter
+        for parameter, key in SURFACE_KEYS.items()
+        if plugin_number.key.endswith(f".{key}")
+    ]
+    within = None
+    if surface_parameters:
+        within = meshes.RENDERED.get(surface_parameters[0])
+    return SceneInput(
+        plugin_number.input,
+        plugin_number.key,
+        write,
+        interior="adjoint" in plugin_number.valid,
+        shape=(len(plugin_number.values),),
+        within=within,
+    )
 
 
 @translation.register
@@ -291,9 +303,12 @@ def _point(part: parts.PointLamp) -> Translation:
 def _spot(part: parts.SpotLamp) -> Translation:
     cutoff, beam = part.cone
     lamp = {
-        "type": "spot", "to_world": mi.ScalarTransform4f(part.to_world), "intensity": _rgb(part.intensity),
-        "cutoff_angle": cutoff, "beam_width": beam,
-    }  # fmt: skip
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f(part.to_world),
+        "intensity": _rgb(part.intensity),
+        "cutoff_angle": cutoff,
+        "beam_width": beam,
+    }
     return Translation(
         {part.name: lamp}, (_light(part.name, "intensity", "intensity"),)
     )
@@ -301,30 +316,36 @@ def _spot(part: parts.SpotLamp) -> Translation:
 
 @translation.register
 def _ball(part: parts.BallLamp) -> Translation:
+    pose = mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius)
     ball = {
-        "type": "sphere", "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
-        "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
-    }  # fmt: skip
+        "type": "sphere",
+        "to_world": pose,
+        "bsdf": {"type": "null"},
+        "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
+    }
     inputs = _pose(part.name, "ball"), _light(part.name, "radiance", "emitter.radiance")
     return Translation({part.name: ball}, inputs)
 
 
 @translation.register
 def _projector(part: parts.ProjectorPart) -> Translation:
-    """Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white
+    """Return a projector.
+
+    Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white
     screen's radiance.
     """
     name = part.name
-    picture = {
+    image = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)),
         "raw": True,
+        "wrap_mode": "clamp",
     }
     projector = {
         "type": "projector",
         "fov": part.fov,
         "fov_axis": "x",
-        "irradiance": {**picture, "wrap_mode": "clamp"},
+        "irradiance": image,
     }
     pattern = SceneInput(f"{name}.pattern", f"{name}.irradiance.data", interior=True)
     return Translation({name: projector}, (_pose(name, "pose"), pattern))
@@ -332,25 +353,33 @@ def _projector(part: parts.ProjectorPart) -> Translation:
 
 @translation.register
 def _beam(part: parts.BeamLamp) -> Translation:
-    """Mitsuba's projector puts pi times its texture on a plane before it, where an
+    """Return a headlamp's beam as a projector.
+
+    Mitsuba's projector puts pi times its texture on a plane before it, where an
     intensity I puts I cos^3.
     """
     height, width = part.table.shape
-    aside = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
-    up = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
-    cosine = (1.0 + aside[None] ** 2 + (up[:, None] * height / width) ** 2) ** -0.5
-    picture = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
+    x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
+    y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
+    cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
+    image = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
     lamp = {
-        "type": "projector", "to_world": mi.ScalarTransform4f(part.to_world), "fov": 90.0, "fov_axis": "x",
-        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"}, "sampling_weight": part.weight,
-    }  # fmt: skip
+        "type": "projector",
+        "to_world": mi.ScalarTransform4f(part.to_world),
+        "fov": 90.0,
+        "fov_axis": "x",
+        "irradiance": {**meshes.texture(image), "wrap_mode": "clamp"},
+        "sampling_weight": part.weight,
+    }
     return Translation({part.name: lamp}, (_pose(part.name, "to_world"),))
 
 
 @translation.register
 def _haze(part: parts.HazePart) -> Translation:
-    """Mitsuba's medium only holds density and albedo for the integrator: no shape
-    refers to it.
+    """Return a haze.
+
+    Mitsuba's medium only holds density and albedo for the integrator: no shape refers
+    to it.
     """
     name = part.name
     albedo = _rgb(part.albedo)
@@ -358,7 +387,7 @@ def _haze(part: parts.HazePart) -> Translation:
         {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
         optimize=False,
     )
-    # for good: Mitsuba does not let go of it
+    # for good: Mitsuba does not release it
     population.add(population, media=(medium,))
     inputs = (
         SceneInput(
@@ -386,68 +415,85 @@ def scene_dict(
     filter: str,
     sampler: str,
 ) -> Plugin:
-    """Mitsuba's dictionary of a scene: its camera, its environment and the ground;
-    objects come as parts.
+    """Return Mitsuba's dictionary of a scene's camera, environment and ground.
+
+    Objects come as parts.
     """
     height, width = resolution
-    place = mi.ScalarTransform4f
-    number = description.number
-    film = {
-        "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba" if description.backdrop else "rgb",
-        "component_format": "float32", "rfilter": {"type": filter},
-    }  # fmt: skip
+    to_world = camera_to_world(description, width / height)
     camera: Plugin = {
-        **_lens(description), "near_clip": 0.01, "far_clip": 1e5,
-        "to_world": place(camera_to_world(description, width / height)), "film": film, "sampler": {"type": sampler},
-    }  # fmt: skip
+        **_lens(description),
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba" if description.backdrop else "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": filter},
+        },
+        "sampler": {"type": sampler},
+    }
     scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
+        radiance = description.environment.radiance
+        rotation = description.number("environment.rotation")
         scene["environment"] = {
             "type": "envmap",
-            "bitmap": mi.Bitmap(
-                np.ascontiguousarray(description.environment.radiance, dtype=np.float32)
-            ),
-            "scale": 2.0 ** number("environment.exposure"),
-            "to_world": place()
-            .rotate([0, 0, 1], number("environment.rotation"))
+            "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
+            "scale": 2.0 ** description.number("environment.exposure"),
+            "to_world": mi.ScalarTransform4f()
+            .rotate([0, 0, 1], rotation)
             .rotate([1, 0, 0], 90),
         }
+    ground = _ground(description)
+    if ground is not None:
+        scene[GROUND] = ground
+    return scene
+
+
+def _ground(description: SceneDescription) -> Any:
+    """Return the ground: a photographed one, a plain one, or None."""
     photograph = description.photograph
     if photograph is not None:
-        scene[GROUND] = meshes.mitsuba_mesh(
-            GROUND, photograph.mesh, np.eye(4), meshes.matt(photograph.base.numpy())
-        )
-    elif number("ground.size") > 0.0 and not paved(description):
-        reflectance = _rgb(
-            srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
-        )
-        scene[GROUND] = {
-            "type": "rectangle",
-            "to_world": place().scale(number("ground.size") / 2.0),
-            "bsdf": {
-                "type": "twosided",
-                "bsdf": {"type": "diffuse", "reflectance": reflectance},
-            },
-        }
-    return scene
+        surface = meshes.matt(photograph.base.numpy())
+        return meshes.mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), surface)
+    size = description.number("ground.size")
+    if not size > 0.0 or paved(description):
+        return None
+    srgb = np.array(description.ground_color, np.float32)
+    reflectance = _rgb(srgb_to_linear(srgb).tolist())
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale(size / 2.0),
+        "bsdf": {
+            "type": "twosided",
+            "bsdf": {"type": "diffuse", "reflectance": reflectance},
+        },
+    }
 
 
 @contextlib.contextmanager
 def refusing(description: SceneDescription) -> Iterator[None]:
-    """What Mitsuba says of plugins that are the user's, the object's surface among
-    them, while they are loaded inside.
+    """Turn Mitsuba's errors about the user's plugins into input errors.
+
+    The object's surface may be such a plugin. They are loaded inside the `with`.
 
     Raises:
         InputError: Mitsuba refuses them.
     """
-    own = description.object.surface is not None and not description.object.finishes
+    object_asset = description.object
+    has_user_surface = object_asset.surface is not None and not object_asset.finishes
+    has_user_plugins = any(
+        isinstance(part, parts.PluginPart) for part in description.parts
+    )
     try:
         with fewer_warnings():
             yield
     except (RuntimeError, TypeError, ValueError) as error:
-        if not own and not any(
-            isinstance(part, parts.PluginPart) for part in description.parts
-        ):
+        if not has_user_surface and not has_user_plugins:
             raise
         reason = " ".join(str(error).split())
         raise InputError(
@@ -457,6 +503,7 @@ def refusing(description: SceneDescription) -> Iterator[None]:
 
 
 def _lens(description: SceneDescription) -> Plugin:
+    """Return the plugin of the camera's lens, without pose and film."""
     model = description.camera_model
     drops = description.number("camera.drops")
     if model is None:
@@ -490,38 +537,44 @@ def _lens(description: SceneDescription) -> Plugin:
             name: description.number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        half = math.radians(description.number("camera.fov")) / 2.0
-        camera["drop_tangent"] = max(model.tangents) if model.name else math.tan(half)
+        half_fov = math.radians(description.number("camera.fov")) / 2.0
+        if model.name:
+            camera["drop_tangent"] = max(model.tangents)
+        else:
+            camera["drop_tangent"] = math.tan(half_fov)
     return camera
 
 
-# what Mitsuba calls numbers of the camera, by the names of our inputs
+# Mitsuba's names of numbers of the camera, by the names of our inputs
 CAMERA_NUMBERS = {
-    "shift_x": "principal_point_offset_x", "shift_y": "principal_point_offset_y", "aperture": "aperture_radius",
+    "shift_x": "principal_point_offset_x",
+    "shift_y": "principal_point_offset_y",
+    "aperture": "aperture_radius",
     "focus": "focus_distance",
-}  # fmt: skip
+}
 
 
 def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
-    """The inputs of camera, environment and ground; our field of view is along the
-    larger side, Mitsuba's the width.
+    """Return the inputs of camera, environment and ground.
+
+    Our field of view is along the larger side of the image, Mitsuba's along the width.
     """
     height, width = resolution
 
-    def along_width(value: Any) -> Any:
-        half = dr.deg2rad(value.array) / 2.0
-        return mi.Float(
-            2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height)))
-        )
+    def to_horizontal_fov(value: Any) -> Any:
+        half_fov = dr.deg2rad(value.array) / 2.0
+        half_tangent = dr.tan(half_fov) * min(1.0, width / height)
+        return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
+    camera_inputs = [
+        SceneInput(f"camera.{name}", f"camera.{key}", number, shape=(1,))
+        for name, key in CAMERA_NUMBERS.items()
+    ]
     return (
         _pose("camera", "to_world"),
-        SceneInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
+        SceneInput("camera.fov", "camera.x_fov", to_horizontal_fov, shape=(1,)),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
-        *(
-            SceneInput(f"camera.{name}", f"camera.{key}", number, shape=(1,))
-            for name, key in CAMERA_NUMBERS.items()
-        ),
+        *camera_inputs,
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
         SceneInput("environment.padded", "environment.data", interior=True),

@@ -1,16 +1,15 @@
-"""A described scene inside Mitsuba: built once, changed only through named inputs,
-rendered and differentiated.
+"""A described scene inside Mitsuba, changed only through named inputs.
 
-Inputs are torch tensors with names of ours (`object.base_color`), so that nothing
-outside this room knows Mitsuba's parameter paths. Every call states all inputs it wants
-changed; those it does not name have their base values, so that no configuration is ever
-applied on top of another.
+It is built once, rendered and differentiated. Inputs are torch tensors with our own
+names (`object.base_color`), so that nothing outside this package knows Mitsuba's
+parameter paths. Every call states all inputs that it changes; all others have their
+base values, so that no configuration is ever applied on top of another.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -41,41 +40,43 @@ from advsearch.scene.mitsuba_backend.variant import (
     one_at_a_time,
     population,
 )
-from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
+from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
 from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE = 1000
 ROULETTE = 2
-"""Segments after which Russian roulette starts: never where paths soon leave the scene
-by themselves. Among houses it saves a third of the time without more noise; from 1 on,
-single gradients were a fifth off.
+"""Segments after which Russian roulette starts.
+
+It never starts where paths soon leave the scene by themselves. Among houses it saves a
+third of the time without more noise; from 1 on, single gradients were a fifth off.
 """
-# samples a pixel of the shadow term; without it a resting object's gradient has a
-# cosine of 0.66
+# samples per pixel of the shadow term; without it the gradient of an object on the
+# ground has a cosine of 0.66 to the true one
 SHADOW_SPP = 4
 # input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)
 BASE_COLOR = "object.base_color"
 
 
 class MitsubaScene:
-    """Renders one scene at one size.
+    """Render one scene at one size.
 
     Attributes:
-        depth: longest light path in segments of the renders now.
+        depth: current longest light path in segments.
         assembly: turns the inputs of a space into those of this scene.
-        made: of what scene, and with which filter.
+        made: the description, and the filter.
         names: every input that can be set.
         parameters: Mitsuba's own.
         roulette: segments of a light path after which Russian roulette starts.
-        declared: for each input the key among them, and what it takes.
-        interior: those that the interior adjoint differentiates correctly.
+        declared: for each input its key in `parameters`, and its definition.
+        interior: the inputs that the interior adjoint differentiates correctly.
 
     Args:
+        description: the scene.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
         leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything
-            only to measure what it brings.
+            only to measure what it saves.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `next_count`.
@@ -95,10 +96,11 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         with one_at_a_time:
-            import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401  (registers them; it needs the variant)
+            # it registers the plugins, which needs the variant
+            import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401
 
-            # first: kernels are compiled for the numbers of their objects, which it
-            # sets free
+            # First: kernels are compiled for the ids of their objects, which this
+            # releases.
             if population.unused:
                 population.bury()
             self.made = (description, filter)
@@ -107,10 +109,10 @@ class MitsubaScene:
             self.assembly = Assembly(description)
             self.max_depth = self.depth = max_depth
             self._leave_out = frozenset(leave_out)
+            # Dr.Jit can record neither of these
             unrecorded = description.thin_lens or any(
                 map(textured_emission, description.meshes.values())
             )
-            # Dr.Jit can record neither of these
             self._freeze = "tracing" in leave_out and not unrecorded
             self.roulette = ROULETTE if enclosed(description) else NO_ROULETTE
             self._pinhole = (
@@ -131,77 +133,90 @@ class MitsubaScene:
             if description.cut_out:
                 self._guides = {"type": "advsearch_guides"}
             self.volumetric = any(part.volumetric for part in description.parts)
-            plugins = parts.scene_dict(description, resolution, filter, sampler)
             self._path: Plugin = {"type": integrator}
-            with parts.refusing(description):
-                lobes = None if "lobes" in leave_out else parts.IDLE_LOBES
-                translated = [parts.mesh_translation(description.meshes[OBJECT], lobes)]
-                translated += [
-                    parts.translation(description.placed(part))
-                    for part in description.parts
-                ]
-                for part in translated:
-                    plugins |= part.plugins
-                    self._path |= part.integrator
-                # a path that meets a dark lamp by chance still counts, should it be lit
-                if "emitters" in leave_out:
-                    for lamp in description.parts:
-                        if isinstance(lamp, Lamp) and lamp.dark:
-                            plugins[lamp.name].get("emitter", plugins[lamp.name])[
-                                "sampling_weight"
-                            ] = 0.0
-                self._scene = mi.load_dict(plugins, optimize=False)
+            inputs = self._load_scene()
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
             for name, weight in sampling_weights(description.meshes.values()).items():
                 self.parameters[f"{name}.emitter.sampling_weight"] = weight
             self.parameters.update()
             self._integrators: dict[tuple[str, int], Any] = {}
-            inputs = [
-                *parts.scene_inputs(resolution),
-                *(own for part in translated for own in part.inputs),
-            ]
-            self.declared = {
-                own.name: (key, own)
-                for own in inputs
-                if (key := parts.key_of(self.parameters, own))
-            }
-            self.names = frozenset(self.declared)
-            self.interior = frozenset(
-                name for name, (_, takes) in self.declared.items() if takes.interior
-            )
-            self._buffers = frozenset(
-                n
-                for n, (key, _) in self.declared.items()
-                if key.endswith((POSITIONS, NORMALS))
-            )
-            self._literals = frozenset(
-                n
-                for n, (_, own) in self.declared.items()
-                if own.write is parts.plain_number
-            )
+            self._declare_inputs(inputs)
             self._base: dict[str, Any] = {}
             self._applied: dict[str, Tensor] = {}
             self._recorded = Recordings()
-            bounds = self._scene.shapes() if self.volumetric else []
-            media = [
-                side
-                for shape in bounds
-                for side in (shape.interior_medium(), shape.exterior_medium())
-            ]
-            held = self._scene, self._integrators, self.parameters
             population.add(
                 self,
-                *held,
-                media=tuple(medium for medium in media if medium is not None),
+                self._scene,
+                self._integrators,
+                self.parameters,
+                media=self._find_media(),
             )
             self._every: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
                 self._every = {name: self.base(name) for name in sorted(self.names)}
 
+    def _load_scene(self) -> list[parts.SceneInput]:
+        """Load Mitsuba's scene, and return the inputs that it may have."""
+        description, filter = self.made
+        plugins = parts.scene_dict(description, self.resolution, filter, self.sampler)
+        with parts.refusing(description):
+            lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
+            translations = [parts.mesh_translation(description.meshes[OBJECT], lobes)]
+            translations += [
+                parts.translation(description.placed(part))
+                for part in description.parts
+            ]
+            for translation in translations:
+                plugins |= translation.plugins
+                self._path |= translation.integrator
+            # A path that meets a dark lamp by chance still counts, should it be lit.
+            if "emitters" in self._leave_out:
+                for part in description.parts:
+                    if isinstance(part, Lamp) and part.dark:
+                        lamp = plugins[part.name]
+                        lamp.get("emitter", lamp)["sampling_weight"] = 0.0
+            self._scene = mi.load_dict(plugins, optimize=False)
+        inputs = list(parts.scene_inputs(self.resolution))
+        for translation in translations:
+            inputs += translation.inputs
+        return inputs
+
+    def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
+        """Set `declared`, `names` and `interior` by the inputs that the scene has."""
+        self.declared = dict[str, tuple[str, parts.SceneInput]]()
+        for scene_input in inputs:
+            key = parts.key_of(self.parameters, scene_input)
+            if key:
+                self.declared[scene_input.name] = (key, scene_input)
+        self.names = frozenset(self.declared)
+        self.interior = frozenset(
+            name
+            for name, (_, scene_input) in self.declared.items()
+            if scene_input.interior
+        )
+        self._buffers = frozenset(
+            name
+            for name, (key, _) in self.declared.items()
+            if key.endswith((POSITIONS, NORMALS))
+        )
+        self._literals = frozenset(
+            name
+            for name, (_, scene_input) in self.declared.items()
+            if scene_input.write is parts.plain_number
+        )
+
+    def _find_media(self) -> tuple[Any, ...]:
+        """Return the media inside and outside of all shapes."""
+        media = []
+        for shape in self._scene.shapes() if self.volumetric else []:
+            media += [shape.interior_medium(), shape.exterior_medium()]
+        return tuple(medium for medium in media if medium is not None)
+
     def like(self, **changes: Any) -> MitsubaScene:
-        """Return another scene made as this one was, but for `max_depth`, `sampler`,
-        `integrator` or `leave_out`.
+        """Return another scene made with the same arguments but for some changes.
+
+        What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
         description, filter = self.made
         settings = {
@@ -211,43 +226,41 @@ class MitsubaScene:
             **changes,
         }
         other = MitsubaScene(description, self.resolution, filter=filter, **settings)
-        for what in ("path", "guides"):
-            # one that comes later makes the recordings of all scenes stale
-            other._integrator(what)
+        # An integrator that is loaded later makes the recordings of all scenes stale.
+        for method in ("path", "guides"):
+            other._integrator(method)
         return other
 
     @contextmanager
     def shorter(self, depth: int | None) -> Iterator[None]:
-        """Render light paths of at most `depth` segments inside the `with`; None
-        changes nothing.
-        """
-        before = self.depth
+        """Limit light paths to `depth` segments inside the `with`, if it is not None."""
+        depth_before = self.depth
         self.depth = self.depth if depth is None else min(depth, self.max_depth)
         try:
             yield
         finally:
-            self.depth = before
+            self.depth = depth_before
 
     def next_count(self, samples: float, sampler: str | None = None) -> int:
-        """Return how many samples the scene's sampler, or another one, takes if it is
-        asked for at least so many.
+        """Return how many samples the sampler takes when at least `samples` are needed.
+
+        The scene's sampler is the default.
         """
         return next_count(sampler or self.sampler, samples)
 
     def base(self, name: str) -> Tensor:
-        """Return the base value of an input, as a fresh torch tensor of the input's
-        shape.
-        """
-        key, takes = self.declared[name]
+        """Return the base value of an input, as a fresh tensor of the input's shape."""
+        key, scene_input = self.declared[name]
         self._set({})
         value = parts.as_torch(self.parameters[key])
-        return value if takes.shape is None else value.reshape(takes.shape)
+        if scene_input.shape is None:
+            return value
+        return value.reshape(scene_input.shape)
 
     def pictures(
         self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int
     ) -> list[Tensor]:
-        """Render pictures of one configuration with `spp` independent samples a pixel
-        each.
+        """Render images of one configuration, each with independent samples.
 
         A render is recorded on first use and replayed later. Only primal ones are:
         Dr.Jit 1.5.0 corrupts memory when it replays some adjoints (a texture of 32 x 32
@@ -255,10 +268,10 @@ class MitsubaScene:
 
         Args:
             inputs: what differs from the base values.
-            seeds: what is wanted, each with the number of its noise: "path", the linear
-                radiance; "hidden", the same without what the environment shows
-                directly, for a backdrop; "guides", what guides the denoiser.
-            spp: samples a pixel.
+            seeds: seed of each image: "path", the linear radiance; "hidden", the same
+                without what the environment shows directly, for a backdrop; "guides",
+                what guides the denoiser.
+            spp: samples per pixel.
 
         Returns:
             For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4)
@@ -285,70 +298,66 @@ class MitsubaScene:
             if population.unused:
                 population.bury()
             spp = self.next_count(spp)
-            integrators = [self._integrator(what) for what in seeds]
+            integrators = [self._integrator(method) for method in seeds]
             media = population.media() if self.volumetric else []
-            pictures: list[Tensor] = []
-            for (what, seed), integrator in zip(
+            images: list[Tensor] = []
+            for (method, seed), integrator in zip(
                 seeds.items(), integrators, strict=True
             ):
-                function = (
-                    self._recorded.of((what, spp, self.depth), render, media)
-                    if self._freeze
-                    else render
+                function: Callable[..., Any] = render
+                if self._freeze:
+                    key = (method, spp, self.depth)
+                    function = self._recorded.of(key, render, media)
+                drjit_image = function(
+                    self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
                 )
-                image = (
-                    function(
-                        self._scene,
-                        self._sensor,
-                        integrator,
-                        dr.opaque(mi.UInt32, seed),
-                    )
-                    .torch()
-                    .clone()
-                )
-                if what == "guides":
+                image = drjit_image.torch().clone()
+                if method == "guides":
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
-                pictures.append(image)
-            return pictures
+                images.append(image)
+            return images
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance; as of `pictures`."""
+        """Render linear radiance; arguments as for `pictures`."""
         return self.pictures(inputs, {"path": seed}, spp)[0]
 
     def guides(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[Tensor, Tensor]:
-        """Render what guides the denoiser: first-hit albedo and shading normal, each
-        (H, W, 3) float32.
+        """Render what guides the denoiser; arguments as for `pictures`.
+
+        Returns:
+            First-hit albedo and shading normal, each (H, W, 3) float32.
         """
-        both = self.pictures(inputs, {"guides": seed}, spp)[0]
-        return both[..., :3], both[..., 3:]
+        guides = self.pictures(inputs, {"guides": seed}, spp)[0]
+        return guides[..., :3], guides[..., 3:]
 
     def held(self, inputs: Mapping[str, Tensor]) -> Any:
-        """Return Mitsuba's scene with these inputs set, until the next call of anything
-        here.
-        """
+        """Set inputs and return Mitsuba's scene, which has them until the next call."""
         with one_at_a_time:
             self._set(inputs)
             return self._scene
 
     def stand(self, inputs: Mapping[str, Tensor]) -> None:
-        """Set the vertices and normals that these inputs have, if others are set;
-        everything else may be anything.
+        """Set the vertices and normals of these inputs, if others are set.
+
+        All other inputs may then have any value.
         """
-        wanted, now = (
-            {n: some[n] for n in some if n in self._buffers}
-            for some in (inputs, self._applied)
+        requested = {name: inputs[name] for name in inputs if name in self._buffers}
+        applied = {
+            name: self._applied[name] for name in self._applied if name in self._buffers
+        }
+        is_set = requested.keys() == applied.keys() and all(
+            torch.equal(requested[name].float(), applied[name]) for name in requested
         )
-        if wanted.keys() != now.keys() or not all(
-            torch.equal(wanted[n].float(), now[n]) for n in wanted
-        ):
+        if not is_set:
             self.held(inputs)
 
     def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel; arguments
-        as for `Renderer.surfaces`.
+        """Find what the camera sees first through the center of each pixel.
+
+        Arguments as for `Renderer.surfaces`; lengths are object sizes.
         """
         with one_at_a_time:
             self._set(inputs)
@@ -357,10 +366,11 @@ class MitsubaScene:
                 self._scene, self._sensor, (height * fineness, width * fineness)
             )
             for part in self.made[0].parts:
-                if isinstance(part, LampGlass):  # it belongs to what carries it
-                    glass = hits.seen(part.name)
-                    hits.face[glass] = torch.from_numpy(part.lies_on)[hits.face[glass]]
-                    hits.id[glass] = hits.names.index(part.carrier) + 1
+                if isinstance(part, LampGlass):  # it counts as what carries it
+                    on_glass = hits.seen(part.name)
+                    carrier_face = torch.from_numpy(part.lies_on)
+                    hits.face[on_glass] = carrier_face[hits.face[on_glass]]
+                    hits.id[on_glass] = hits.names.index(part.carrier) + 1
             return hits
 
     def adjoint(
@@ -373,16 +383,15 @@ class MitsubaScene:
         wrt: Collection[str] | None = None,
         method: str = "path",
     ) -> dict[str, Tensor]:
-        """Return the gradient of `sum(cotangent * radiance)` with respect to named
-        inputs.
+        """Return the gradient of `sum(cotangent * radiance)` by some inputs.
 
         Args:
             inputs: as in `radiance`.
             cotangent: (H, W, 3) float32.
-            seed: should differ from the primal's, or the gradient of a noisy picture is
+            seed: should differ from the primal's, or the gradient of a noisy image is
                 returned.
-            spp: independent samples a pixel.
-            wrt: the inputs whose gradients are wanted; None means all that are named.
+            spp: independent samples per pixel.
+            wrt: the inputs whose gradients are returned; None means all of `inputs`.
             method: "path", the interior adjoint (path replay backpropagation, Vicini et
                 al. 2021), unbiased for inputs that do not move silhouettes; "hidden",
                 the same without the visible environment. Where boundary terms are not
@@ -393,61 +402,68 @@ class MitsubaScene:
             For each of `wrt` a float32 tensor of the input's shape.
         """
         with one_at_a_time:
-            wanted = tuple(inputs if wrt is None else wrt)
-            beside = set() if "gradients" in self._leave_out else set(self.interior)
-            plain = method == "path" and self._pinhole and not self.volumetric
-            # which knows no lens and no medium
-            if "boundary" not in self._leave_out and plain:
+            requested = tuple(inputs if wrt is None else wrt)
+            # inputs that are differentiated although nobody asks for it
+            extra = set() if "gradients" in self._leave_out else set(self.interior)
+            # the projective integrator knows no lens and no medium
+            has_boundary = method == "path" and self._pinhole and not self.volumetric
+            if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
-                beside = beside | self._buffers
-            shown = cotangent.detach().to(torch.float32).contiguous()
+                extra = extra | self._buffers
+            image_gradient = cotangent.detach().to(torch.float32).contiguous()
             if self._backdrop:
-                shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
+                no_coverage = torch.zeros_like(image_gradient[..., :1])
+                image_gradient = torch.cat([image_gradient, no_coverage], dim=-1)
             self._set(inputs)
-            held = dict[str, Any]()
-            tracked = dict[str, Any]()
-            gradients = dict[str, Tensor]()
-            level = mi.log_level()
-            try:
-                for name in (*sorted(beside - set(wanted)), *wanted):
-                    key, takes = self.declared[name]
-                    own = self.parameters[key]
-                    held[key] = type(own)(own)
-                    tracked[name] = mi.TensorXf(
-                        takes.rendered(inputs[name])
-                        if name in inputs
-                        else parts.as_torch(own)
-                    )
-                    dr.enable_grad(tracked[name])
-                    self.parameters[key] = (
-                        takes.write(tracked[name]) if takes.write else tracked[name]
-                    )
-                self.parameters.update()
-                spp = self.next_count(spp)
-                arriving = mi.TensorXf(shown)
-                # it warns at every call of a film that samples beyond its border
-                mi.set_log_level(mi.LogLevel.Error)
+            names = (*sorted(extra - set(requested)), *requested)
+            with self._tracked(names, inputs) as tracked:
                 self._integrator(method).render_backward(
                     self._scene,
                     self.parameters,
-                    arriving,
+                    mi.TensorXf(image_gradient),
                     sensor=self._sensor,
                     seed=seed,
-                    spp=spp,
+                    spp=self.next_count(spp),
                 )
-                for name in wanted:
-                    gradients[name] = (
-                        dr.grad(tracked[name])
-                        .torch()
-                        .clone()
-                        .reshape(inputs[name].shape)
-                    )
-                return gradients
-            finally:
-                mi.set_log_level(level)
-                while held:  # what is put back must have no second owner, see `_set`
-                    self.parameters.__setitem__(*held.popitem())
-                self.parameters.update()
+                return {
+                    name: dr.grad(tracked[name])
+                    .torch()
+                    .clone()
+                    .reshape(inputs[name].shape)
+                    for name in requested
+                }
+
+    @contextmanager
+    def _tracked(
+        self, names: Sequence[str], inputs: Mapping[str, Tensor]
+    ) -> Iterator[dict[str, Any]]:
+        """Set inputs as Dr.Jit tensors with gradients, and put the old values back."""
+        old_values = dict[str, Any]()
+        tracked = dict[str, Any]()
+        level = mi.log_level()
+        try:
+            for name in names:
+                key, scene_input = self.declared[name]
+                value = self.parameters[key]
+                old_values[key] = type(value)(value)
+                if name in inputs:
+                    tracked[name] = mi.TensorXf(scene_input.rendered(inputs[name]))
+                else:
+                    tracked[name] = mi.TensorXf(parts.as_torch(value))
+                dr.enable_grad(tracked[name])
+                if scene_input.write:
+                    self.parameters[key] = scene_input.write(tracked[name])
+                else:
+                    self.parameters[key] = tracked[name]
+            self.parameters.update()
+            # it warns at every call of a film that samples beyond its border
+            mi.set_log_level(mi.LogLevel.Error)
+            yield tracked
+        finally:
+            mi.set_log_level(level)
+            while old_values:  # what is put back must have no second owner, see `_set`
+                self.parameters.__setitem__(*old_values.popitem())
+            self.parameters.update()
 
     def material_adjoint(
         self,
@@ -458,9 +474,11 @@ class MitsubaScene:
         *,
         meshes: Collection[str],
     ) -> dict[str, Tensor]:
-        """Return the gradient with respect to the vertices and normals of some meshes,
-        by the material form. The inputs have `NAME.vertices` and `NAME.normals` of
-        each, `spp` are the samples of the interior term; the others as of `adjoint`.
+        """Return the gradient by the vertices and normals of some meshes.
+
+        It is that of the material form. The inputs have `NAME.vertices` and
+        `NAME.normals` of each mesh, `spp` is the number of samples of the interior
+        term; other arguments as for `adjoint`.
         """
         with one_at_a_time:
             # few scenes search a material
@@ -470,21 +488,18 @@ class MitsubaScene:
 
             self._set(inputs)
             population.changes += 1  # the first call loads integrators of its own
-            moving = [
-                f"{name}.{what}" for name in meshes for what in ("vertices", "normals")
-            ]
-            counts = {
-                "seed": seed,
-                "spp": spp,
-                "max_depth": self.depth,
-                "shadow_spp": SHADOW_SPP,
-            }
-            held = self._scene, self._sensor, self.parameters
+            buffers = ("vertices", "normals")
+            moving = [f"{name}.{buffer}" for name in meshes for buffer in buffers]
             return material_adjoint(
-                *held,
+                self._scene,
+                self._sensor,
+                self.parameters,
                 {name: inputs[name] for name in moving},
                 cotangent=cotangent,
-                **counts,
+                seed=seed,
+                spp=spp,
+                max_depth=self.depth,
+                shadow_spp=SHADOW_SPP,
             )
 
     @property
@@ -498,9 +513,10 @@ class MitsubaScene:
     def transport(
         self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int
     ) -> Paths:
-        """Return what the vertices of light paths add to their pixels for a unit more
-        of an input that is a base colour, or a projector's pattern, and the picture of
-        these paths; the others as of `pictures`.
+        """Collect light paths for an input that is a base color or a projector's pattern.
+
+        Their vertices have the change of their pixel for a unit more of the input, and
+        the paths have an image. Other arguments as for `pictures`.
         """
         with one_at_a_time:
             self._set(inputs)
@@ -508,13 +524,13 @@ class MitsubaScene:
             spp = self.next_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
-            noise.seed(
-                dr.opaque(mi.UInt32, seed),
-                self.resolution[0] * self.resolution[1] * spp,
-            )
+            height, width = self.resolution
+            noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
             part = name.partition(".")[0]
-            emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
-            projector = emitters.get(part) if name.endswith(PATTERN) else None
+            projector = None
+            if name.endswith(PATTERN):
+                emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
+                projector = emitters.get(part)
             paths = collect(
                 self._scene,
                 self.parameters,
@@ -531,39 +547,38 @@ class MitsubaScene:
                 surface = self.made[0].meshes[part].surface
                 if surface is None:
                     return paths
+            vertices = [
+                replace(vertex, uv=_to_repeating(vertex.uv, surface, size))
+                for vertex in paths.vertices
+            ]
+            return replace(paths, vertices=vertices)
 
-            def looked_up(uv: Tensor) -> Tensor:
-                """Where lookups of a matrix, which repeat at the border, find what is
-                shown at texture coordinates.
-                """
-                if surface is None:  # a projector's picture ends at the border
-                    half = 0.5 / torch.tensor(size[::-1])
-                    return uv.clamp(half, 1.0 - half)
-                options = next(
-                    plugin
-                    for plugin in plugins_in(surface)
-                    if plugin["type"] == BASE_COLOR_PLACE
-                )
-                return repeating(uv, options, size)
-
-            return replace(
-                paths,
-                vertices=[
-                    replace(some, uv=looked_up(some.uv)) for some in paths.vertices
-                ],
-            )
-
-    # ---- inside
-    # -----------------------------------------------------------------------------------------------------
+    # ---- implementation
 
     def _set(self, inputs: Mapping[str, Tensor]) -> None:
-        """Set exactly these inputs, everything else at its base value; does nothing for
-        what is set already.
+        """Set exactly these inputs, and everything else to its base value.
 
-        Vertices are written into the memory where they are: recordings hold on to it.
-        Numbers that Mitsuba takes for constants are part of a recording, so that every
-        change makes all recordings stale.
+        It does nothing for what is set already. Vertices are written into the memory
+        where they are: recordings refer to it. Numbers that Mitsuba takes for constants
+        are part of a recording, so that every change makes all recordings stale.
         """
+        self._check_known(inputs)
+        if self._every:
+            inputs = {**self._every, **inputs}
+            self._applied.clear()
+        changes = self._find_changes(inputs)
+        population.changes += not self._literals.isdisjoint(changes)
+        for name, fresh in changes.items():
+            self._write(name, fresh)
+            if fresh is None:
+                del self._applied[name]
+            else:
+                self._applied[name] = fresh.clone()
+        if changes:
+            self.parameters.update()
+
+    def _check_known(self, inputs: Mapping[str, Tensor]) -> None:
+        """Check that the scene has all of these inputs."""
         unknown = [name for name in inputs if name not in self.declared]
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
@@ -577,60 +592,55 @@ class MitsubaScene:
                 f"the scene has no input {', '.join(unknown)}; it has "
                 f"{', '.join(sorted(self.declared))}"
             )
-        if self._every:
-            inputs = {**self._every, **inputs}
-            self._applied.clear()
-        wanted: dict[str, Tensor | None] = dict.fromkeys(
-            [name for name in self._applied if name not in inputs]
-        )
+
+    def _find_changes(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor | None]:
+        """Return the values that differ from what is set; None means the base value."""
+        reset = [name for name in self._applied if name not in inputs]
+        changes: dict[str, Tensor | None] = dict.fromkeys(reset)
         for name, tensor in inputs.items():
             value = self.declared[name][1].rendered(tensor)
             applied = self._applied.get(name)
-            if (
-                applied is None
-                or applied.shape != value.shape
-                or not torch.equal(applied, value)
-            ):
-                wanted[name] = value
-        population.changes += not self._literals.isdisjoint(wanted)
-        for name, fresh in wanted.items():
-            key, takes = self.declared[name]
-            current = self.parameters[key]
-            if (
-                fresh is not None
-                and takes.shape is not None
-                and fresh.numel() != math.prod(takes.shape)
-            ):
+            is_set = (
+                applied is not None
+                and applied.shape == value.shape
+                and torch.equal(applied, value)
+            )
+            if not is_set:
+                changes[name] = value
+        return changes
+
+    def _write(self, name: str, fresh: Tensor | None) -> None:
+        """Write a value, or None for the base value, to Mitsuba's parameter."""
+        key, scene_input = self.declared[name]
+        current = self.parameters[key]
+        if fresh is not None and scene_input.shape is not None:
+            if fresh.numel() != math.prod(scene_input.shape):
                 raise InputError(
-                    f"{name}: expected shape {takes.shape}, got "
+                    f"{name}: expected shape {scene_input.shape}, got "
                     f"{tuple(fresh.shape)}, from what sets it"
                 )
-            if name not in self._base:
-                self._base[name] = type(current)(
-                    current.torch().clone() if name in self._buffers else current
-                )
-            value = (
-                type(current)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
-            )
-            if fresh is not None and takes.write:
-                value = takes.write(value)
-            if name in self._buffers:
-                place = current.torch().data_ptr()
-                dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
-                dr.eval(current)
-                # Dr.Jit copies what has a second owner
-                population.changes += current.torch().data_ptr() != place
-                self.parameters.set_dirty(key)
-            else:
-                self.parameters[key] = value
-            if fresh is None:
-                del self._applied[name]
-            else:
-                self._applied[name] = fresh.clone()
-        if wanted:
-            self.parameters.update()
+        if name not in self._base:
+            is_buffer = name in self._buffers
+            base = current.torch().clone() if is_buffer else current
+            self._base[name] = type(current)(base)
+        if fresh is None:
+            value = type(current)(self._base[name])
+        else:
+            value = mi.TensorXf(fresh)
+            if scene_input.write:
+                value = scene_input.write(value)
+        if name in self._buffers:
+            address = current.torch().data_ptr()
+            dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
+            dr.eval(current)
+            # Dr.Jit copies what has a second owner
+            population.changes += current.torch().data_ptr() != address
+            self.parameters.set_dirty(key)
+        else:
+            self.parameters[key] = value
 
     def _integrator(self, method: str) -> Any:
+        """Return the integrator of a method, at the current depth; load it on first use."""
         key = method, self.depth
         if key not in self._integrators:
             path = {
@@ -639,15 +649,34 @@ class MitsubaScene:
                 "rr_depth": self.roulette,
                 **self._path,
             }
-            projective = {
-                "type": "prb_projective",
-                "max_depth": self.depth,
-                "rr_depth": NO_ROULETTE,
-            }
             recipes: dict[str, Plugin] = {
-                "path": path, "hidden": {**path, "hide_emitters": True}, "guides": self._guides,
-                "boundary": {**projective, "guiding": "none"},
-            }  # fmt: skip
+                "path": path,
+                "hidden": {**path, "hide_emitters": True},
+                "guides": self._guides,
+                "boundary": {
+                    "type": "prb_projective",
+                    "max_depth": self.depth,
+                    "rr_depth": NO_ROULETTE,
+                    "guiding": "none",
+                },
+            }
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]
+
+
+def _to_repeating(
+    uv: Tensor, surface: Mapping[str, object] | None, size: tuple[int, int]
+) -> Tensor:
+    """Return where look-ups that repeat at the border find what is shown at `uv`.
+
+    The surface is one of Mitsuba's own; None stands for a projector's image (rows,
+    columns), which ends at the border.
+    """
+    if surface is None:
+        half_texel = 0.5 / torch.tensor(size[::-1])
+        return uv.clamp(half_texel, 1.0 - half_texel)
+    options = next(
+        plugin for plugin in plugins_in(surface) if plugin["type"] == BASE_COLOR_TYPE
+    )
+    return repeating(uv, options, size)

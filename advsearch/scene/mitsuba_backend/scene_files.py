@@ -1,15 +1,15 @@
-"""A shape of a Mitsuba scene as the object, and all the rest around it as it is.
+"""Import a Mitsuba scene: one shape becomes the object, all the rest its surroundings.
 
 Lengths are in object sizes, so that everything is moved and scaled with the object, as
-in `advsearch.scene.importing.scenes`. Lights whose power is a quantity of lengths are
-scaled with it, and media too.
+in `advsearch.scene.importing.scenes`. Lights whose power depends on the unit of length
+are scaled with it, and media too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,6 +43,9 @@ from advsearch.scene.parts import (
 )
 
 CAMERAS = frozenset(("perspective", "thinlens"))
+PATH_INTEGRATORS = frozenset(
+    ("path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective")
+)
 NOTHING = {"type": "null"}  # the surface of what only bounds a medium
 Y_TO_Z = np.array(
     [
@@ -53,7 +56,7 @@ Y_TO_Z = np.array(
     ]
 )
 MOST_PARTS = 2000  # plugins at the top of a scene
-# of the film of which Mitsuba's `focal_length` speaks, millimetres
+# of the film to which Mitsuba's `focal_length` refers, millimetres
 DIAGONAL = math.hypot(36.0, 24.0)
 NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
     **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
@@ -62,14 +65,14 @@ NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
     ),
     "to_world": ((4, 4), "a transform"),
 }
-"""Entries that are numbers in whatever plugin has them, their shape, and what they are
-in words.
-"""
+"""Entries that are numbers in whatever plugin has them: their shape and description."""
 
 
 def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
-    """Return a scene file's dictionary, or a caller's own, with arrays for transforms;
-    and warnings about its pictures.
+    """Read a scene file or a dictionary, with arrays for transforms.
+
+    Returns:
+        The dictionary, and warnings about its images.
 
     Raises:
         FileFormatError: as for `read_scene` and `trusted`.
@@ -95,28 +98,27 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Check that numbers stand where they are read here; what else a plugin has is for
-    Mitsuba to refuse.
+    """Check that entries are numbers where they are read here.
+
+    Mitsuba checks all other entries. `where` is the beginning of an error.
     """
     for key, value in plugin.items():
-        # of whatever name
-        if isinstance(value, Mapping) and value.get("type", "rgb") not in (
+        is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
             "rgb",
             "spectrum",
-        ):
-            _check_numbers(
-                value,
-                where
-                if plugin["type"] != "scene"
-                else f"{where}: {shown(key, quoted=False)}",
-            )
+        )
+        if isinstance(value, Mapping) and not is_color:
+            inner_where = where
+            if plugin["type"] == "scene":
+                inner_where = f"{where}: {shown(key, quoted=False)}"
+            _check_numbers(value, inner_where)
         elif key in NUMBERS:
             shape, expected = NUMBERS[key]
             try:
-                right = np.asarray(value, np.float64).shape == shape
+                is_valid = np.asarray(value, np.float64).shape == shape
             except (TypeError, ValueError):
-                right = False
-            if not right:
+                is_valid = False
+            if not is_valid:
                 raise InputError(
                     f"{where}: expected {expected} as {key} of its {plugin['type']}, "
                     f"got {shown(str(value))}"
@@ -125,19 +127,16 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
 
 @dataclass(frozen=True)
 class PluginContents:
-    """What is in a Mitsuba scene, by id: shapes that can be the object; of the rest,
-    which stays as it is, its plugin's name; what shines; and sensors that can be looked
-    through.
-    """
+    """What is in a Mitsuba scene, by id."""
 
-    objects: tuple[str, ...]
-    kept: Mapping[str, str]
-    lights: tuple[str, ...]
-    cameras: tuple[str, ...]
+    objects: tuple[str, ...]  # shapes that can be the object
+    kept: Mapping[str, str]  # the plugin's name of what stays as it is
+    lights: tuple[str, ...]  # what emits light
+    cameras: tuple[str, ...]  # sensors that can be used
 
 
 def contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file; it is refused as of `read_tree`."""
+    """Return what is understood of a scene file; errors as for `read_tree`."""
     named = dict(_plugins(read_tree(path)[0]))
     kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(
@@ -147,33 +146,35 @@ def contents(path: Path) -> PluginContents:
     )
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     known = {*objects, *cameras}
-    unkept = INTEGRATORS | SENSORS
+    replaced = INTEGRATORS | SENSORS
     kept = {
         name: kind
         for name, kind in kinds.items()
-        if name not in known and kind not in unkept
+        if name not in known and kind not in replaced
     }
-    lights = tuple(name for name, plugin in named.items() if _shines(plugin))
-    return PluginContents(objects, kept, lights, tuple(map(_free, cameras)))
+    lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
+    return PluginContents(objects, kept, lights, tuple(map(_rename_reserved, cameras)))
 
 
-def _free(name: str) -> str:
+def _rename_reserved(name: str) -> str:
+    """Return a name that is not one of `TAKEN`."""
     return f"{name}-2" if name in TAKEN else name
 
 
-def _shines(plugin: Mapping[str, object]) -> bool:
+def _emits_light(plugin: Mapping[str, object]) -> bool:
     return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
 
 
 def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
     """Read a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
 
-    The shape becomes a mesh with its own kind of surface, whose base colour, where it
+    The shape becomes a mesh with its own kind of surface, whose base color, where it
     has one, becomes a texture. Everything else stays as it is, under its own name.
-    Perspective sensors become cameras. Integrator, sampler and film are those of the
-    house. What is left out is among the object's warnings.
+    Perspective sensors become cameras. Integrator, sampler and film are those of
+    advsearch. What is left out is among the object's warnings.
 
     Args:
+        scene: path of the file, or the dictionary.
         wanted: id of the shape that is the object; where there is none, the only one
             that differs in nothing but case and signs ("largebox" means "large-box", as
             Mitsuba's own writer calls it).
@@ -187,15 +188,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
     named = dict(_plugins(tree))
-    ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
-    letters = {
-        name: "".join(filter(str.isalnum, name.casefold())) for name in (*ids, wanted)
-    }
-    alike = [name for name in ids if letters[name] == letters[wanted]]
-    if wanted not in ids and len(alike) == 1:
-        wanted = alike[0]
-    if wanted not in ids:
-        raise UnknownNameError(f"shape of {where}", wanted, ids)
+    wanted = _find_shape(named, wanted, where)
     if len(named) > MOST_PARTS:
         raise InputError(
             f"{where}: expected at most {MOST_PARTS} plugins at the top, "
@@ -203,76 +196,113 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         )
     shape = named[wanted]
     surface = shapes.surface_of(_bsdf(shape, named))
-    (mesh, own_uvs) = shapes.mesh_of(shape, wanted)
-    placed = [
-        plugin
-        for plugin in named.values()
-        if plugin["type"] in SENSORS and "to_world" in plugin
-    ]
-    # of the first camera's side
-    upper = (
-        abs(shapes.pose_of(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])
-    )
-    frame = _ObjectFrame(mesh, wanted, z_up=bool(upper[2] > upper[1]))
-    haze, used = shapes.haze_in(named, frame.matrix) or (None, frozenset[str]())
+    mesh, has_uvs = shapes.mesh_of(shape, wanted)
+    frame = _ObjectFrame(mesh, wanted, z_up=_is_z_up(named))
+    haze, haze_names = shapes.haze_in(named, frame.matrix) or (None, frozenset[str]())
     light = _light(shape)
     left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
     missing = _missing_attributes(surface.plugin, mesh)
     notes += [f"{where}: {clause}" for clause in (*left_out, *surface.notes, *missing)]
-    source = scene if isinstance(scene, Path) else Path("scene.xml")
     turn = frame.turn.astype(np.float32)
-    # z up
     mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
-    mesh, base_color = _painted(mesh, own_uvs, surface, str(shape["type"]), where)
-    made = ObjectAsset(
-        name=f"{safe_name(source)}-{clean(wanted)}", mesh=normalised(mesh), base_color=base_color, source=str(source),
-        warnings=tuple(notes), up=FileAxis("z"), surface=surface.plugin, emission=light, extent=frame.size,
-    )  # fmt: skip
-    around: list[ScenePart] = [] if haze is None else [haze]
-    cameras: dict[str, PlacedCamera] = {}
+    mesh, base_color = _paint(mesh, has_uvs, surface, str(shape["type"]), where)
+    source = scene if isinstance(scene, Path) else Path("scene.xml")
+    asset = ObjectAsset(
+        name=f"{safe_name(source)}-{clean(wanted)}",
+        mesh=normalised(mesh),
+        base_color=base_color,
+        source=str(source),
+        warnings=tuple(notes),
+        up=FileAxis("z"),
+        surface=surface.plugin,
+        emission=light,
+        extent=frame.size,
+    )
+    surroundings: list[ScenePart] = [] if haze is None else [haze]
+    surroundings += _import_surroundings(named, {wanted, *haze_names}, frame)
+    cameras = {
+        _rename_reserved(name): _import_camera(plugin, frame)
+        for name, plugin in named.items()
+        if plugin["type"] in CAMERAS
+    }
+    return ImportedScene(asset, tuple(surroundings), cameras)
+
+
+def _find_shape(
+    named: Mapping[str, Mapping[str, object]], wanted: str, where: str
+) -> str:
+    """Return the id of a shape, or that of the only one with the same letters."""
+
+    def letters_of(name: str) -> str:
+        return "".join(filter(str.isalnum, name.casefold()))
+
+    ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
+    if wanted in ids:
+        return wanted
+    similar = [name for name in ids if letters_of(name) == letters_of(wanted)]
+    if len(similar) != 1:
+        raise UnknownNameError(f"shape of {where}", wanted, ids)
+    return similar[0]
+
+
+def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
+    """Return whether the first camera's upwards axis is rather z than y; else y is."""
+    posed_sensors = [
+        plugin
+        for plugin in named.values()
+        if plugin["type"] in SENSORS and "to_world" in plugin
+    ]
+    if not posed_sensors:
+        return False
+    upwards = abs(shapes.pose_of(posed_sensors[0])[:3, 1])
+    return bool(upwards[2] > upwards[1])
+
+
+def _import_surroundings(
+    named: Mapping[str, Mapping[str, object]],
+    used: Collection[str],
+    frame: _ObjectFrame,
+) -> Iterator[ScenePart]:
+    """Import all plugins that stay as they are; those that were `used` do not."""
+    replaced = INTEGRATORS | SENSORS
     for name, plugin in named.items():
-        if plugin["type"] in CAMERAS:
-            cameras[_free(name)] = _camera(plugin, frame)
-        elif (
-            name != wanted
-            and name not in used
-            and plugin["type"] not in INTEGRATORS | SENSORS
-        ):
-            kept = _renamed(frame.moved(plugin))
-            holds = (
-                MediumPart
-                if any(inner.get("type") in MEDIA for inner in plugins_in(kept))
-                else PluginPart
-            )
-            around.append(holds(_free(name), kept, _shines(kept)))
-    return ImportedScene(made, tuple(around), cameras)
+        if name in used or plugin["type"] in replaced:
+            continue
+        moved = _rename_references(frame.moved(plugin))
+        has_medium = any(inner.get("type") in MEDIA for inner in plugins_in(moved))
+        part_type = MediumPart if has_medium else PluginPart
+        yield part_type(_rename_reserved(name), moved, _emits_light(moved))
 
 
-def _painted(
-    mesh: Mesh, own_uvs: bool, surface: shapes.ShapeSurface, kind: str, where: str
+def _paint(
+    mesh: Mesh, has_uvs: bool, surface: shapes.ShapeSurface, kind: str, where: str
 ) -> tuple[Mesh, Floats]:
-    """Return a shape's mesh with texture coordinates for its base colour, and that.
+    """Return a mesh with texture coordinates for its base color, and that base color.
 
-    Where anything is looked up by the mesh's own, or by its attributes, they stay. A
-    shape of one colour gets new ones where its own do not tell its places apart, as on
-    a cube.
+    Where anything is looked up by the mesh's own coordinates, or by its attributes,
+    they stay. A shape of one color gets new ones where its own do not tell its points
+    apart, as on a cube.
+
+    Args:
+        mesh: of the shape.
+        has_uvs: whether the file has texture coordinates.
+        surface: of the shape.
+        kind: Mitsuba's type of the shape.
+        where: the scene, for errors.
     """
     if surface.picture or surface.bound:
-        down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
-        down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
-        return replace(
-            mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
-        ), surface.base_color
-    own_uvs &= kind not in ("cube", "sphere", "cylinder", "disk")
-    vertices, normals, uvs = (
-        values.astype(np.float64) for values in (mesh.vertices, mesh.normals, mesh.uvs)
-    )
+        # the transform is that of coordinates with v downwards
+        flipped = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        flipped = flipped @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        uvs = (flipped * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+        return replace(mesh, uvs=uvs), surface.base_color
+    keeps_uvs = has_uvs and kind not in ("cube", "sphere", "cylinder", "disk")
     color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(
-        vertices,
+        mesh.vertices.astype(np.float64),
         mesh.faces.astype(np.int64),
-        normals,
-        uvs if own_uvs else None,
+        mesh.normals.astype(np.float64),
+        mesh.uvs.astype(np.float64) if keeps_uvs else None,
         None,
         color,
     )
@@ -281,16 +311,17 @@ def _painted(
 
 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
+    """Return the plugins at the top of a scene, by name."""
     return (
-        (name, one)
-        for name, one in tree.items()
-        if isinstance(one, Mapping) and "type" in one
+        (name, entry)
+        for name, entry in tree.items()
+        if isinstance(entry, Mapping) and "type" in entry
     )
 
 
-def _renamed(plugin: Mapping[str, object]) -> Plugin:
-    """A plugin whose references have the names that the house left free."""
-    entries = with_inner(plugin, _renamed)
+def _rename_references(plugin: Mapping[str, object]) -> Plugin:
+    """Return a plugin whose references have the names of `_rename_reserved`."""
+    entries = with_inner(plugin, _rename_references)
     if entries["type"] == "ref" and entries["id"] in TAKEN:
         entries["id"] = f"{entries['id']}-2"
     return entries
@@ -299,13 +330,13 @@ def _renamed(plugin: Mapping[str, object]) -> Plugin:
 def _bsdf(
     shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
 ) -> Mapping[str, object]:
-    """The surface of a shape with what it refers to in its place; Mitsuba's default
-    where it has none.
-    """
+    """Return the surface of a shape, with its references resolved.
 
+    It is Mitsuba's default if the shape has none.
+    """
     count = 0
 
-    def whole(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+    def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
         nonlocal count
         count += 1
         if count > MOST_PARTS:
@@ -317,23 +348,21 @@ def _bsdf(
             name = str(plugin["id"])
             if name not in named or depth > len(named):
                 raise UnknownNameError("material of the scene", name, list(named))
-            return whole(named[name], depth + 1)
-        return with_inner(plugin, lambda inner: whole(inner, depth))
+            return resolve(named[name], depth + 1)
+        return with_inner(plugin, lambda inner: resolve(inner, depth))
 
-    for inner in shape.values():
-        if isinstance(inner, Mapping) and inner["type"] not in LIGHTS | MEDIA:
-            return whole(inner, 0)
+    for entry in shape.values():
+        if isinstance(entry, Mapping) and entry["type"] not in LIGHTS | MEDIA:
+            return resolve(entry, 0)
     return {"type": "diffuse"}
 
 
 def _light(shape: Mapping[str, object]) -> Floats | None:
-    """The radiance (1, 1, 3) of a shape that shines evenly; None of any other."""
+    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other."""
     for inner in shape.values():
-        if (
-            isinstance(inner, Mapping)
-            and inner["type"] == "area"
-            and set(inner) <= {"type", "id", "radiance"}
-        ):
+        if not isinstance(inner, Mapping) or inner["type"] != "area":
+            continue
+        if set(inner) <= {"type", "id", "radiance"}:
             radiance = shapes.constant(inner.get("radiance"))
             if (
                 radiance is not None
@@ -345,182 +374,215 @@ def _light(shape: Mapping[str, object]) -> Floats | None:
 
 
 def _missing_attributes(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
-    """Sentences about attributes that a surface shows and the mesh has not."""
+    """Yield clauses about attributes that a surface uses and the mesh has not."""
     for plugin in plugins_in(surface):
         name = plugin.get("name")
         if plugin["type"] == "mesh_attribute" and name not in mesh.attributes:
-            there = ", ".join(sorted(mesh.attributes)) or "none"
+            available = ", ".join(sorted(mesh.attributes)) or "none"
             yield (
-                f"the mesh has no attribute {shown(str(name))} (it has {there}), so "
-                "that is black"
+                f"the mesh has no attribute {shown(str(name))} (it has {available}), "
+                "so that is black"
             )
 
 
 def _left_out(
     tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool
 ) -> Iterator[str]:
-    """Sentences about what is not as it is in the file; `hazy`: the camera's medium is
-    the scene's haze, `lit`: the object keeps its light.
+    """Yield clauses about what is not as it is in the file.
+
+    Args:
+        tree: the scene.
+        shape: the object's.
+        hazy: the camera's medium is the scene's haze.
+        lit: the object keeps its light.
     """
     for name, plugin in _plugins(tree):
-        kind = plugin["type"]
-        if kind in SENSORS - CAMERAS:
-            yield f"the sensor {name} is left out: a {kind}"
-        elif kind == "thinlens":
-            yield f"the sensor {name} is sharp at all distances: its lens is left out"
-        elif kind in INTEGRATORS - {
-            "path",
-            "prb",
-            "volpath",
-            "prbvolpath",
-            "volpathmis",
-            "prb_projective",
-        }:
-            yield (
-                f"the integrator {name} is left out: a {kind}; light takes all "
-                "paths "
-                "of up to 6 segments"
-            )
-        elif kind in INTEGRATORS:
-            if plugin.get("hide_emitters"):
-                yield (
-                    f"hide_emitters of the integrator {name} is left out: lights "
-                    "are "
-                    "seen"
-                )
-            depth = plugin.get("max_depth", -1)
-            if isinstance(depth, int) and 0 <= depth < 6:
-                yield (
-                    f"the integrator's max_depth of {depth} is left out: light "
-                    "takes "
-                    "all paths of up to 6 segments"
-                )
-        if kind in SENSORS:
-            films = [inner for inner in plugin.values() if isinstance(inner, Mapping)]
-            if any(str(key).startswith("crop") for film in films for key in film):
-                yield (
-                    f"the crop of the film of {name} is left out: the whole picture "
-                    "is seen"
-                )
-            if "medium" in plugin and not hazy:
-                yield (
-                    f"the sensor {name} sees nothing of its medium up to the first "
-                    "surface"
-                )
-            if any("principal_point" in key for key in plugin):
-                yield (
-                    f"the sensor {name} looks along its middle: its principal point "
-                    "is left out"
-                )
+        if plugin["type"] in INTEGRATORS:
+            yield from _left_out_of_integrator(name, plugin)
+        elif plugin["type"] in SENSORS:
+            yield from _left_out_of_sensor(name, plugin, hazy=hazy)
     for key, inner in shape.items():
-        if not isinstance(inner, Mapping) and key not in shapes.OF_A_SHAPE:
-            yield f"the object's {shown(key)} is left out: a {shape['type']} has none"
-        if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
+        if not isinstance(inner, Mapping):
+            if key not in shapes.OF_A_SHAPE:
+                yield (
+                    f"the object's {shown(key)} is left out: a {shape['type']} has none"
+                )
+            continue
+        if inner["type"] in LIGHTS and not lit:
             yield "the object's own light is left out"
-        if isinstance(inner, Mapping) and inner["type"] in MEDIA:
+        if inner["type"] in MEDIA:
             yield "the medium in the object is left out"
 
 
+def _left_out_of_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
+    """Yield clauses about an integrator."""
+    kind = plugin["type"]
+    if kind not in PATH_INTEGRATORS:
+        yield (
+            f"the integrator {name} is left out: a {kind}; light takes all paths of up "
+            "to 6 segments"
+        )
+        return
+    if plugin.get("hide_emitters"):
+        yield f"hide_emitters of the integrator {name} is left out: lights are seen"
+    depth = plugin.get("max_depth", -1)
+    if isinstance(depth, int) and 0 <= depth < 6:
+        yield (
+            f"the integrator's max_depth of {depth} is left out: light takes all "
+            "paths of up to 6 segments"
+        )
+
+
+def _left_out_of_sensor(
+    name: str, plugin: Mapping[str, object], *, hazy: bool
+) -> Iterator[str]:
+    """Yield clauses about a sensor."""
+    kind = plugin["type"]
+    if kind not in CAMERAS:
+        yield f"the sensor {name} is left out: a {kind}"
+    elif kind == "thinlens":
+        yield f"the sensor {name} is sharp at all distances: its lens is left out"
+    films = [inner for inner in plugin.values() if isinstance(inner, Mapping)]
+    if any(str(key).startswith("crop") for film in films for key in film):
+        yield f"the crop of the film of {name} is left out: the whole picture is seen"
+    if "medium" in plugin and not hazy:
+        yield (f"the sensor {name} sees nothing of its medium up to the first surface")
+    if any("principal_point" in key for key in plugin):
+        yield (
+            f"the sensor {name} looks along its middle: its principal point is left out"
+        )
+
+
 class _ObjectFrame:
-    """From the scene's coordinates to the object's: z up, standing on z = 0, a largest
-    extent of 1.
+    """The object's coordinates: z up, standing on z = 0, with a largest extent of 1.
+
+    Attributes:
+        turn: (3, 3) rotation from the scene's coordinates to z up.
+        size: largest extent in the scene's units.
+        matrix: (4, 4) from the scene's coordinates to the object's.
     """
 
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
         turn = np.eye(4) if z_up else Y_TO_Z
-        places = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
-        low = places.min(axis=0)
-        high = places.max(axis=0)
+        turned = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
+        lower = turned.min(axis=0)
+        upper = turned.max(axis=0)
         self.turn = turn[:3, :3]
-        self.size = float((high - low).max())
+        self.size = float((upper - lower).max())
         if not (math.isfinite(self.size) and self.size > 0.0):
             raise InputError(
                 f"object {name}: expected a shape of some size, got one of {self.size}"
             )
         move = np.eye(4)
-        move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
+        move[:3, 3] = (
+            -(lower[0] + upper[0]) / 2,
+            -(lower[1] + upper[1]) / 2,
+            -lower[2],
+        )
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
 
     def moved(self, plugin: Mapping[str, object], *, top: bool = True) -> Plugin:
-        """Return a plugin at the top of a scene, or within another, in its place; media
-        are scaled everywhere.
+        """Return a plugin of the scene in the object's coordinates.
+
+        Args:
+            plugin: its dictionary.
+            top: it stands at the top of the scene; within another plugin only media and
+                volumes change.
         """
         kind = plugin["type"]
-        entries = dict(plugin)
         if kind in MEDIA:
-            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
+            scale = float(np.asarray(plugin.get("scale", 1.0)))
+            entries = {**plugin, "scale": scale * self.size}
         elif kind in ("gridvolume", "constvolume"):
-            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
+            entries = self._with_pose(plugin)
         elif not top:
-            pass
+            entries = dict(plugin)
         elif kind == "merge":
-            return with_inner(entries, self.moved)
+            return with_inner(plugin, self.moved)
         elif kind in SHAPES - {"shapegroup"}:
-            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
+            entries = self._with_pose(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
-            turn = np.eye(4)
-            turn[:3, :3] = self.turn
-            if "direction" in entries:
-                entries["direction"] = (
-                    self.turn @ np.asarray(entries["direction"], dtype=np.float64)
-                ).tolist()
-            elif kind != "constant":
-                entries["to_world"] = turn @ shapes.pose_of(plugin)
+            entries = self._move_distant_light(plugin)
         elif kind in ("point", "spot", "projector"):
-            if "position" in entries:
-                place = np.asarray(entries["position"], dtype=np.float64)
-                entries["position"] = (
-                    self.matrix[:3, :3] @ place + self.matrix[:3, 3]
-                ).tolist()
-            else:
-                entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
-            power = "irradiance" if kind == "projector" else "intensity"
-            entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
+            entries = self._move_lamp(plugin)
+        else:
+            entries = dict(plugin)
         return with_inner(entries, lambda inner: self.moved(inner, top=False))
 
+    def _with_pose(self, plugin: Mapping[str, object]) -> Plugin:
+        return {**plugin, "to_world": self.matrix @ shapes.pose_of(plugin)}
 
-def _times(value: object, factor: float, kind: str) -> object:
+    def _move_distant_light(self, plugin: Mapping[str, object]) -> Plugin:
+        """Rotate a light that is infinitely far."""
+        entries = dict(plugin)
+        if "direction" in entries:
+            direction = np.asarray(entries["direction"], dtype=np.float64)
+            entries["direction"] = (self.turn @ direction).tolist()
+        elif plugin["type"] != "constant":
+            turn = np.eye(4)
+            turn[:3, :3] = self.turn
+            entries["to_world"] = turn @ shapes.pose_of(plugin)
+        return entries
+
+    def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
+        """Move a lamp and scale its power, which is a quantity of squared lengths."""
+        kind = str(plugin["type"])
+        entries = dict(plugin)
+        if "position" in entries:
+            position = np.asarray(entries["position"], dtype=np.float64)
+            moved = self.matrix[:3, :3] @ position + self.matrix[:3, 3]
+            entries["position"] = moved.tolist()
+        else:
+            entries = self._with_pose(plugin)
+        power = "irradiance" if kind == "projector" else "intensity"
+        entries[power] = _scale_power(entries.get(power, 1.0), self.size**-2, kind)
+        return entries
+
+
+def _scale_power(value: object, factor: float, kind: str) -> object:
+    """Multiply a light's power in any form that Mitsuba takes; `kind` is for errors."""
     if isinstance(value, (int, float)):
         return float(value) * factor
     if isinstance(value, Mapping):
-        light = value["type"]
-        inner = value.get("value")
-        if light in ("rgb", "uniform", "srgb", "spectrum") and isinstance(
-            inner, (int, float)
-        ):
-            return {**value, "value": float(inner) * factor}
-        if light == "rgb" and inner is not None:
-            return {
-                **value,
-                "value": (np.asarray(inner, dtype=np.float64) * factor).tolist(),
-            }
-        if light == "spectrum" and isinstance(inner, (list, tuple)):
-            return {
-                **value,
-                "value": [(length, amount * factor) for length, amount in inner],
-            }
-        if light in ("d65", "blackbody"):
-            return {
-                **value,
-                "scale": float(np.asarray(value.get("scale", 1.0))) * factor,
-            }
-        if light == "bitmap" and isinstance(value.get("bitmap"), np.ndarray):
-            return {**value, "bitmap": np.asarray(value["bitmap"]) * np.float32(factor)}
+        scaled = _scale_spectrum(value, factor)
+        if scaled is not None:
+            return scaled
     raise InputError(
         f"{kind} light: expected a power as a number, rgb or spectrum; "
         "change it in the scene"
     )
 
 
-def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
+def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None:
+    """Multiply a spectrum's or a bitmap's values; None if it is of another kind."""
+    kind = value["type"]
+    inner = value.get("value")
+    bitmap = value.get("bitmap")
+    is_constant = kind in ("rgb", "uniform", "srgb", "spectrum")
+    if is_constant and isinstance(inner, (int, float)):
+        return {**value, "value": float(inner) * factor}
+    if kind == "rgb" and inner is not None:
+        values = np.asarray(inner, dtype=np.float64) * factor
+        return {**value, "value": values.tolist()}
+    if kind == "spectrum" and isinstance(inner, (list, tuple)):
+        pairs = [(wavelength, amount * factor) for wavelength, amount in inner]
+        return {**value, "value": pairs}
+    if kind in ("d65", "blackbody"):
+        scale = float(np.asarray(value.get("scale", 1.0)))
+        return {**value, "scale": scale * factor}
+    if kind == "bitmap" and isinstance(bitmap, np.ndarray):
+        return {**value, "bitmap": np.asarray(bitmap) * np.float32(factor)}
+    return None
+
+
+def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
+    """Return a sensor's pose and field of view along the larger side."""
     matrix = frame.matrix @ shapes.pose_of(sensor)
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
-    inner = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
-    film = next((plugin for plugin in inner if "film" in str(plugin["type"])), {})
-    width, height = (
-        float(np.asarray(film.get(side, other)))
-        for side, other in (("width", 768), ("height", 576))
-    )
+    entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
+    film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
+    width = float(np.asarray(film.get("width", 768)))
+    height = float(np.asarray(film.get("height", 576)))
     if not min(width, height) >= 1.0:
         raise InputError(
             "camera: expected a film of at least 1 x 1 pixels, got "
@@ -529,24 +591,28 @@ def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
     axis = str(sensor.get("fov_axis", "x"))
     degrees = float(np.asarray(sensor.get("fov", 0.0)))
     if not degrees:
-        text = str(sensor.get("focal_length", "50mm"))
-        length = 0.0
-        with contextlib.suppress(ValueError):
-            length = float(text.removesuffix("mm"))
-        if not length > 0.0:
-            raise InputError(
-                f"focal_length: expected millimetres, such as 50mm, got {text!r}"
-            )
         axis = "diagonal"
-        degrees = 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))
+        degrees = _fov_of_focal_length(str(sensor.get("focal_length", "50mm")))
     larger = max(width, height)
-    smaller = min(width, height)
-    across = {
+    lengths = {
         "x": width,
         "y": height,
         "diagonal": math.hypot(width, height),
         "larger": larger,
-        "smaller": smaller,
+        "smaller": min(width, height),
     }
-    half = math.tan(math.radians(degrees) / 2.0) * larger / across.get(axis, width)
-    return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half)))
+    length = lengths.get(axis, width)
+    half_tangent = math.tan(math.radians(degrees) / 2.0) * larger / length
+    return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
+
+
+def _fov_of_focal_length(text: str) -> float:
+    """Return the diagonal field of view in degrees of a focal length such as "50mm"."""
+    length = 0.0
+    with contextlib.suppress(ValueError):
+        length = float(text.removesuffix("mm"))
+    if not length > 0.0:
+        raise InputError(
+            f"focal_length: expected millimetres, such as 50mm, got {text!r}"
+        )
+    return 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))

@@ -1,8 +1,8 @@
-"""What cameras see of light on surfaces, by rays and look-ups in one recorded launch.
+"""Look light on surfaces up through many cameras, by rays in one recorded launch.
 
-A ray of a pixel sees a texel, or the environment; another one, in the mean direction of
-the surface's gloss, sees what is reflected. Where a pixel's rays go through it is the
-same for all pixels, so that nothing is random.
+A ray of a pixel meets a texel, or the environment; another one, in the mean direction
+of the surface's gloss, finds what is reflected. The rays go through a pixel at the same
+positions in all pixels, so that nothing is random.
 """
 
 from __future__ import annotations
@@ -23,28 +23,30 @@ from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, one_at_a_time
 
-# spreads of gloss between which one ray to the ground gives way to what surrounds the
-# object
+# Spreads of gloss between which one ray to the ground gives way to what surrounds the
+# object.
 SHARP = 0.15
 WIDE = 0.4
-CAMERA = 16  # numbers of a camera
+CAMERA = 16  # numbers of a camera in the kernel, see `_camera_numbers`
 PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
-"""Where the rays of a pixel go through it: a turned grid, which sees upright and level
-edges at four places.
+"""Positions of the rays of a pixel in it.
+
+It is a rotated grid, which samples upright and level edges at four positions.
 """
 RAYS = len(PATTERN)
-# share of a ray's light under which what is behind a cut-out does not count
+# fraction of a ray's light below which what is behind a cut-out does not count
 LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """The light of one moment, as `Views` looks it up: flat arrays, three numbers each,
-    and sizes of the maps.
+    """The light of one moment, as `Views` looks it up.
+
+    The maps are flat Dr.Jit arrays, three numbers for each color.
     """
 
-    # radiance that leaves each texel of all grids, and in the end that of the ground
-    # far off; of a photographed ground, the share of the photograph that it shows
+    # radiance that leaves each texel of all grids, and last that of the ground far off;
+    # for a photographed ground, a fraction of the photograph instead
     texels: Any
     sky: Any  # the environment's map, with the copied columns at both ends
     sky_shape: tuple[int, int]
@@ -54,46 +56,60 @@ class Lit:
 
     @property
     def numbers(self) -> int:
-        """How many numbers there are."""
+        """Number of floats in all maps."""
         return len(self.texels) + len(self.sky) + len(self.blurred)
 
 
 def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
-    """Return light for look-ups, in memory of its own: of the texels (cells of all
-    grids, 3), the environment (H, W + 2, 3), and its blurred maps (widths, h, w, 3).
+    """Make light maps for look-ups, in memory of their own.
+
+    Args:
+        texels: (cells of all grids and one more, 3) radiance.
+        padded: (H, W + 2, 3) map of the environment.
+        blurred: (widths, h, w, 3) its blurred maps.
     """
-    flat = [
-        mi.Float(functional.pad(values, (0, 1)).numpy().ravel())
-        for values in (texels, padded, blurred)
-    ]
-    shapes = [(values.shape[-3], values.shape[-2]) for values in (padded, blurred)]
-    return Lit(flat[0], flat[1], shapes[0], flat[2], shapes[1])
+
+    def flatten(values: Tensor) -> Any:
+        # one number more, since colors are gathered by four numbers
+        return mi.Float(functional.pad(values, (0, 1)).numpy().ravel())
+
+    return Lit(
+        texels=flatten(texels),
+        sky=flatten(padded),
+        sky_shape=(padded.shape[-3], padded.shape[-2]),
+        blurred=flatten(blurred),
+        blurred_shape=(blurred.shape[-3], blurred.shape[-2]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What cameras see."""
+    """What cameras see, by `Views`."""
 
-    # (n, H, W, 3) radiance but for what the searched texture reflects diffusely
+    # (n, H, W, 3) radiance without what the searched texture reflects diffusely
     rest: Tensor
-    covered: Tensor  # (n, H, W, 1) share of each pixel that shows surfaces
+    covered: Tensor  # (n, H, W, 1) fraction of each pixel that surfaces cover
     # (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row
     # by row. One that goes through cut-outs sees it several times
     sample: Tensor
-    uv: Tensor  # (k, 2) where, as Mitsuba has them
-    weight: Tensor  # (k,) the diffuse share over pi, and over the rays of a pixel
-    back: Tensor  # (k,) whether it is seen from behind
+    uv: Tensor  # (k, 2) texture coordinates there, as Mitsuba has them
+    weight: Tensor  # (k,) the diffuse fraction over pi, and over the rays of a pixel
+    back: Tensor  # (k,) bool, whether it is seen from behind
 
 
 class Views:
-    """Looks through many cameras of a scene in one launch, which is recorded; the
-    inputs that it is asked with have to be set in the scene.
+    """Trace rays through many cameras of a scene in one recorded launch.
 
-    Grids and lobes are those of all surfaces that take part, the searched texture's
-    first. `widths` are the root mean square angles, radians, of maps blurred as seen
-    from the middle (3,) of the object, each twice the one before. A ground is
-    photographed from a height. A lens model is that of all cameras; pinholes each have
-    a field of view.
+    Args:
+        scene: the scene; the inputs of the arrangement have to be set at a call.
+        grids, lobes: those of all surfaces, the searched texture's first.
+        widths: root mean square angles, radians, of the blurred maps, each twice the
+            one before. The maps are blurred as seen from `middle`.
+        photographed: height from which a photographed ground was taken; None of any
+            other ground.
+        model: lens model of all cameras; None of pinholes, which have a field of view
+            each.
+        middle: (3,) center of the object.
     """
 
     def __init__(
@@ -116,383 +132,454 @@ class Views:
             for surface in lobes
         ]
         self._tables = np.concatenate(tables).astype(np.float32)
-        self._lens: Floats | None = None
-        if model is not None:  # where the rays of each pixel go through it
-            height, width = scene.resolution
-            row, column, ray = np.meshgrid(
-                np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij"
-            )
-            across, down = np.array(PATTERN)[ray.ravel()].T
-            places = np.stack(
-                [(column.ravel() + across) / width, (row.ravel() + down) / height],
-                axis=1,
-            )
-            self._lens = model.table(torch.from_numpy(places)).numpy().ravel()
+        self._lens = None if model is None else self._make_lens_table(model)
         self._recorded = Recordings()
+
+    def _make_lens_table(self, model: CameraModel) -> Floats:
+        """Return the lens's rays through each pixel, flat, four numbers each."""
+        height, width = self._scene.resolution
+        row, column, ray_index = np.meshgrid(
+            np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij"
+        )
+        x_offset, y_offset = np.array(PATTERN)[ray_index.ravel()].T
+        x = (column.ravel() + x_offset) / width
+        y = (row.ravel() + y_offset) / height
+        positions = torch.from_numpy(np.stack([x, y], axis=1))
+        table: Floats = model.table(positions).numpy().ravel()
+        return table
 
     def __call__(
         self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit
     ) -> Callable[[], Seen]:
-        """Begin to look at a lit scene through cameras, by the inputs of each:
-        `camera.to_world` (4, 4), and of a pinhole `camera.fov`, `camera.shift_x` and
-        `camera.shift_y` (1,). What is returned waits until Dr.Jit has done all that was
-        asked, and says what is seen; until then the processor may do other things.
+        """Start to trace a lit scene through cameras.
+
+        Args:
+            cameras: inputs of each camera: `camera.to_world` (4, 4), and of a pinhole
+                `camera.fov`, `camera.shift_x` and `camera.shift_y` (1,).
+            lit: the light.
+
+        Returns:
+            A function that waits for the result and returns it; until it is called the
+            processor may do other things.
         """
         with one_at_a_time:
             height, width = self._scene.resolution
             count = len(cameras)
-            rows = np.stack(
-                [_camera(inputs, height, width) for inputs in cameras]
+            camera_rows = np.stack(
+                [_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
-            def look(
-                held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, *arrays: Any
+            def trace(
+                mitsuba_scene: Any,
+                lane: Any,
+                tables: Any,
+                cameras: Any,
+                lens: Any,
+                *maps: Any,
             ) -> Any:
-                there = Lit(
-                    arrays[0], arrays[1], lit.sky_shape, arrays[2], lit.blurred_shape
+                recorded_lit = Lit(
+                    maps[0], maps[1], lit.sky_shape, maps[2], lit.blurred_shape
                 )
-                return self._look(held, lane, tables, cameras, lens, there)
+                return self._trace(
+                    mitsuba_scene, lane, tables, cameras, lens, recorded_lit
+                )
 
             recording = self._recorded.of(
-                (count, lit.sky_shape, lit.blurred_shape), look, []
+                (count, lit.sky_shape, lit.blurred_shape), trace, []
             )
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
-            arrays = [mi.Float(values) for values in (self._tables, rows.ravel(), lens)]
+            arrays = [
+                mi.Float(values) for values in (self._tables, camera_rows.ravel(), lens)
+            ]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS)
-            # a recording takes its size from what it is given, the size of the scene's
-            # map else
+            # A recording takes its size from its arguments; without the lanes it would
+            # be that of the scene's map.
             dr.eval(lane)
             channels = recording(
                 self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred
             )
-        return lambda: _seen(channels, (count, height, width))
+        return lambda: _fetch(channels, (count, height, width))
 
-    def _look(
-        self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit
+    def _trace(
+        self,
+        mitsuba_scene: Any,
+        lane: Any,
+        tables: Any,
+        cameras: Any,
+        lens: Any,
+        lit: Lit,
     ) -> list[Any]:
-        """The kernel: radiance but for the searched texture, coverage, and where and
-        how much each ray sees of it.
-        """
-        height, width = self._scene.resolution
-        pixel = lane // RAYS
-        number = lane % RAYS
-        view = pixel // (height * width)
-        pixel = pixel % (height * width)
-        across = mi.Float(PATTERN[0][0])
-        down = mi.Float(PATTERN[0][1])
-        for index, place in enumerate(PATTERN[1:], 1):
-            across, down = (
-                dr.select(number == index, a, b)
-                for a, b in zip(place, (across, down), strict=True)
-            )
-        camera = [
-            dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)
-        ]
-        if self._lens is None:
-            x = (
-                camera[14] - 2.0 * (mi.Float(pixel % width) + across) / width
-            ) * camera[12]
-            y = (
-                camera[15] - 2.0 * (mi.Float(pixel // width) + down) / height
-            ) * camera[13]
-            z = mi.Float(1.0)
-            active = mi.Bool(True)
-        else:
-            x, y, z, within = (
-                dr.gather(mi.Float, lens, 4 * (pixel * RAYS + number) + k)
-                for k in range(4)
-            )
-            active = within > 0.0
-        d = dr.normalize(
-            mi.Vector3f(
-                *(
-                    camera[k] * x + camera[3 + k] * y + camera[6 + k] * z
-                    for k in range(3)
-                )
-            )
-        )
-        ray = mi.Ray3f(mi.Point3f(*camera[9:12]), d)
-        wanted = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        """Trace all rays: the recorded kernel.
 
-        # Through cut-outs, layer by layer; of each, what light passes is left for those
-        # behind it
-        layers = texel_rays.layers_of(self._scene)
+        Returns:
+            For each pixel the three channels of radiance without the searched texture,
+            and coverage; then for each layer of cut-outs and each ray u, v and weight
+            of the searched texture, negative on its back.
+        """
+        ray, active = self._make_rays(lane, cameras, lens)
+        d = ray.d
+        to_local = texel_rays.world_to_map(self._scene)
+        ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+
+        # Through cut-outs, layer by layer; what light passes one is left for those
+        # behind it.
+        n_layers = texel_rays.count_cut_out_layers(self._scene)
         texture = []
         radiance = mi.Color3f(0.0)
         covered = mi.Float(0.0)
         left = mi.Float(1.0)
-        for layer in range(layers + 1):
-            si = held.ray_intersect(ray, wanted, layer == 0, active)
+        for layer in range(n_layers + 1):
+            si = mitsuba_scene.ray_intersect(ray, ray_flags, layer == 0, active)
             valid = active & si.is_valid()
-            share = (
-                left * (1.0 - texel_rays.passed(si, valid)) if layer < layers else left
+            if layer < n_layers:
+                stopped = left * (1.0 - texel_rays.eval_transmittance(si, valid))
+            else:
+                stopped = left
+            surface_radiance, diffuse, side = self._shade(
+                mitsuba_scene, si, valid, d, tables, lit
             )
-            shown, diffuse, side = self._shaded(held, si, valid, d, tables, lit)
-            radiance += dr.select(valid, share * shown, 0.0)
-            radiance += dr.select(
-                active & ~si.is_valid(),
-                left * _sky(lit, d, texel_rays.to_map(self._scene)),
-                0.0,
-            )
-            covered += dr.select(valid, share / RAYS, 0.0)
-            texture += [si.uv.x, si.uv.y, side * share * diffuse / (math.pi * RAYS)]
-            left, active = left - share, valid & (left - share > LEAST)
+            radiance += dr.select(valid, stopped * surface_radiance, 0.0)
+            escapes = active & ~si.is_valid()
+            radiance += dr.select(escapes, left * _look_up_sky(lit, d, to_local), 0.0)
+            covered += dr.select(valid, stopped / RAYS, 0.0)
+            texture += [si.uv.x, si.uv.y, side * stopped * diffuse / (math.pi * RAYS)]
+            left = left - stopped
+            active = valid & (left > LEAST)
             ray = si.spawn_ray(d)
         radiance /= RAYS
-        # a sum of its own kernel each would send all rays again
+        # a sum in a kernel of its own for each channel would trace all rays again
         dr.eval(radiance, covered, texture)
-        return [
-            *(dr.block_sum(channel, RAYS) for channel in (*radiance, covered)),
-            *texture,
-        ]
+        pixel_sums = [dr.block_sum(channel, RAYS) for channel in (*radiance, covered)]
+        return [*pixel_sums, *texture]
 
-    def _shaded(
-        self, held: Any, si: Any, valid: Any, d: Any, tables: Any, lit: Lit
+    def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
+        """Return the ray of each lane, and whether the lens has one there."""
+        height, width = self._scene.resolution
+        pixel = lane // RAYS
+        ray_index = lane % RAYS
+        view = pixel // (height * width)
+        pixel = pixel % (height * width)
+        x_offset = mi.Float(PATTERN[0][0])
+        y_offset = mi.Float(PATTERN[0][1])
+        for index, offset in enumerate(PATTERN[1:], 1):
+            x_offset = dr.select(ray_index == index, offset[0], x_offset)
+            y_offset = dr.select(ray_index == index, offset[1], y_offset)
+        camera = [
+            dr.gather(mi.Float, cameras, view * CAMERA + index)
+            for index in range(CAMERA)
+        ]
+        if self._lens is None:
+            column = mi.Float(pixel % width) + x_offset
+            row = mi.Float(pixel // width) + y_offset
+            x = (camera[14] - 2.0 * column / width) * camera[12]
+            y = (camera[15] - 2.0 * row / height) * camera[13]
+            z = mi.Float(1.0)
+            active = mi.Bool(True)
+        else:
+            entry = 4 * (pixel * RAYS + ray_index)
+            x = dr.gather(mi.Float, lens, entry)
+            y = dr.gather(mi.Float, lens, entry + 1)
+            z = dr.gather(mi.Float, lens, entry + 2)
+            active = dr.gather(mi.Float, lens, entry + 3) > 0.0
+        direction = [
+            camera[axis] * x + camera[3 + axis] * y + camera[6 + axis] * z
+            for axis in range(3)
+        ]
+        origin = mi.Point3f(*camera[9:12])
+        return mi.Ray3f(origin, dr.normalize(mi.Vector3f(*direction))), active
+
+    def _shade(
+        self, mitsuba_scene: Any, si: Any, valid: Any, d: Any, tables: Any, lit: Lit
     ) -> tuple[Any, Any, Any]:
-        """What a ray in direction d hit: its radiance, but for what the searched
-        texture reflects diffusely; its diffuse share; and 1 on the front of the
-        searched texture, -1 on its back, 0 elsewhere.
+        """Shade what a ray in direction d hit.
+
+        Returns:
+            Its radiance, without what the searched texture reflects diffusely; its
+            diffuse fraction; and 1 on the front of the searched texture, -1 on its
+            back, 0 elsewhere.
         """
-        to_local = texel_rays.to_map(self._scene)
-        layers = texel_rays.layers_of(self._scene)
-        on = [at & valid for at in texel_rays.on_grids(held, self._grids, si, d)]
+        to_local = texel_rays.world_to_map(self._scene)
+        masks = [
+            mask & valid
+            for mask in texel_rays.find_hit_grids(mitsuba_scene, self._grids, si, d)
+        ]
         # towards the viewer
         n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)
         cosine = -dr.dot(n, d)
+        diffuse, *lobe = self._look_up_lobes(masks, cosine, tables)
+        gloss = lobe[0]
 
-        # The tables of the surface, between their two entries next to the angle
+        # Diffuse light; that of the searched texture is left to the matrix.
+        diffuse_radiance = self._look_up_diffuse(si, masks, lit, to_local)
+        side = mi.Float(0.0)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            if grid.warp is None:
+                side = dr.select(mask, -1.0 if grid.side < 0 else 1.0, side)
+        radiance = dr.select(
+            side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
+        )
+
+        is_glossy = valid & (gloss > 1e-4)
+        reflected = self._reflect(mitsuba_scene, si, d, n, cosine, lobe, is_glossy, lit)
+        radiance += dr.select(is_glossy, gloss * reflected, 0.0)
+        return radiance, diffuse, side
+
+    def _look_up_lobes(
+        self, masks: Sequence[Any], cosine: Any, tables: Any
+    ) -> list[Any]:
+        """Look up the tables of `Lobes` for a cosine of the angle of view.
+
+        The value lies between the two entries next to the angle.
+        """
+        n_tables = len(texel_rays.TABLES)
         table = mi.UInt32(0)
-        for number, at in enumerate(on):
-            table = dr.select(
-                at,
-                mi.UInt32(number * len(texel_rays.TABLES) * texel_rays.ANGLES),
-                table,
-            )
-        place = dr.clip(cosine * texel_rays.ANGLES - 0.5, 0.0, texel_rays.ANGLES - 1.0)
-        low = dr.minimum(mi.UInt32(place), texel_rays.ANGLES - 2)
-        between = place - mi.Float(low)
-        entries = []
-        for number in range(len(texel_rays.TABLES)):
-            entry = table + number * texel_rays.ANGLES + low
+        for index, mask in enumerate(masks):
+            first_entry = mi.UInt32(index * n_tables * texel_rays.ANGLES)
+            table = dr.select(mask, first_entry, table)
+        position = dr.clip(
+            cosine * texel_rays.ANGLES - 0.5, 0.0, texel_rays.ANGLES - 1.0
+        )
+        lower = dr.minimum(mi.UInt32(position), texel_rays.ANGLES - 2)
+        fraction = position - mi.Float(lower)
+        values = []
+        for index in range(n_tables):
+            entry = table + index * texel_rays.ANGLES + lower
             first = dr.gather(mi.Float, tables, entry)
             second = dr.gather(mi.Float, tables, entry + 1)
-            entries.append(first + between * (second - first))
-        diffuse, gloss, up, along, core, tail = entries
+            values.append(first + fraction * (second - first))
+        return values
 
-        # Diffuse light; that of the searched texture is left to the matrix
-        shown = self._shown(si, on, lit, to_local)
-        side = mi.Float(0.0)
-        for grid, at in zip(self._grids, on, strict=True):
-            side = (
-                dr.select(at, -1.0 if grid.side < 0 else 1.0, side)
-                if grid.warp is None
-                else side
-            )
-        radiance = dr.select(side != 0.0, 0.0, shown * dr.select(valid, diffuse, 1.0))
+    def _reflect(
+        self,
+        mitsuba_scene: Any,
+        si: Any,
+        d: Any,
+        n: Any,
+        cosine: Any,
+        lobe: Sequence[Any],
+        active: Any,
+        lit: Lit,
+    ) -> Any:
+        """Return the radiance in the gloss of what a ray in direction d hit.
 
-        # The gloss: a ray in the mean direction of the lobe says what is there, the
-        # blurred map how bright it is
-        glossy = valid & (gloss > 1e-4)
-        beside = dr.normalize(d + n * cosine + 1e-8)
-        wo = dr.normalize(n * up + beside * along)
-        si_wo = texel_rays.stopped(
-            held, mi.Ray3f(si.p + n * texel_rays.SHIFT, wo), layers, active=glossy
+        A ray in the mean direction of the lobe finds what is there, and the blurred map
+        how bright it is. The lobe is gloss, up, along, core and tail of `Lobes`.
+        """
+        _, up, along, core, tail = lobe
+        to_local = texel_rays.world_to_map(self._scene)
+        n_layers = texel_rays.count_cut_out_layers(self._scene)
+        tangent = dr.normalize(d + n * cosine + 1e-8)
+        wo = dr.normalize(n * up + tangent * along)
+        si_wo = texel_rays.find_opaque_hits(
+            mitsuba_scene,
+            mi.Ray3f(si.p + n * texel_rays.SHIFT, wo),
+            n_layers,
+            active=active,
         )
-        on_wo = texel_rays.on_grids(held, self._grids, si_wo, wo)
-        # or the direction in which the middle of the object sees the ground that is
-        # seen from here
-        seen_in = wo
-        if any(grid.warp is not None for grid in self._grids):
-            far = si.p.z / dr.maximum(-wo.z, 1e-3)
-            seen_in = dr.select(
-                wo.z < -1e-3,
-                dr.normalize(si.p + wo * far - mi.Point3f(*self._middle)),
-                wo,
-            )
+        masks_wo = texel_rays.find_hit_grids(mitsuba_scene, self._grids, si_wo, wo)
+        map_direction = self._correct_parallax(si, wo)
         blurred = 0.5 * sum(
-            _blurred(lit, seen_in, to_local, spread, self._widths)
+            _look_up_blurred(lit, map_direction, to_local, spread, self._widths)
             for spread in (core, tail)
         )
-        texel = self._texel(si_wo, on_wo, lit)
+        texel = self._look_up_texel(si_wo, masks_wo, lit)
 
         # On the ground one ray meets a single place: the wider the lobe, the more
         # counts what surrounds the object, which is darker where the ground is darker
-        # there than far off
-        shade = texel / _gathered(
-            lit.texels, mi.UInt32(self._grids[-1].first + self._grids[-1].count)
-        )
-        level = mi.Bool(False)
-        for grid, at in zip(self._grids, on_wo, strict=True):
-            level |= at & (grid.warp is not None)
-        wide = dr.clip(
-            (dr.sqrt(0.5 * (core * core + tail * tail)) - SHARP) / (WIDE - SHARP),
-            0.0,
-            1.0,
-        )
-        traced = self._shown(si_wo, on_wo, lit, to_local)
-        ground = traced + wide * (blurred * shade - traced)
-        reflected = dr.select(
-            si_wo.is_valid(), dr.select(level, ground, texel), blurred
-        )
-        radiance += dr.select(glossy, gloss * reflected, 0.0)
-        return radiance, diffuse, side
+        # there than far off.
+        far_ground = mi.UInt32(self._grids[-1].first + self._grids[-1].count)
+        shade = texel / _gather_color(lit.texels, far_ground)
+        on_ground = mi.Bool(False)
+        for grid, mask in zip(self._grids, masks_wo, strict=True):
+            on_ground |= mask & (grid.warp is not None)
+        spread = dr.sqrt(0.5 * (core * core + tail * tail))
+        wideness = dr.clip((spread - SHARP) / (WIDE - SHARP), 0.0, 1.0)
+        single_ray = self._look_up_diffuse(si_wo, masks_wo, lit, to_local)
+        ground = single_ray + wideness * (blurred * shade - single_ray)
+        return dr.select(si_wo.is_valid(), dr.select(on_ground, ground, texel), blurred)
 
-    def _shown(self, si: Any, on: Sequence[Any], lit: Lit, to_local: Any) -> Any:
-        """Diffuse radiance of what was hit: that of a photographed ground is a share of
-        its photograph.
+    def _correct_parallax(self, si: Any, direction: Any) -> Any:
+        """Return the direction in which the blurred maps have what is seen from a hit.
+
+        The maps are those seen from the object's center: what matters is the direction
+        in which the center sees the same point of the ground.
         """
-        radiance = self._texel(si, on, lit)
+        if all(grid.warp is None for grid in self._grids):
+            return direction
+        distance = si.p.z / dr.maximum(-direction.z, 1e-3)
+        from_center = si.p + direction * distance - mi.Point3f(*self._middle)
+        return dr.select(direction.z < -1e-3, dr.normalize(from_center), direction)
+
+    def _look_up_diffuse(
+        self, si: Any, masks: Sequence[Any], lit: Lit, to_local: Any
+    ) -> Any:
+        """Return the diffuse radiance of what was hit.
+
+        That of a photographed ground is a fraction of its photograph.
+        """
+        radiance = self._look_up_texel(si, masks, lit)
         if self._photographed is not None:
             below = dr.normalize(si.p - mi.Point3f(0.0, 0.0, self._photographed))
-            for grid, at in zip(self._grids, on, strict=True):
+            for grid, mask in zip(self._grids, masks, strict=True):
                 if grid.warp is not None:
-                    radiance = dr.select(
-                        at, radiance * _sky(lit, below, to_local), radiance
-                    )
+                    photograph = _look_up_sky(lit, below, to_local)
+                    radiance = dr.select(mask, radiance * photograph, radiance)
         return radiance
 
-    def _texel(self, si: Any, on: Sequence[Any], lit: Lit) -> Any:
+    def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: Lit) -> Any:
+        """Return what the texels around a hit have, bilinear; 0 on no grid."""
         first = mi.UInt32(0)
-        rows = mi.UInt32(1)
-        columns = mi.UInt32(1)
+        n_rows = mi.UInt32(1)
+        n_columns = mi.UInt32(1)
         y = mi.Float(0.0)
         x = mi.Float(0.0)
-        known = mi.Bool(False)
-        for grid, at in zip(self._grids, on, strict=True):
-            down, across = texel_rays.grid_place(grid, si.p, si.uv)
-            y = dr.select(at, down, y)
-            x = dr.select(at, across, x)
-            known = known | at
-            first = dr.select(at, mi.UInt32(grid.first), first)
-            rows = dr.select(at, mi.UInt32(grid.shape[0]), rows)
-            columns = dr.select(at, mi.UInt32(grid.shape[1]), columns)
-        radiance = _bilinear(
-            lit.texels,
-            first,
-            rows,
-            columns,
-            y * mi.Float(rows) - 0.5,
-            x * mi.Float(columns) - 0.5,
-        )
-        return dr.select(known, radiance, 0.0)
+        on_any_grid = mi.Bool(False)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            grid_y, grid_x = texel_rays.compute_grid_position(grid, si.p, si.uv)
+            y = dr.select(mask, grid_y, y)
+            x = dr.select(mask, grid_x, x)
+            on_any_grid = on_any_grid | mask
+            first = dr.select(mask, mi.UInt32(grid.first), first)
+            n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
+            n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
+        row = y * mi.Float(n_rows) - 0.5
+        column = x * mi.Float(n_columns) - 0.5
+        radiance = _look_up_bilinear(lit.texels, first, n_rows, n_columns, row, column)
+        return dr.select(on_any_grid, radiance, 0.0)
 
 
-def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
-    """The 16 numbers of a camera: its axes to the left, up and forward, its place, half
-    its extent, its middle.
+def _camera_numbers(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
+    """Return the `CAMERA` numbers of a camera as the kernel takes them.
+
+    They are its axes to the left, up and forward (9), its position (3), half its extent
+    along x and y, and its center along x and y.
     """
     matrix = inputs["camera.to_world"].detach().double().numpy()
-    half = (
-        math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
-        if "camera.fov" in inputs
-        else 0.0
-    )
-    extent = [half * side / max(height, width) for side in (width, height)]
-    middle = [
-        1.0 - 2.0 * float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"
-    ]
-    return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
+    half_tangent = 0.0
+    if "camera.fov" in inputs:
+        half_tangent = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
+    larger = max(height, width)
+    extent = [half_tangent * size / larger for size in (width, height)]
+    shifts = [float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"]
+    center = [1.0 - 2.0 * shift for shift in shifts]
+    return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, center])
 
 
-def _seen(channels: Sequence[Any], size: tuple[int, int, int]) -> Seen:
-    """What the kernel has found, in memory of torch's own; `size` in cameras, rows and
-    columns.
+def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> Seen:
+    """Copy what the kernel has computed into memory of torch.
+
+    The size is the number of cameras, rows and columns.
     """
     with one_at_a_time:
-        # of three channels a layer, all layers of a ray, ray by ray
+        # three channels a layer, all layers of a ray, ray by ray
         u, v, weight = (
-            np.stack([layer.numpy() for layer in channels[k::3]], axis=1).ravel()
-            for k in (4, 5, 6)
+            np.stack([layer.numpy() for layer in channels[first::3]], axis=1).ravel()
+            for first in (4, 5, 6)
         )
-        (met,) = np.nonzero(weight)
+        (hits,) = np.nonzero(weight)
+        n_layers = len(weight) // (math.prod(size) * RAYS)
         rest = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         return Seen(
             rest=torch.from_numpy(rest).reshape(*size, 3),
             covered=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
-            sample=torch.from_numpy(met // (len(weight) // (math.prod(size) * RAYS))),
-            uv=torch.from_numpy(np.stack([u[met], v[met]], axis=1)),
-            weight=torch.from_numpy(np.abs(weight[met])),
-            back=torch.from_numpy(weight[met] < 0.0),
+            sample=torch.from_numpy(hits // n_layers),
+            uv=torch.from_numpy(np.stack([u[hits], v[hits]], axis=1)),
+            weight=torch.from_numpy(np.abs(weight[hits])),
+            back=torch.from_numpy(weight[hits] < 0.0),
         )
 
 
-def _bilinear(
+def _look_up_bilinear(
     values: Any,
     first: Any,
-    rows: Any,
-    columns: Any,
+    n_rows: Any,
+    n_columns: Any,
     y: Any,
     x: Any,
     *,
     wraps: bool = False,
 ) -> Any:
-    """Look three numbers up in a grid of a flat array, which ends at its border or goes
-    round in its columns.
-    """
-    y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
-    upper = mi.UInt32(y)
-    share = y - dr.floor(y)
-    lower = dr.minimum(upper + 1, rows - 1)
-    x = (
-        dr.select(x < 0.0, x + mi.Float(columns), x)
-        if wraps
-        else dr.clip(x, 0.0, mi.Float(columns) - 1.0)
-    )
-    left = mi.UInt32(x)
-    across = x - dr.floor(x)
-    right = (left + 1) % columns if wraps else dr.minimum(left + 1, columns - 1)
-    left = left % columns if wraps else left
+    """Look a color up between the four nearest cells of a grid.
 
-    def along(row: Any) -> Any:
-        begin = first + row * columns
+    Args:
+        values: flat array with three numbers for each cell.
+        first: index of the grid's first cell in it.
+        n_rows, n_columns: of the grid.
+        y, x: row and column, integers at the centers of cells.
+        wraps: columns go round; otherwise the grid ends at its border.
+    """
+    y = dr.clip(y, 0.0, mi.Float(n_rows) - 1.0)
+    upper = mi.UInt32(y)
+    y_fraction = y - dr.floor(y)
+    lower = dr.minimum(upper + 1, n_rows - 1)
+    if wraps:
+        x = dr.select(x < 0.0, x + mi.Float(n_columns), x)
+    else:
+        x = dr.clip(x, 0.0, mi.Float(n_columns) - 1.0)
+    left = mi.UInt32(x)
+    x_fraction = x - dr.floor(x)
+    if wraps:
+        right = (left + 1) % n_columns
+        left = left % n_columns
+    else:
+        right = dr.minimum(left + 1, n_columns - 1)
+
+    def look_up_row(row: Any) -> Any:
+        row_start = first + row * n_columns
         return (
-            _gathered(values, begin + left) * (1.0 - across)
-            + _gathered(values, begin + right) * across
+            _gather_color(values, row_start + left) * (1.0 - x_fraction)
+            + _gather_color(values, row_start + right) * x_fraction
         )
 
-    return along(upper) * (1.0 - share) + along(lower) * share
+    return look_up_row(upper) * (1.0 - y_fraction) + look_up_row(lower) * y_fraction
 
 
-def _gathered(values: Any, number: Any) -> Any:
-    """The three numbers with a number; four at once is what the processor reads
-    fastest.
+def _gather_color(values: Any, index: Any) -> Any:
+    """Return three numbers; gathering four at once is fastest on the processor."""
+    return mi.Color3f(*dr.gather(mi.Vector4f, values, index)[:3])
+
+
+def _look_up_sky(lit: Lit, direction: Any, to_local: Any) -> Any:
+    """Look the environment up in a direction, as Mitsuba does.
+
+    Rows go from pole to pole, and there are copies of columns at both ends.
     """
-    return mi.Color3f(*dr.gather(mi.Vector4f, values, number)[:3])
+    n_rows, n_columns = lit.sky_shape
+    x, y = texel_rays.compute_map_position(direction, to_local)
+    column = x * (n_columns - 2) + 0.5
+    row = y * (n_rows - 1)
+    return _look_up_bilinear(
+        lit.sky, mi.UInt32(0), mi.UInt32(n_rows), mi.UInt32(n_columns), row, column
+    )
 
 
-def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
-    """The environment in a direction, as Mitsuba has it: rows from pole to pole,
-    columns with a copy at both ends.
-    """
-    rows, columns = lit.sky_shape
-    across, down = texel_rays.map_place(way, to_local)
-    x = across * (columns - 2) + 0.5
-    y = down * (rows - 1)
-    return _bilinear(lit.sky, mi.UInt32(0), mi.UInt32(rows), mi.UInt32(columns), y, x)
-
-
-def _blurred(
-    lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[float]
+def _look_up_blurred(
+    lit: Lit, direction: Any, to_local: Any, spread: Any, widths: Sequence[float]
 ) -> Any:
-    """The environment in a direction, blurred by an angle (root mean square)."""
-    rows, columns = lit.blurred_shape
+    """Look up the environment blurred by a root mean square angle `spread`.
+
+    The value lies between the two maps whose widths are next to it.
+    """
+    n_rows, n_columns = lit.blurred_shape
     level = dr.clip(
         dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0
     )
-    low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
-    across, down = texel_rays.map_place(way, to_local)
-    y = down * rows - 0.5
-    x = across * columns - 0.5
-    narrow, wide = (
-        _bilinear(
+    lower_level = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
+    x, y = texel_rays.compute_map_position(direction, to_local)
+    row = y * n_rows - 0.5
+    column = x * n_columns - 0.5
+
+    def look_up_level(index: Any) -> Any:
+        return _look_up_bilinear(
             lit.blurred,
-            (low + k) * (rows * columns),
-            mi.UInt32(rows),
-            mi.UInt32(columns),
-            y,
-            x,
+            index * (n_rows * n_columns),
+            mi.UInt32(n_rows),
+            mi.UInt32(n_columns),
+            row,
+            column,
             wraps=True,
         )
-        for k in (0, 1)
-    )
-    return narrow + (level - mi.Float(low)) * (wide - narrow)
+
+    narrow = look_up_level(lower_level)
+    wide = look_up_level(lower_level + 1)
+    return narrow + (level - mi.Float(lower_level)) * (wide - narrow)

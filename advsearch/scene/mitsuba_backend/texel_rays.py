@@ -1,10 +1,8 @@
-"""Rays from texels: what they see of each other and of the environment; and where in
-grids and its map things lie.
+"""Trace rays from texels, find positions in grids and maps, and measure surfaces.
 
-A grid of texels is laid over each surface (`TexelGrid`). Nothing here depends on the
-light.
-
-And what a surface does to light, as tables over the angle of view (`Lobes`).
+A grid of texels is laid over each surface (`TexelGrid`). What the texels see of each
+other and of the environment does not depend on the light. `Lobes` are tables of what a
+surface does to light over the angle of view.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,247 +24,294 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 Ints = npt.NDArray[np.int32]
 Grids: TypeAlias = "Sequence[TexelGrid]"
 SHIFT = 1e-4  # how far from a surface rays begin, object sizes
-PASS = 1 << 20  # rays of one launch of `gather`
+PASS = 1 << 20  # rays of one launch of `trace_texel_rays`
 # cut-outs that a ray goes through; what comes after them is taken for opaque
 LAYERS = 4
-# share of what is seen of a shape from outside, from which on the backs of its faces
-# count
+# fraction of hits from outside on the backs of a shape's faces above which backs count
 FROM_BEHIND = 0.02
 
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """The texels over one surface, of a shape in Mitsuba's scene; `first` is their
-    first number among all grids.
-    """
+    """The texels over one surface, of a shape in Mitsuba's scene."""
 
     name: str
-    first: int
+    first: int  # index of its first cell among the cells of all grids
     shape: tuple[int, int]  # rows and columns
-    # None where it lies over texture coordinates; else (middle x, middle y, scale,
-    # rate) of a level plane whose cells are small about its middle: coordinate = middle
+    # None where it lies over texture coordinates; else (center x, center y, scale,
+    # rate) of a level plane whose cells are small about its center: coordinate = center
     # + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
     side: int = 0  # of the faces that it lies on: 1 the front, -1 the back, 0 both
 
     @property
     def count(self) -> int:
+        """Number of cells."""
         return self.shape[0] * self.shape[1]
 
 
-def gather(
+def trace_texel_rays(
     scene: MitsubaScene,
     grids: Grids,
-    cells: tuple[int, int],
-    places: Floats,
+    sky_shape: tuple[int, int],
+    positions: Floats,
     normals: Floats,
-    rays: int,
+    n_rays: int,
     seed: int,
 ) -> Ints:
-    """Return what rays from texels of all grids in a scene with its inputs set see,
-    over the cosine, as numbers (n, rays) of texels; from the count of all texels on, of
-    cells of the environment, which has so many rows and columns; or -1, where there is
-    no light: the back of a surface that has texels, or a shape that has none.
+    """Trace cosine-weighted rays from texels and return what they meet.
 
-    The texels lie at places (n, 3) with unit shading normals. All have the same
-    well-spread points, shifted by chance, of which `seed` is the number.
+    All texels have the same well-spread points on the hemisphere, each shifted at
+    random.
+
+    Args:
+        scene: the scene, with its inputs set.
+        grids: those of all surfaces.
+        sky_shape: rows and columns of the cells of the environment.
+        positions, normals: (n, 3) of the texels, with unit shading normals.
+        n_rays: rays from each texel.
+        seed: of the shifts.
+
+    Returns:
+        (n, n_rays) indices of cells of all grids; from the number of those on, of cells
+        of the environment; or -1 where there is no light: the back of a surface that
+        has texels, or a shape that has none.
     """
-    held = scene._scene
-    to_local = to_map(scene)
-    layers = layers_of(scene)
-    count = len(places)
-    texels = grids[-1].first + grids[-1].count
-    steps = (
-        np.arange(1, rays + 1)[:, None]
-        * np.array([0.7548776662466927, 0.5698402909980532])
-    ) % 1.0
-    points = _points(mi.Point2f, steps)
+    # The additive recurrence of the plastic number, which fills a square evenly
+    # (Roberts 2018, The unreasonable effectiveness of quasirandom sequences).
+    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    points = _points(mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * steps) % 1.0)
+    count = len(positions)
     shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
-    seen_by_rays = np.empty((count, rays), dtype=np.int32)
-    for begin in range(0, count, max(1, PASS // rays)):
-        some = slice(begin, min(count, begin + max(1, PASS // rays)))
-        lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
-        texel = lane // rays
-        number = lane % rays
-
-        # The same points for every texel, each shifted around the square by chance;
-        # over the cosine
-        shift = _points(mi.Point2f, shifts[some], texel)
-        square = dr.gather(mi.Point2f, points, number) + shift
+    met_cells = np.empty((count, n_rays), dtype=np.int32)
+    texels_per_launch = max(1, PASS // n_rays)
+    for begin in range(0, count, texels_per_launch):
+        batch = slice(begin, min(count, begin + texels_per_launch))
+        lane = dr.arange(mi.UInt32, (batch.stop - begin) * n_rays)
+        texel = lane // n_rays
+        ray_index = lane % n_rays
+        shift = _points(mi.Point2f, shifts[batch], texel)
+        square = dr.gather(mi.Point2f, points, ray_index) + shift
         square -= dr.floor(square)
-        normal = _points(mi.Normal3f, normals[some], texel)
-        place = _points(mi.Point3f, places[some], texel)
-        way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-        si = stopped(
-            held,
-            mi.Ray3f(place + normal * SHIFT, way),
-            layers,
-            _chance(layers, len(lane), (seed, begin)),
+        met = _trace_batch(
+            scene,
+            grids,
+            sky_shape,
+            _points(mi.Normal3f, normals[batch], texel),
+            _points(mi.Point3f, positions[batch], texel),
+            square,
+            (seed, begin),
         )
+        met_cells[batch] = met.numpy().reshape(-1, n_rays)
+    return met_cells
 
-        # What escapes sees a cell of the environment; what stops sees a texel, or a
-        # shape that has no light
-        column, row = map_place(way, to_local)
-        across = mi.UInt32(column * cells[1]) % cells[1]
-        down = mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
-        seen = dr.select(
-            si.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across)
+
+def _trace_batch(
+    scene: MitsubaScene,
+    grids: Grids,
+    sky_shape: tuple[int, int],
+    normal: Any,
+    position: Any,
+    square: Any,
+    seed: tuple[int, int],
+) -> Any:
+    """Trace one launch of `trace_texel_rays`, by points of the unit square."""
+    mitsuba_scene = scene._scene
+    n_layers = count_cut_out_layers(scene)
+    direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
+    ray = mi.Ray3f(position + normal * SHIFT, direction)
+    chance = _sample_chances(n_layers, dr.width(square), seed)
+    si = find_opaque_hits(mitsuba_scene, ray, n_layers, chance)
+
+    # What escapes meets a cell of the environment.
+    n_cells = grids[-1].first + grids[-1].count
+    n_rows, n_columns = sky_shape
+    column, row = compute_map_position(direction, world_to_map(scene))
+    sky_column = mi.UInt32(column * n_columns) % n_columns
+    sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
+    sky_cell = mi.Int32(n_cells + sky_row * n_columns + sky_column)
+    met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
+
+    # What stops meets a texel, or a shape that has no light.
+    masks = find_hit_grids(mitsuba_scene, grids, si, direction)
+    for grid, is_hit in zip(grids, masks, strict=True):
+        if grid.warp is None and grid.side == 0:
+            is_hit &= dr.dot(si.n, direction) < 0.0
+        y, x = compute_grid_position(grid, si.p, si.uv)
+        nearest = mi.Int32(
+            grid.first
+            + _cell_index(y, grid.shape[0]) * grid.shape[1]
+            + _cell_index(x, grid.shape[1])
         )
-        for grid, on in zip(grids, on_grids(held, grids, si, way), strict=True):
-            if grid.warp is None and grid.side == 0:
-                on &= dr.dot(si.n, way) < 0.0
-            y, x = grid_place(grid, si.p, si.uv)
-            nearest = mi.Int32(
-                grid.first
-                + _cell(y, grid.shape[0]) * grid.shape[1]
-                + _cell(x, grid.shape[1])
-            )
-            seen = dr.select(on, nearest, seen)
-        seen_by_rays[some] = seen.numpy().reshape(-1, rays)
-    return seen_by_rays
+        met = dr.select(is_hit, nearest, met)
+    return met
 
 
-def towards(
-    scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats
+def compute_visible_cosines(
+    scene: MitsubaScene, positions: Floats, normals: Floats, directions: Floats
 ) -> Floats:
-    """Return how much of what comes from unit directions (k, 3), in the axes of the
-    environment's map, texels receive: (n, k) cosines; 0 where something is in between.
-    The others as of `gather`.
+    """Return the fraction of light from given directions that texels receive.
+
+    Args:
+        scene: the scene, with its inputs set.
+        positions, normals: (n, 3) of the texels, with unit shading normals.
+        directions: (k, 3) unit vectors in the axes of the environment's map.
+
+    Returns:
+        (n, k) cosines; 0 where something is in between.
     """
     # the transpose turns back
-    world = (ways @ np.array(to_map(scene))).astype(np.float32)
-    lane = dr.arange(mi.UInt32, len(places) * len(world))
+    world = (directions @ np.array(world_to_map(scene))).astype(np.float32)
+    lane = dr.arange(mi.UInt32, len(positions) * len(world))
     texel = lane // len(world)
-    number = lane % len(world)
-    place = _points(mi.Point3f, places, texel)
+    position = _points(mi.Point3f, positions, texel)
     normal = _points(mi.Normal3f, normals, texel)
-    way = _points(mi.Vector3f, world, number)
-    cosine = dr.dot(normal, way)
-    active = above = cosine > 0.0
-    ray = mi.Ray3f(place + normal * SHIFT, way)
-    share = mi.Float(1.0)
-    for _ in range(layers_of(scene)):  # cut-outs in the way
+    direction = _points(mi.Vector3f, world, lane % len(world))
+    cosine = dr.dot(normal, direction)
+    is_above = cosine > 0.0
+    active = is_above
+    ray = mi.Ray3f(position + normal * SHIFT, direction)
+    transmittance = mi.Float(1.0)
+    for _ in range(count_cut_out_layers(scene)):
         si = scene._scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
         active = active & si.is_valid()
-        share = dr.select(active, share * passed(si, active), share)
-        active = active & (share > 0.0)
+        transmittance = dr.select(
+            active, transmittance * eval_transmittance(si, active), transmittance
+        )
+        active = active & (transmittance > 0.0)
         ray = si.spawn_ray(ray.d)
-    share = dr.select(scene._scene.ray_test(ray, active), 0.0, share)
-    return np.asarray(
-        dr.select(above, cosine * share, 0.0).numpy().reshape(len(places), len(world))
-    )
+    is_blocked = scene._scene.ray_test(ray, active)
+    transmittance = dr.select(is_blocked, 0.0, transmittance)
+    received = dr.select(is_above, cosine * transmittance, 0.0)
+    return np.asarray(received.numpy().reshape(len(positions), len(world)))
 
 
-def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
-    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from
-    outside, as through a window.
+def is_visible_from_behind(scene: MitsubaScene, name: str, positions: Floats) -> bool:
+    """Return whether backs of a shape's faces are visible from outside.
+
+    That is so through a window, for example. The positions (n, 3) lie on the shape.
     """
     generator = np.random.default_rng(0)
-    ways = generator.standard_normal((PASS >> 7, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    ways[:, 2] = np.abs(ways[:, 2])
-    targets = places[generator.integers(len(places), size=len(ways))]
-    reach = 2.0 * float(np.ptp(places, axis=0).max())
-    way = _points(mi.Vector3f, (-ways).astype(np.float32))
-    ray = mi.Ray3f(
-        _points(mi.Point3f, (targets + reach * ways).astype(np.float32)), way
-    )
-    layers = layers_of(scene)
-    si = stopped(scene._scene, ray, layers, _chance(layers, len(ways), (0,)))
-    (on,) = on_grids(scene._scene, [TexelGrid(name, 0, (1, 1))], si, way)
-    behind = np.asarray((on & (dr.dot(si.n, way) > 0.0)).numpy())
-    return bool(behind.sum() > FROM_BEHIND * np.asarray(on.numpy()).sum())
+    directions = generator.standard_normal((PASS >> 7, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions[:, 2] = np.abs(directions[:, 2])
+    targets = positions[generator.integers(len(positions), size=len(directions))]
+    distance = 2.0 * float(np.ptp(positions, axis=0).max())
+    inwards = _points(mi.Vector3f, (-directions).astype(np.float32))
+    origins = (targets + distance * directions).astype(np.float32)
+    ray = mi.Ray3f(_points(mi.Point3f, origins), inwards)
+    n_layers = count_cut_out_layers(scene)
+    chance = _sample_chances(n_layers, len(directions), (0,))
+    si = find_opaque_hits(scene._scene, ray, n_layers, chance)
+    grid = TexelGrid(name, 0, (1, 1))
+    (is_hit,) = find_hit_grids(scene._scene, [grid], si, inwards)
+    is_back = np.asarray((is_hit & (dr.dot(si.n, inwards) > 0.0)).numpy())
+    return bool(is_back.sum() > FROM_BEHIND * np.asarray(is_hit.numpy()).sum())
 
 
-def layers_of(scene: MitsubaScene) -> int:
-    """How many cut-outs its rays go through; 0 where it has none."""
+def count_cut_out_layers(scene: MitsubaScene) -> int:
+    """Return how many cut-outs a scene's rays go through; 0 where it has none."""
     return LAYERS if scene.made[0].cut_out else 0
 
 
-def stopped(
-    held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = True
+def find_opaque_hits(
+    mitsuba_scene: Any, ray: Any, n_layers: int, chance: Any = 0.5, active: Any = True
 ) -> Any:
-    """Return the first hits of rays in Mitsuba's scene that light does not pass. A ray
-    goes on through cut-outs, up to `layers`, as long as the share of light that passes
-    all it has met is larger than its chance in [0, 1].
+    """Return the first hits of rays that light does not pass.
+
+    A ray goes on through up to `n_layers` cut-outs, as long as the fraction of light
+    that passes all it has met is larger than its chance in [0, 1].
     """
-    si = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
-    share = mi.Float(1.0)
-    for _ in range(layers):
-        share *= passed(si, active)
-        active = active & si.is_valid() & (share > chance)
-        following = held.ray_intersect(
+    si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
+    transmittance = mi.Float(1.0)
+    for _ in range(n_layers):
+        transmittance *= eval_transmittance(si, active)
+        active = active & si.is_valid() & (transmittance > chance)
+        next_hit = mitsuba_scene.ray_intersect(
             si.spawn_ray(ray.d), mi.RayFlags.UV, False, active
         )
-        si = dr.select(active, following, si)
+        si = dr.select(active, next_hit, si)
     return si
 
 
-def passed(si: Any, active: Any) -> Any:
-    """The share of light that passes what was hit."""
+def eval_transmittance(si: Any, active: Any) -> Any:
+    """Return the fraction of light that passes what was hit."""
     return dr.mean(si.bsdf().eval_null_transmission(si, active & si.is_valid()))
 
 
-def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
-    return (
-        mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32))
-        if layers
-        else 0.5
-    )
+def _sample_chances(n_layers: int, count: int, seed: tuple[int, ...]) -> Any:
+    """Return a random number in [0, 1) for each ray, if there are cut-outs."""
+    if not n_layers:
+        return 0.5
+    generator = np.random.default_rng([*seed, 1])
+    return mi.Float(generator.random(count, dtype=np.float32))
 
 
-def on_grids(held: Any, grids: Grids, si: Any, way: Any) -> list[Any]:
-    """Whether hits of rays in a direction lie on each grid."""
-    front = dr.dot(si.n, way) < 0.0
-    shapes = {shape.id(): shape for shape in held.shapes()}
-    sides = {0: True, 1: front, -1: ~front}
+def find_hit_grids(
+    mitsuba_scene: Any, grids: Grids, si: Any, direction: Any
+) -> list[Any]:
+    """Return for each grid a mask of the hits of rays that lie on it."""
+    is_front = dr.dot(si.n, direction) < 0.0
+    shapes = {shape.id(): shape for shape in mitsuba_scene.shapes()}
+    side_masks = {0: True, 1: is_front, -1: ~is_front}
     return [
-        si.is_valid() & (si.shape == mi.ShapePtr(shapes[grid.name])) & sides[grid.side]
+        si.is_valid()
+        & (si.shape == mi.ShapePtr(shapes[grid.name]))
+        & side_masks[grid.side]
         for grid in grids
     ]
 
 
-def to_map(scene: MitsubaScene) -> Any:
-    """The turn from the world to the axes of the environment's map, three rows."""
+def world_to_map(scene: MitsubaScene) -> Any:
+    """Return the rotation from the world to the axes of the environment's map.
+
+    It is a list of three rows.
+    """
     matrix = scene.parameters["environment.to_world"].matrix
     return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
 
 
-def map_place(way: Any, to_local: Any) -> tuple[Any, Any]:
-    """Where in the environment's map a direction lies: shares of its width and of its
-    height.
+def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
+    """Return where a direction lies in the environment's map.
+
+    The position is a fraction of the map's width and one of its height; `to_local` is
+    that of `world_to_map`.
     """
-    x, y, z = (row[0] * way.x + row[1] * way.y + row[2] * way.z for row in to_local)
-    across = dr.atan2(x, -z) / (2.0 * math.pi)
-    return across - dr.floor(across), dr.safe_acos(y) / math.pi
+    x, y, z = (
+        row[0] * direction.x + row[1] * direction.y + row[2] * direction.z
+        for row in to_local
+    )
+    azimuth = dr.atan2(x, -z) / (2.0 * math.pi)
+    return azimuth - dr.floor(azimuth), dr.safe_acos(y) / math.pi
 
 
-def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
-    """Where in a grid something lies: shares of its height and of its width."""
+def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any, Any]:
+    """Return where in a grid something lies: fractions of its height and its width."""
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
-    middle_x, middle_y, scale, rate = grid.warp
+    center_x, center_y, scale, rate = grid.warp
 
-    def share(far: Any) -> Any:
-        return dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0)
+    def unwarp(offset: Any) -> Any:
+        return dr.clip(0.5 + dr.asinh(offset) / (2.0 * rate), 0.0, 1.0)
 
-    return share((place.y - middle_y) / scale), share((place.x - middle_x) / scale)
-
-
-def _cell(share: Any, count: int) -> Any:
-    return mi.Int32(dr.minimum(share * count, count - 1.0))
+    row = unwarp((position.y - center_y) / scale)
+    column = unwarp((position.x - center_x) / scale)
+    return row, column
 
 
-def _points(kind: Any, values: Floats | Doubles, index: Any = None) -> Any:
-    """Rows of numbers as Dr.Jit's points, vectors or normals; of an index, one for each
-    lane.
+def _cell_index(fraction: Any, count: int) -> Any:
+    return mi.Int32(dr.minimum(fraction * count, count - 1.0))
+
+
+def _points(kind: Any, rows: Floats | Doubles, index: Any = None) -> Any:
+    """Convert rows of numbers to Dr.Jit's points, vectors or normals.
+
+    With an index, return the row with that index in each lane.
     """
-    points = kind(
-        *(
-            mi.Float(np.ascontiguousarray(column, dtype=np.float32))
-            for column in values.T
-        )
-    )
+    columns = [
+        mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in rows.T
+    ]
+    points = kind(*columns)
     return points if index is None else dr.gather(kind, points, index)
 
 
@@ -278,16 +323,17 @@ TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
 
 @dataclass(frozen=True, eq=False)
 class Lobes:
-    """What a surface does to light, by the cosine of the angle of view (`ANGLES`
-    entries, the first at grazing).
+    """Reflectance and gloss of a surface by the cosine of the angle of view.
+
+    Each table has `ANGLES` entries, the first at grazing angles.
     """
 
-    # (k,) share of even light that it reflects for a base colour of one, without the
+    # (k,) fraction of even light that it reflects for a base color of one, without the
     # gloss
     diffuse: Floats
-    gloss: Floats  # (k,) share of even light that it reflects whatever the base colour
-    up: Floats  # (k,) of the gloss's mean direction: its part along the normal
-    along: Floats  # (k,) and its part away from the viewer
+    gloss: Floats  # (k,) fraction of even light reflected whatever the base color
+    up: Floats  # (k,) component of the gloss's mean direction along the normal
+    along: Floats  # (k,) and its component away from the viewer
     # (k,) root mean square angle about that direction, radians, of the nearer half of
     # the gloss
     core: Floats
@@ -296,16 +342,26 @@ class Lobes:
 
     @classmethod
     def matt(cls) -> Lobes:
-        """Those of a diffuse surface."""
-        whole = np.ones(ANGLES, dtype=np.float32)
-        none = np.zeros(ANGLES, dtype=np.float32)
-        return cls(whole, none, whole, none, none, none)
+        """Return those of a diffuse surface."""
+        ones = np.ones(ANGLES, dtype=np.float32)
+        zeros = np.zeros(ANGLES, dtype=np.float32)
+        return cls(ones, zeros, ones, zeros, zeros, zeros)
 
     @property
     def mean_shares(self) -> tuple[float, float]:
-        """Both shares under even light from everywhere, over all angles of view."""
+        """Diffuse and glossy fractions under even light, over all angles of view."""
         weight = (np.arange(ANGLES) + 0.5) * 2.0 / ANGLES**2
         return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
+
+
+class _BsdfSamples(NamedTuple):
+    """Samples of a BSDF, each (ANGLES, LOBE_SAMPLES) float64."""
+
+    grey: Doubles  # value over a cosine density, for a base color of 0.5
+    black: Doubles  # the same for a base color of 0
+    weight: Doubles  # of a sampled direction, for a base color of 0
+    x: Doubles  # its component in the plane of view, towards the viewer
+    z: Doubles  # its component along the normal
 
 
 def measured(
@@ -315,86 +371,114 @@ def measured(
     place: Floats,
     normal: Floats,
 ) -> Lobes:
-    """Measure the BSDF of a shape, by sampling it, at one of its texels: a (3,) place
-    and the unit normal there.
+    """Measure the BSDF of a shape at one of its texels, by sampling it.
+
+    The texel has a (3,) position `place` and a (3,) unit normal.
     """
-    key = f"{grid.name}.base_color"
+    cosine = (np.arange(ANGLES) + 0.5) / ANGLES
     with one_at_a_time:
-        middle = (np.arange(ANGLES) + 0.5) / ANGLES
-        cosine = dr.repeat(mi.Float(middle.astype(np.float32)), LOBE_SAMPLES)
-        towards = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
-        noise = mi.load_dict({"type": "independent"})
-        noise.seed(0, ANGLES * LOBE_SAMPLES)
-        sample1 = noise.next_1d()
-        sample2 = noise.next_2d()
-        even = mi.warp.square_to_cosine_hemisphere(sample2)
-        sampled = []
-        for level in (0.5, 0.0):
-            changed = (
-                {key: torch.full_like(scene.base(key), level)}
-                if key in scene.names
-                else {}
-            )
-            held = scene.held({**inputs, **changed})
-            start = mi.Point3f([float(x) for x in place + 1e-3 * normal])
-            ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
-            si = held.ray_intersect(
-                dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES))
-            )
-            bsdf = si.bsdf()
-            si.wi = towards
-            # of cut-outs, what stops light
-            opaque = dr.maximum(1.0 - passed(si, True), 1e-3)
-            value = bsdf.eval(mi.BSDFContext(), si, even) / opaque
-            if level:
-                sampled.append(dr.mean(value))
-                continue
-            bsdf_sample, bsdf_weight = bsdf.sample(
-                mi.BSDFContext(), si, sample1, sample2
-            )
-            back = dr.select(
-                (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0),
-                dr.mean(bsdf_weight) / opaque,
-                0.0,
-            )
-            back = dr.select(dr.isfinite(back), back, 0.0)
-            sampled += [dr.mean(value), back, bsdf_sample.wo.x, bsdf_sample.wo.z]
-    lit, dark = (
-        _rows(value.numpy()) / _rows(even.z.numpy() / math.pi) for value in sampled[:2]
-    )
-    weight, x, z = (_rows(value.numpy()) for value in sampled[2:])
-    share = weight.mean(axis=1)
-    mean = np.stack([(weight * x).mean(axis=1), (weight * z).mean(axis=1)])
-    length = np.linalg.norm(mean, axis=0)
-    mirrored = share < 1e-6
+        samples = _sample_bsdf(scene, inputs, grid, place, normal, cosine)
+    gloss = samples.weight.mean(axis=1)
+    mean_x = (samples.weight * samples.x).mean(axis=1)
+    mean_z = (samples.weight * samples.z).mean(axis=1)
+    length = np.linalg.norm(np.stack([mean_x, mean_z]), axis=0)
+
+    # Without gloss the mirrored direction stands for the lobe's mean direction.
+    no_gloss = gloss < 1e-6
     along = np.where(
-        mirrored, -np.sqrt(1.0 - middle**2), mean[0] / np.maximum(length, 1e-12)
+        no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
     )
-    up = np.where(mirrored, middle, mean[1] / np.maximum(length, 1e-12))
-    core, tail = _spreads(
-        weight, 2.0 * np.maximum(0.0, 1.0 - x * along[:, None] - z * up[:, None])
+    up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
+    # the square of the chord, which is that of the angle where it is small
+    squared_angle = 2.0 * np.maximum(
+        0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
-    diffuse = np.maximum(lit.mean(axis=1) - dark.mean(axis=1), 0.0) / 0.5
-    return Lobes(
-        *(part.astype(np.float32) for part in (diffuse, share, up, -along, core, tail))
+    core, tail = _measure_spreads(samples.weight, squared_angle)
+    diffuse = (
+        np.maximum(samples.grey.mean(axis=1) - samples.black.mean(axis=1), 0.0) / 0.5
+    )
+    tables = (diffuse, gloss, up, -along, core, tail)
+    return Lobes(*(table.astype(np.float32) for table in tables))
+
+
+def _sample_bsdf(
+    scene: MitsubaScene,
+    inputs: Mapping[str, Tensor],
+    grid: TexelGrid,
+    position: Floats,
+    normal: Floats,
+    cosines: Doubles,
+) -> _BsdfSamples:
+    """Sample the BSDF at a point for each cosine of the angle of view."""
+    n_samples = ANGLES * LOBE_SAMPLES
+    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), LOBE_SAMPLES)
+    to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+    noise = mi.load_dict({"type": "independent"})
+    noise.seed(0, n_samples)
+    sample1 = noise.next_1d()
+    sample2 = noise.next_2d()
+    cosine_direction = mi.warp.square_to_cosine_hemisphere(sample2)
+    context = mi.BSDFContext()
+
+    def hit_surface(base_color: float) -> Any:
+        """Return the hit as seen from each angle, with a base color set."""
+        key = f"{grid.name}.base_color"
+        changed = dict(inputs)
+        if key in scene.names:
+            changed[key] = torch.full_like(scene.base(key), base_color)
+        mitsuba_scene = scene.held(changed)
+        start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
+        ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
+        first_lane = dr.zeros(mi.UInt32, n_samples)
+        si = mitsuba_scene.ray_intersect(dr.gather(mi.Ray3f, ray, first_lane))
+        si.wi = to_viewer
+        return si
+
+    def eval_opacity(si: Any) -> Any:
+        """Return the fraction of light that a cut-out stops."""
+        return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
+
+    si = hit_surface(0.5)
+    opacity = eval_opacity(si)
+    grey = dr.mean(si.bsdf().eval(context, si, cosine_direction) / opacity)
+
+    si = hit_surface(0.0)
+    bsdf = si.bsdf()
+    opacity = eval_opacity(si)
+    black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
+    bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
+    is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
+    weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
+    weight = dr.select(dr.isfinite(weight), weight, 0.0)
+
+    density = _to_table(cosine_direction.z.numpy() / math.pi)
+    return _BsdfSamples(
+        grey=_to_table(grey.numpy()) / density,
+        black=_to_table(black.numpy()) / density,
+        weight=_to_table(weight.numpy()),
+        x=_to_table(bsdf_sample.wo.x.numpy()),
+        z=_to_table(bsdf_sample.wo.z.numpy()),
     )
 
 
-def _spreads(weight: Doubles, apart: Doubles) -> tuple[Doubles, Doubles]:
-    """Root mean squares (k,) of the nearer and of the farther half of weighted samples
-    (k, n), by squares of angles.
+def _measure_spreads(
+    weight: Doubles, squared_angle: Doubles
+) -> tuple[Doubles, Doubles]:
+    """Return root mean square angles (k,) of both halves of weighted samples (k, n).
+
+    The first is that of the half with smaller angles, the second that of the other.
     """
-    order = np.argsort(apart, axis=1)
-    weight, apart = (
-        np.take_along_axis(values, order, axis=1) for values in (weight, apart)
-    )
+    order = np.argsort(squared_angle, axis=1)
+    weight = np.take_along_axis(weight, order, axis=1)
+    squared_angle = np.take_along_axis(squared_angle, order, axis=1)
     total = weight.sum(axis=1, keepdims=True)
-    near = np.clip(0.5 * total - (weight.cumsum(axis=1) - weight), 0.0, weight)
+    weight_before = weight.cumsum(axis=1) - weight
+    near = np.clip(0.5 * total - weight_before, 0.0, weight)
     half = np.maximum(0.5 * total[:, 0], 1e-12)
-    return np.sqrt((near * apart).sum(axis=1) / half), np.sqrt(
-        ((weight - near) * apart).sum(axis=1) / half
-    )
+    core = np.sqrt((near * squared_angle).sum(axis=1) / half)
+    tail = np.sqrt(((weight - near) * squared_angle).sum(axis=1) / half)
+    return core, tail
 
 
-def _rows(values: npt.NDArray[Any]) -> Doubles:
+def _to_table(values: npt.NDArray[Any]) -> Doubles:
     return np.asarray(values, dtype=np.float64).reshape(ANGLES, LOBE_SAMPLES)

@@ -1,7 +1,7 @@
-"""A scene with its inputs set, as an XML file that stock Mitsuba loads, with meshes
-(PLY) and pictures (EXR) beside it.
+"""Write a scene as an XML file that stock Mitsuba loads, with meshes and images.
 
-Every number is written with all of its digits, meshes and pictures in float32.
+Every number is written with all of its digits, meshes (PLY) and images (EXR) in
+float32.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from advsearch.errors import InputError
 from advsearch.scene import parts
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.description import OBJECT
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import (
     base_texture,
     emitter,
@@ -42,12 +42,12 @@ from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
 
 NAME = "scene.xml"
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
-# segments that paths in haze have beyond those between surfaces: stock Mitsuba counts
-# both alike
+# further segments of paths in haze: stock Mitsuba counts those between scatterings as
+# well
 SCATTERINGS = 3
-# entries that a dictionary need not have for them to be set
+# entries that can be set although a dictionary does not have them
 ABSENT = ("to_world", *CAMERA_NUMBERS.values())
-# entries of a mesh from a file that are in what is written
+# entries of a mesh from a file that the written mesh includes
 BAKED = ("filename", "to_world", "flip_tex_coords")
 
 
@@ -59,9 +59,16 @@ def write_scene(
     *,
     hide: bool = False,
 ) -> None:
-    """Write a scene with its inputs set, and the visible environment hidden or not, as
-    of `MitsubaScene.pictures`, as XML that stock Mitsuba loads, into a folder that is
-    there, with meshes and pictures beside it, and a note as a comment.
+    """Write a scene with its inputs set as XML that stock Mitsuba loads.
+
+    Meshes and images are written next to it.
+
+    Args:
+        scene: the scene.
+        inputs: as for `MitsubaScene.pictures`.
+        path: of the XML file, in a folder that exists.
+        note: becomes a comment.
+        hide: hide the visible environment.
 
     Raises:
         InputError: something in it is no part of stock Mitsuba.
@@ -72,75 +79,83 @@ def write_scene(
             "camera: stock Mitsuba has no sensor with distortion; export "
             "the run as glTF (.glb) instead"
         )
-    # not `prbvolpath`, which starts outside of all media
-    kind = "volpath" if scene.volumetric else "path"
     integrator: Plugin = {
-        "type": kind,
+        # not `prbvolpath`, which starts outside of all media
+        "type": "volpath" if scene.volumetric else "path",
         "max_depth": scene.max_depth,
         "rr_depth": scene.roulette,
         "hide_emitters": hide,
     }
-    whole: Plugin = {
+    xml_scene: Plugin = {
         "integrator": integrator,
         **scene_dict(description, scene.resolution, filter, scene.sampler),
     }
-    left = {
+    # inputs that are not yet in what is written
+    remaining = {
         name: value.detach().cpu().numpy().astype(np.float32)
         for name, value in inputs.items()
     }
-    if "camera.fov" in left:  # along the larger side, as in the dictionary
-        whole["camera"]["fov"] = float(left.pop("camera.fov")[0])
-    if "environment.padded" in left:
-        left["environment.padded"] = left["environment.padded"][:, 1:-1]
+    if "camera.fov" in remaining:  # along the larger side, as in the dictionary
+        xml_scene["camera"]["fov"] = float(remaining.pop("camera.fov")[0])
+    if "environment.padded" in remaining:
+        padded = remaining["environment.padded"]
+        remaining["environment.padded"] = padded[:, 1:-1]
     if description.photograph is not None:
-        whole[GROUND] = {
+        xml_scene[GROUND] = {
             "type": "ply",
             "bsdf": matt(description.photograph.base.numpy()),
         }
     for part in (description.meshes[OBJECT], *description.parts):
-        if isinstance(part, parts.HazePart):
-            _put_haze(whole, part, left)
-        elif isinstance(part, parts.MeshPart):
-            whole[part.name] = _mesh(description.placed(part), left)
-        else:
-            whole |= translation(description.placed(part)).plugins
-        if not isinstance(whole.get(part.name, {}), Mapping):
-            raise InputError(
-                f"out: stock Mitsuba has nothing for {part.name}; export "
-                "a run without it"
-            )
-    unplaced = [
+        _put_part(xml_scene, description, part, remaining)
+    not_set = [
         name
-        for name in sorted(left)
-        if not _put(whole, scene.declared[name][0].split("."), left[name])
+        for name in sorted(remaining)
+        if not _put(xml_scene, scene.declared[name][0].split("."), remaining[name])
     ]
-    if unplaced:
+    if not_set:
         raise InputError(
-            f"out: stock Mitsuba has nothing for {', '.join(unplaced)}; "
+            f"out: stock Mitsuba has nothing for {', '.join(not_set)}; "
             "export another run"
         )
     meshes = {
-        shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()
+        shape.id(): shape
+        for shape in scene.held(inputs).shapes()
+        if shape.is_mesh() and shape.id() in xml_scene
     }
-    write_xml(
-        path,
-        whole,
-        {name: mesh for name, mesh in meshes.items() if name in whole},
-        note,
-    )
+    write_xml(path, xml_scene, meshes, note)
 
 
-def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
-    """Fill a ball and the camera in it with haze, unless its density is 0; takes its
-    inputs from what is left.
+def _put_part(
+    xml_scene: Plugin,
+    description: SceneDescription,
+    part: parts.ScenePart,
+    remaining: Plugin,
+) -> None:
+    """Put a part into a scene's dictionary, and take its inputs from the remaining."""
+    if isinstance(part, parts.HazePart):
+        _put_haze(xml_scene, part, remaining)
+    elif isinstance(part, parts.MeshPart):
+        xml_scene[part.name] = _mesh(description.placed(part), remaining)
+    else:
+        xml_scene |= translation(description.placed(part)).plugins
+    if not isinstance(xml_scene.get(part.name, {}), Mapping):
+        raise InputError(
+            f"out: stock Mitsuba has nothing for {part.name}; export a run without it"
+        )
+
+
+def _put_haze(scene: Plugin, haze: parts.HazePart, remaining: Plugin) -> None:
+    """Fill a ball and the camera in it with haze, unless its density is 0.
+
+    The haze's inputs are taken from the remaining ones.
     """
-    density = left.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
-    albedo = left.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
+    density = remaining.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
+    albedo = remaining.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
         return
-    medium = f"{haze.name}-medium"
-    inside = {"type": "ref", "id": medium}
-    scene[medium] = {
+    medium_name = f"{haze.name}-medium"
+    medium_reference = {"type": "ref", "id": medium_name}
+    scene[medium_name] = {
         "type": "homogeneous",
         "sigma_t": density[0],
         "albedo": {"type": "rgb", "value": albedo},
@@ -149,58 +164,55 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
         "type": "sphere",
         "radius": haze.radius,
         "bsdf": {"type": "null"},
-        "interior": inside,
+        "interior": medium_reference,
     }
-    scene["camera"]["medium"] = inside
+    scene["camera"]["medium"] = medium_reference
     scene["integrator"]["max_depth"] += SCATTERINGS
 
 
 def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
-    """Set a number, colour, transform or picture by Mitsuba's name, where a dictionary
-    has it; whether it does.
+    """Set a number, color, transform or image of a dictionary by Mitsuba's key.
+
+    Returns:
+        Whether the dictionary has such an entry.
     """
-    here, *rest = key
-    if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
-        here = next(
-            (name for name, inner in plugin.items() if isinstance(inner, Mapping)), here
-        )
-    here = "bitmap" if here == "data" else here
-    inner = plugin.get(here)
-    if isinstance(inner, Mapping):
-        plugin[here] = dict(inner)
-        return bool(rest) and _put(plugin[here], rest, value)
-    if rest or (inner is None and here not in ABSENT):
+    name, *rest = key
+    if name.startswith("brdf_") and name not in plugin:
+        # the surface of both sides is the only inner plugin
+        inner_names = [
+            inner for inner, entry in plugin.items() if isinstance(entry, Mapping)
+        ]
+        name = inner_names[0] if inner_names else name
+    name = "bitmap" if name == "data" else name
+    entry = plugin.get(name)
+    if isinstance(entry, Mapping):
+        plugin[name] = dict(entry)
+        return bool(rest) and _put(plugin[name], rest, value)
+    if rest or (entry is None and name not in ABSENT):
         return False
-    if here == "bitmap":
-        plugin[here] = mi.Bitmap(np.ascontiguousarray(value))
+    if name == "bitmap":
+        plugin[name] = mi.Bitmap(np.ascontiguousarray(value))
     elif value.shape == (4, 4):
-        plugin[here] = mi.ScalarTransform4f(value)
+        plugin[name] = mi.ScalarTransform4f(value)
     else:
-        plugin[here] = value.tolist() if value.size > 1 else float(value[0])
+        plugin[name] = value.tolist() if value.size > 1 else float(value[0])
     return True
 
 
-def _mesh(part: parts.MeshPart, left: Plugin) -> Plugin:
+def _mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
+    """Return a mesh's plugin, and take its inputs from the remaining ones."""
     inputs = {
-        name.partition(".")[2]: left.pop(name)
-        for name in list(left)
+        name.partition(".")[2]: remaining.pop(name)
+        for name in list(remaining)
         if name.startswith(f"{part.name}.")
     }
     if "base_color" in inputs:
-        part = replace(
-            part,
-            base_color=linear_to_srgb(
-                torch.from_numpy(inputs.pop("base_color"))
-            ).numpy(),
-        )
+        linear = torch.from_numpy(inputs.pop("base_color"))
+        part = replace(part, base_color=linear_to_srgb(linear).numpy())
     if "radiance" in inputs:
         radiance = inputs.pop("radiance")
-        part = replace(
-            part,
-            emission=radiance.reshape(
-                -1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)
-            ),
-        )
+        size = radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)
+        part = replace(part, emission=radiance.reshape(-1, *size))
     if part.surface is None:
         numbers = {
             name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs
@@ -212,72 +224,41 @@ def _mesh(part: parts.MeshPart, left: Plugin) -> Plugin:
             part.surface, lambda options: base_texture(base_color, options)
         )
     # the mesh that is written has them
-    inputs.pop("vertices", None), inputs.pop("normals", None)
-    left |= {f"{part.name}.{name}": value for name, value in inputs.items()}
+    inputs.pop("vertices", None)
+    inputs.pop("normals", None)
+    remaining |= {f"{part.name}.{name}": value for name, value in inputs.items()}
+    mesh: Plugin = {"type": "ply", "bsdf": surface}
     light = emitter(part)
-    return {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
+    if light:
+        mesh["emitter"] = light
+    return mesh
 
 
 def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:
-    """Write a scene's dictionary, of `described`, by Mitsuba's own writer into a folder
-    that is there, and beside it what it needs, in files whose names begin with its own:
-    Mitsuba's meshes, by the names of the entries of the type "ply", and pictures. The
-    note is a comment at the beginning.
+    """Write a scene's dictionary by Mitsuba's own writer, with all files that it needs.
+
+    The files' names begin with that of the XML file.
+
+    Args:
+        path: of the XML file, in a folder that exists.
+        scene: the dictionary.
+        meshes: Mitsuba's meshes, by the names of the entries of the type "ply".
+        note: a comment at the beginning.
     """
-
-    taken = set[Path]()
-
-    def beside(name: str, suffix: str) -> Path:
-        free = path.with_name(f"{path.stem}-{name}{suffix}")
-        while free in taken:
-            free = free.with_stem(f"{free.stem}-2")
-        taken.add(free)
-        return free
-
-    def filed(name: str, plugin: Mapping[str, Any]) -> Plugin:
-        """The plugin with its pictures, and the files that it names, beside the
-        scene.
-        """
-        copied: Plugin = {}
-        for key, entry in plugin.items():
-            if isinstance(entry, mi.Bitmap):
-                key = "filename"
-                file = beside(name, ".exr")
-                values = np.array(entry, dtype=np.float32)
-                grey = values.ndim < 3 or values.shape[2] == 1
-                channels = (
-                    {"Y": values.reshape(values.shape[:2])}
-                    if grey
-                    else {"RGBA"[: values.shape[2]]: values}
-                )
-                # Mitsuba's waits forever where Dr.Jit has one thread
-                with OpenEXR.File({}, channels) as picture:
-                    picture.write(str(file))
-                entry = file.name
-            elif isinstance(entry, Mapping):
-                entry = filed(f"{name}-{key}", entry)
-            elif key == "filename" and os.path.isabs(entry):
-                file = beside(name, Path(entry).suffix)
-                shutil.copyfile(entry, file)
-                entry = file.name
-            copied[key] = entry
-        return copied
-
-    whole: Plugin = {"type": "scene"}
+    files = _SceneFiles(path)
+    xml_scene: Plugin = {"type": "scene"}
     for name, plugin in scene.items():
         if name == "type":
             continue
         if plugin["type"] == "ply" and name in meshes:
-            file = beside(name, ".ply")
+            file = files.reserve(name, ".ply")
             meshes[name].write_ply(str(file))
-            plugin = {
-                **{key: entry for key, entry in plugin.items() if key not in BAKED},
-                "filename": file.name,
-            }
-        whole[name] = filed(name, plugin)
+            plugin = {key: entry for key, entry in plugin.items() if key not in BAKED}
+            plugin["filename"] = file.name
+        xml_scene[name] = files.write_files_of(name, plugin)
     try:
         text = mi.parser.write_string(
-            mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), whole)
+            mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), xml_scene)
         )
     except (RuntimeError, TypeError) as error:
         raise InputError(
@@ -289,3 +270,51 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
     path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
+
+
+class _SceneFiles:
+    """Write the files of a scene next to its XML file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._used = set[Path]()
+
+    def reserve(self, name: str, suffix: str) -> Path:
+        """Return a path that no other file of the scene has."""
+        path = self._path.with_name(f"{self._path.stem}-{name}{suffix}")
+        while path in self._used:
+            path = path.with_stem(f"{path.stem}-2")
+        self._used.add(path)
+        return path
+
+    def write_files_of(self, name: str, plugin: Mapping[str, Any]) -> Plugin:
+        """Write a plugin's images, copy the files that it names, and return it.
+
+        The returned plugin has the names of the new files.
+        """
+        entries: Plugin = {}
+        for key, entry in plugin.items():
+            if isinstance(entry, mi.Bitmap):
+                entries["filename"] = self._write_image(name, entry)
+            elif isinstance(entry, Mapping):
+                entries[key] = self.write_files_of(f"{name}-{key}", entry)
+            elif key == "filename" and os.path.isabs(entry):
+                file = self.reserve(name, Path(entry).suffix)
+                shutil.copyfile(entry, file)
+                entries[key] = file.name
+            else:
+                entries[key] = entry
+        return entries
+
+    def _write_image(self, name: str, bitmap: Any) -> str:
+        """Write a bitmap as EXR and return the file's name."""
+        file = self.reserve(name, ".exr")
+        values = np.array(bitmap, dtype=np.float32)
+        if values.ndim < 3 or values.shape[2] == 1:
+            channels = {"Y": values.reshape(values.shape[:2])}
+        else:
+            channels = {"RGBA"[: values.shape[2]]: values}
+        # Mitsuba's writer waits forever where Dr.Jit has one thread
+        with OpenEXR.File({}, channels) as image:
+            image.write(str(file))
+        return file.name

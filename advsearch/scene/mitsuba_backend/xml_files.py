@@ -1,12 +1,11 @@
-"""Mitsuba's XML scene files as the dictionaries that its loader takes, by Mitsuba's own
-parser.
+"""Read Mitsuba's XML scene files as the dictionaries that its loader takes.
 
-A file may come from anywhere. It names plugins, which are libraries, and files, and may
-include others. So Mitsuba gets one text without document types, `$names` and includes,
-of a bounded size and depth, and makes nothing of it; then only plugins that Mitsuba
-brings are taken, and only ordinary files of the scene's own folder: Mitsuba finds a
-plugin as a library, the current folder included, and reads most files without the
-checks that a file from anywhere needs.
+Mitsuba's own parser does the work. But a file may come from anywhere: it names plugins,
+which are libraries, and files, and may include others. So the parser gets one text
+without document types, `$names` and includes, of a bounded size and depth, and loads
+nothing. Then only plugins that come with Mitsuba are accepted, and only ordinary files
+of the scene's own folder: Mitsuba finds a plugin as a library, the current folder
+included, and reads most files without the checks that an untrusted file needs.
 """
 
 from __future__ import annotations
@@ -44,19 +43,20 @@ MOST_ELEMENTS = 50_000
 DEEPEST = 40
 MOST_INCLUDED = 50
 LONGEST = 10_000  # letters of a text with the values of its `$names`
-# elements that are not called as the type is
+# elements that are not named like their type
 TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
-_PLACE = re.compile(
+_ERROR_LINE = re.compile(
     r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL
 )
 
 
 def read_scene(path: Path) -> Plugin:
-    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts,
-    transforms (4, 4).
+    """Return the dictionary of a scene file.
+
+    It has plugins with their `type`, numbers, strings and transforms (4, 4).
 
     Raises:
-        FileFormatError: it is missing, damaged, too large, or no Mitsuba scene.
+        FileFormatError: it is missing, corrupt, too large, or no Mitsuba scene.
     """
     text = _Text(path, References(path))
     root = text.parsed(read_bytes(path, "scene", (SUFFIX,)))
@@ -76,38 +76,40 @@ def read_scene(path: Path) -> Plugin:
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
-        place = _PLACE.match(str(error))
+        position = _ERROR_LINE.match(str(error))
+        where = ""
         # lines are the file's as long as nothing is included
-        where = (
-            f"line {int(place[1]) + text.above}: "
-            if place and not text.included
-            else ""
-        )
+        if position and not text.included:
+            where = f"line {int(position[1]) + text.above}: "
         raise FileFormatError(
-            f"{path}: {where}{_PLACE.sub('', str(error))}; correct it"
+            f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
     referred: set[str] = set()
     scene = _plugin(path, state, 0, referred)
     # plugins with ids that stand within others, to which the rest of the file may refer
     for name in sorted(referred):
-        if _plain(name) not in scene and name in state.id_to_index:
-            scene[_plain(name)] = _plugin(path, state, state.id_to_index[name], set())
+        if _plain_name(name) not in scene and name in state.id_to_index:
+            index = state.id_to_index[name]
+            scene[_plain_name(name)] = _plugin(path, state, index, set())
     return scene
 
 
 @dataclass
 class _Text:
+    """The text of a scene file and of the files that it includes."""
+
     path: Path
     references: References
-    values: dict[str, str] = field(default_factory=dict)
-    size: int = 0
+    values: dict[str, str] = field(default_factory=dict)  # of `$names`
+    size: int = 0  # bytes so far
     elements: int = 0
-    included: int = 0
+    included: int = 0  # files
     above: int = 0  # lines before the scene's first one
 
     def parsed(self, data: bytes) -> ElementTree.Element:
-        """Return the tree of a file, comments and blanks included, so that lines stay
-        the same.
+        """Return the tree of a file.
+
+        Comments and blanks are included, so that lines stay the same.
         """
         self.size += len(data)
         if self.size > scaled(LARGEST):
@@ -118,6 +120,35 @@ class _Text:
             )
         parser = expat.ParserCreate()
         tree = ElementTree.TreeBuilder(insert_comments=True)
+        self._set_handlers(parser, tree)
+        try:
+            parser.Parse(data, True)
+        except expat.ExpatError as error:
+            got = looks_like(data)
+            if data.lstrip().startswith(b"<"):
+                message = expat.errors.messages[error.code]
+                got = f"{message} in line {error.lineno}"
+            raise damaged(self.path, "an XML file", got) from error
+        # an encoding that Python does not have
+        except (LookupError, ValueError) as error:
+            raise damaged(
+                self.path,
+                "an XML file",
+                f"one in an unknown encoding ({shown(str(error))})",
+            ) from error
+        root = tree.close()
+        version = root.get("version", "3.0.0")
+        if root.tag == "scene" and not re.match(r"[23]\.", version):
+            raise FileFormatError(
+                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
+                f"{shown(version)}; convert it"
+            )
+        return root
+
+    def _set_handlers(
+        self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
+    ) -> None:
+        """Have a parser build a tree and refuse what no scene needs."""
         depth = 0
 
         def refuse(*_: object) -> None:
@@ -130,12 +161,12 @@ class _Text:
             nonlocal depth
             if not self.elements:
                 self.above = parser.CurrentLineNumber - 1
-            depth = depth + 1
-            self.elements = self.elements + 1
+            depth += 1
+            self.elements += 1
             if self.elements > scaled(MOST_ELEMENTS) or depth > DEEPEST:
-                most = f"at most {scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
+                limit = f"at most {scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
                 raise FileFormatError(
-                    f"{self.path}: expected {most}, got more; split the scene up"
+                    f"{self.path}: expected {limit}, got more; split the scene up"
                 )
             if tag in ("alias", "path"):
                 where = f"{self.path}: line {parser.CurrentLineNumber}"
@@ -154,134 +185,137 @@ class _Text:
         parser.EndElementHandler = end
         parser.CharacterDataHandler = lambda text: tree.data(text) if depth else None
         parser.CommentHandler = lambda text: tree.comment(text) if depth else None
-        try:
-            parser.Parse(data, True)
-        except expat.ExpatError as error:
-            found = f"{expat.errors.messages[error.code]} in line {error.lineno}"
-            got = found if data.lstrip().startswith(b"<") else looks_like(data)
-            raise damaged(self.path, "an XML file", got) from error
-        except (
-            LookupError,
-            ValueError,
-        ) as error:  # an encoding that Python does not have
-            raise damaged(
-                self.path,
-                "an XML file",
-                f"one in an unknown encoding ({shown(str(error))})",
-            ) from error
-        root = tree.close()
-        version = root.get("version", "3.0.0")
-        if root.tag == "scene" and not re.match(r"[23]\.", version):
-            raise FileFormatError(
-                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
-                f"{shown(version)}; convert it"
-            )
-        return root
 
     def fill(self, element: ElementTree.Element) -> None:
-        """Put the values of `$names`, and what other files hold, into an element."""
-        inner: list[ElementTree.Element] = []
+        """Replace `$names` by their values and includes by the files' elements."""
+        children: list[ElementTree.Element] = []
         for child in element:
             for key, text in child.items():
                 child.set(key, self.filled(text))
             if child.tag == "default":
                 self.values.setdefault(child.get("name", ""), child.get("value", ""))
-            if child.tag != "include":
+            if child.tag == "include":
+                children += self._include(child.get("filename", ""))
+            else:
                 self.fill(child)
-                inner.append(child)
-                continue
-            self.included, name = self.included + 1, child.get("filename", "")
-            if self.included > MOST_INCLUDED:
-                raise FileFormatError(
-                    f"{self.path}: includes more than {MOST_INCLUDED} files; does one "
-                    "include itself?"
-                )
-            try:
-                included = self.parsed(self.references.get(name))
-            except FileNotFoundError:
-                reason = next(reversed(self.references.refused.values()))
-                raise FileFormatError(
-                    f"{self.path}: includes {shown(name)}, which {reason}"
-                ) from None
-            if included.tag != "scene":
-                alone = included
-                included = ElementTree.Element("scene")
-                included.append(alone)
-            self.fill(included)
-            inner += list(included)
-        element[:] = inner
+                children.append(child)
+        element[:] = children
+
+    def _include(self, name: str) -> list[ElementTree.Element]:
+        """Return the elements of another file."""
+        self.included += 1
+        if self.included > MOST_INCLUDED:
+            raise FileFormatError(
+                f"{self.path}: includes more than {MOST_INCLUDED} files; does one "
+                "include itself?"
+            )
+        try:
+            root = self.parsed(self.references.get(name))
+        except FileNotFoundError:
+            reason = next(reversed(self.references.refused.values()))
+            raise FileFormatError(
+                f"{self.path}: includes {shown(name)}, which {reason}"
+            ) from None
+        if root.tag != "scene":
+            single = root
+            root = ElementTree.Element("scene")
+            root.append(single)
+        self.fill(root)
+        return list(root)
 
     def filled(self, text: str) -> str:
-        whole = ""
-        for at, part in enumerate(re.split(r"\$(\w+)", text)):
-            if at % 2 and part not in self.values:
-                named = shown(part, quoted=False)
+        """Replace the `$names` in a text by their values."""
+        result = ""
+        # of the pieces, every second one is a name
+        for index, piece in enumerate(re.split(r"\$(\w+)", text)):
+            is_name = index % 2 == 1
+            if is_name and piece not in self.values:
+                name = shown(piece, quoted=False)
                 raise FileFormatError(
-                    f"{self.path}: ${named} has no value: no <default> has that name"
+                    f"{self.path}: ${name} has no value: no <default> has that name"
                 )
-            whole += self.values[part] if at % 2 else part
+            result += self.values[piece] if is_name else piece
             # a <default> may name others twice, and so on
-            if at and len(whole) > LONGEST:
-                most = f"expected at most {LONGEST:,} letters, got more"
+            if index and len(result) > LONGEST:
+                limit = f"expected at most {LONGEST:,} letters, got more"
                 raise FileFormatError(
-                    f"{self.path}: {shown(text)}: {most}; write the value out"
+                    f"{self.path}: {shown(text)}: {limit}; write the value out"
                 )
-        return whole
+        return result
 
 
 def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
-    """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it; ids that
-    it names go into `referred`.
+    """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
+
+    Args:
+        path: of the file, for errors.
+        state: what Mitsuba's parser returns.
+        number: index of the plugin in it; 0 is the scene.
+        referred: is extended by the ids that the plugin refers to.
     """
     kinds = mi.Properties.Type
     props = state.nodes[number].props
     entries: Plugin = {"type": props.plugin_name()}
-    last: dict[str, int] = {}
+    last_suffix: dict[str, int] = {}
 
-    def put(wanted: str, made: object) -> None:
-        name = wanted
-        count = last.get(wanted, 1)
+    def put(wanted_name: str, entry: object) -> None:
+        """Add an entry, with a number behind its name if there is one already."""
+        name = wanted_name
+        suffix = last_suffix.get(wanted_name, 1)
         while name in entries:
-            count += 1
-            name = f"{wanted}-{count}"
-        last[wanted], entries[name] = count, made
+            suffix += 1
+            name = f"{wanted_name}-{suffix}"
+        last_suffix[wanted_name] = suffix
+        entries[name] = entry
 
     for key in props.keys():
         kind = props.type(key)
         value = props[key]
-        named = "" if key.startswith("_arg_") else key
+        argument = "" if key.startswith("_arg_") else key
         if kind == kinds.ResolvedReference:
             node = state.nodes[value.index()]
-            name = node.props.id() or named if number == 0 else named or node.props.id()
-            tag = TAGS.get(node.type.name, node.type.name.lower())
-            name = name or (node.props.plugin_name() if number == 0 else tag)
-            put(_plain(name), _plugin(path, state, value.index(), referred))
+            name = _name_of_node(node, argument, at_top=number == 0)
+            put(_plain_name(name), _plugin(path, state, value.index(), referred))
         elif kind == kinds.Reference:
             referred.add(str(value.id()))
-            put(named or "ref", {"type": "ref", "id": _plain(str(value.id()))})
+            reference = {"type": "ref", "id": _plain_name(str(value.id()))}
+            put(argument or "ref", reference)
         else:
             put(key, _value(f"{path}: {shown(key, quoted=False)}", kind, value))
     return entries
 
 
+def _name_of_node(node: Any, argument: str, *, at_top: bool) -> str:
+    """Return the name of an inner plugin: its id, its argument's name, or its kind.
+
+    At the top of a scene the id comes first, elsewhere the argument.
+    """
+    node_id = str(node.props.id())
+    if at_top:
+        return node_id or argument or str(node.props.plugin_name())
+    tag = TAGS.get(node.type.name, node.type.name.lower())
+    return argument or node_id or tag
+
+
 def _value(where: str, kind: Any, value: Any) -> object:
-    """Return a number, a text, a colour, a transform, of finite numbers of float32's
-    range.
+    """Return a number, a string, a color or a transform.
+
+    Numbers are finite and in float32's range; `where` is for errors.
     """
     kinds = mi.Properties.Type
-    made: object = value
+    entry: object = value
     numbers: Any = value if kind in (kinds.Float, kinds.Integer) else ()
     if kind == kinds.Color:
         numbers = list(value)
-        made = {"type": "rgb", "value": numbers}
+        entry = {"type": "rgb", "value": numbers}
     elif kind == kinds.Vector:
-        made = numbers = list(value)
+        entry = numbers = list(value)
     elif kind == kinds.Transform:
-        made = numbers = np.array(value.matrix, np.float64)
+        entry = numbers = np.array(value.matrix, np.float64)
     elif kind == kinds.Spectrum:
         pairs = list(zip(value.wavelengths, value.values, strict=False))
         numbers = pairs or value.values
-        made = {"type": "spectrum", "value": pairs or value.values[0]}
+        entry = {"type": "spectrum", "value": pairs or value.values[0]}
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
@@ -297,11 +331,11 @@ def _value(where: str, kind: Any, value: Any) -> object:
             f"{where}: expected an affine transform, whose last row "
             "is 0 0 0 1; correct it"
         )
-    return made
+    return entry
 
 
-def _plain(name: str) -> str:
-    """A name as Mitsuba's loader takes it: without dots."""
+def _plain_name(name: str) -> str:
+    """Return a name as Mitsuba's loader takes it: without dots."""
     return name.replace(".", "_")
 
 
@@ -325,11 +359,13 @@ INTEGRATORS = frozenset(
 MEDIA = frozenset(("homogeneous", "heterogeneous"))
 OTHERS = frozenset(
     """
-    bitmap blackbody blendbsdf blendphase box bumpmap catmullrom checkerboard circular conductor constvolume d65
-    dielectric diffuse gaussian gridvolume hair hdrfilm hg independent irregular isotropic lanczos ldsampler mask
-    mesh_attribute mitchell multijitter normalmap null orthogonal plastic polarizer pplastic principled principledthin
-    rawconstant rayleigh ref regular retarder rgb roughconductor roughdielectric roughplastic scene sggx specfilm
-    spectrum srgb stratified tabphase tent thindielectric twosided uniform volume
+    bitmap blackbody blendbsdf blendphase box bumpmap catmullrom checkerboard circular
+    conductor constvolume d65 dielectric diffuse gaussian gridvolume hair hdrfilm hg
+    independent irregular isotropic lanczos ldsampler mask mesh_attribute mitchell
+    multijitter normalmap null orthogonal plastic polarizer pplastic principled
+    principledthin rawconstant rayleigh ref regular retarder rgb roughconductor
+    roughdielectric roughplastic scene sggx specfilm spectrum srgb stratified tabphase
+    tent thindielectric twosided uniform volume
     """.split()
 )
 STOCK = (SHAPES | LIGHTS | SENSORS | INTEGRATORS | MEDIA | OTHERS) - {"merge"}
@@ -337,115 +373,125 @@ STOCK = (SHAPES | LIGHTS | SENSORS | INTEGRATORS | MEDIA | OTHERS) - {"merge"}
 
 
 def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:
-    """Return a file's dictionary with pictures read, about which warnings are put into
-    `notes`, and with the full names of meshes that were read once.
+    """Return a file's dictionary with images read and full names of checked meshes.
+
+    Args:
+        path: of the file.
+        scene: its dictionary.
+        notes: is extended by warnings about images.
 
     Raises:
         FileFormatError: a plugin that Mitsuba does not bring, or a file that is
-            missing, outside the folder of `path`, damaged, or of a kind that only
+            missing, outside the folder of `path`, corrupt, or of a kind that only
             Mitsuba reads.
     """
-    references = References(path)
+    return _FileReader(path, notes).check(scene)
 
-    def file_of(kind: str, name: object) -> Path:
-        try:
-            references.get(str(name))
-        except FileNotFoundError:
-            reason = references.refused.get(
-                next(reversed(references.refused)), "is missing"
-            )
+
+class _FileReader:
+    """Check the plugins of a scene file, and read the files that they name."""
+
+    def __init__(self, path: Path, notes: list[str]) -> None:
+        self._path = path
+        self._notes = notes
+        self._references = References(path)
+        self._readers: dict[str, Callable[[Plugin], Plugin]] = {
+            "obj": self._check_mesh,
+            "ply": self._check_mesh,
+            "bitmap": self._read_bitmap,
+            "envmap": self._read_envmap,
+        }
+
+    def check(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin with all in it checked and read."""
+        kind = str(plugin["type"])
+        if kind not in STOCK:
             raise FileFormatError(
-                f"{path}: {kind} needs {shown(str(name))}, which {reason}"
+                f"{self._path}: {shown(kind)} is no plugin that comes with Mitsuba; "
+                "leave it out of the file"
+            )
+        if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
+            raise FileFormatError(
+                f"{self._path}: {shown(str(plugin['material']))} is no name of a "
+                "material"
+            )
+        entries = with_inner(plugin, self.check)
+        # without one Mitsuba's bitmap ends the process
+        if kind in self._readers and "filename" not in entries:
+            raise FileFormatError(
+                f"{self._path}: expected a filename in each {kind}, got none; name the "
+                "file"
+            )
+        if "filename" not in entries:
+            return entries
+        if kind not in self._readers:
+            filename = shown(str(entries["filename"]))
+            raise FileFormatError(
+                f"{self._path}: {kind} names the file {filename}, which only Mitsuba "
+                "reads, without checks; convert it to "
+                "a .ply mesh or a picture, or give the scene as a dictionary from "
+                "Python"
+            )
+        return self._readers[kind](entries)
+
+    def _find_file(self, kind: str, name: object) -> Path:
+        """Return the path of a file that is in the folder of the scene."""
+        try:
+            self._references.get(str(name))
+        except FileNotFoundError:
+            refused = self._references.refused
+            reason = refused.get(next(reversed(refused)), "is missing")
+            raise FileFormatError(
+                f"{self._path}: {kind} needs {shown(str(name))}, which {reason}"
             ) from None
+        directory = self._path.parent
         for candidate in (str(name), os.path.basename(str(name))):
-            file = Path(os.path.realpath(os.path.join(path.parent, candidate)))
-            if file.is_file() and is_inside(file, path.parent):
+            file = Path(os.path.realpath(os.path.join(directory, candidate)))
+            if file.is_file() and is_inside(file, directory):
                 note_opened(file)
                 return file
         raise FileFormatError(
-            f"{path}: {kind} needs {shown(str(name))}; write its "
+            f"{self._path}: {kind} needs {shown(str(name))}; write its "
             "name as it is in the folder"
         )
 
-    def mesh(plugin: Plugin) -> Plugin:
-        file = file_of("a shape", plugin["filename"])
+    def _check_mesh(self, plugin: Plugin) -> Plugin:
+        """Read a mesh once, so that a corrupt one is found, and set its full name."""
+        file = self._find_file("a shape", plugin["filename"])
         if file.suffix.lower() != f".{plugin['type']}":
             raise FileFormatError(
-                f"{path}: expected a .{plugin['type']} file, got "
+                f"{self._path}: expected a .{plugin['type']} file, got "
                 f"{shown(file.name)}; rename it"
             )
         read_parts(file, file.read_bytes())
         return {**plugin, "filename": str(file)}
 
-    def bitmap(plugin: Plugin) -> Plugin:
-        file = file_of("a texture", plugin.pop("filename"))
+    def _read_bitmap(self, plugin: Plugin) -> Plugin:
+        """Read a texture as linear values."""
+        file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
-            raw = bool(plugin.get("raw"))
-            picture = read_picture(file, raw=raw)
-            return {
-                **plugin,
-                "bitmap": picture if raw else srgb_to_linear(picture),
-                "raw": True,
-            }
+            is_raw = bool(plugin.get("raw"))
+            image = read_picture(file, raw=is_raw)
+            if not is_raw:
+                image = srgb_to_linear(image)
+            return {**plugin, "bitmap": image, "raw": True}
         light = read_light(file, "texture")
-        notes.extend(f"{file.name}: {note}" for note in light.notes)
+        self._notes.extend(f"{file.name}: {note}" for note in light.notes)
+        height, width = light.size
         scale = min(1.0, TEXTURE_LIMIT / max(light.size))
-        small = (
-            max(1, round(light.size[0] * scale)),
-            max(1, round(light.size[1] * scale)),
-        )
-        linear = (
-            light.band(0, light.size[0])
-            if scale == 1.0
-            else banded_average(light.band, light.size, small)
-        )
+        if scale == 1.0:
+            linear = light.band(0, height)
+        else:
+            smaller = (max(1, round(height * scale)), max(1, round(width * scale)))
+            linear = banded_average(light.band, light.size, smaller)
         return {**plugin, "bitmap": linear, "raw": True}
 
-    def envmap(plugin: Plugin) -> Plugin:
-        file = file_of("a light", plugin.pop("filename"))
+    def _read_envmap(self, plugin: Plugin) -> Plugin:
+        """Read an environment as linear values."""
+        file = self._find_file("a light", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
-            return {
-                **plugin,
-                "bitmap": np.asarray(srgb_to_linear(read_picture(file)), np.float32),
-            }
+            image = np.asarray(srgb_to_linear(read_picture(file)), np.float32)
+            return {**plugin, "bitmap": image}
         environment = import_environment(file)
-        notes.extend(environment.warnings)
+        self._notes.extend(environment.warnings)
         return {**plugin, "bitmap": environment.radiance}
-
-    readers: dict[str, Callable[[Plugin], Plugin]] = {
-        "obj": mesh,
-        "ply": mesh,
-        "bitmap": bitmap,
-        "envmap": envmap,
-    }
-
-    def checked(plugin: Mapping[str, object]) -> Plugin:
-        kind = str(plugin["type"])
-        if kind not in STOCK:
-            raise FileFormatError(
-                f"{path}: {shown(kind)} is no plugin that comes with Mitsuba; leave it "
-                "out of the file"
-            )
-        if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
-            raise FileFormatError(
-                f"{path}: {shown(str(plugin['material']))} is no name of a material"
-            )
-        entries = with_inner(plugin, checked)
-        # without one Mitsuba's bitmap ends the process
-        if kind in readers and "filename" not in entries:
-            raise FileFormatError(
-                f"{path}: expected a filename in each {kind}, got none; name the file"
-            )
-        if "filename" in entries:
-            if kind not in readers:
-                named = shown(str(entries["filename"]))
-                raise FileFormatError(
-                    f"{path}: {kind} names the file {named}, which only Mitsuba reads, "
-                    "without checks; convert it to "
-                    "a .ply mesh or a picture, or give the scene as a dictionary from "
-                    "Python"
-                )
-            entries = readers[kind](entries)
-        return entries
-
-    return checked(scene)

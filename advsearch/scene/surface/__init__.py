@@ -1,3 +1,1 @@
-"""Light kept on surfaces: pictures of a scene in which nothing moves but the camera,
-for rays and look-ups alone.
-"""
+"""Predict images by light that is stored on surfaces, where only cameras move."""

@@ -1,14 +1,15 @@
-"""Object and surroundings as they stand, with the light that arrives on them.
+"""Object and surroundings in fixed positions, with the light that arrives on them.
 
 Where object, surroundings and lights stand still, the irradiance E of a point is the
 same for every camera, so that
 
-    radiance(pixel) = mean over its rays of [ share(angle) base colour E / pi +
-                      gloss(angle) x light in its lobe ] or of the environment where a
-                      ray escapes
+    radiance(pixel) = mean over its rays of
+                          diffuse(angle) base color E / pi
+                          + gloss(angle) x light in its lobe,
+                      or of the environment where a ray escapes
 
-with the shares and the lobe of the surface measured by sampling its BSDF. Nothing in it
-is random.
+with `diffuse`, `gloss` and the lobe of the surface measured by sampling its BSDF.
+Images have no noise.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.assets import Bools
+from advsearch.scene.assets import Bools, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
 from advsearch.scene.grounds import irradiance as unshadowed
@@ -33,22 +34,33 @@ from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_
 from advsearch.scene.mitsuba_backend.texel_rays import (
     Ints,
     Lobes,
-    gather,
+    compute_visible_cosines,
+    is_visible_from_behind,
     measured,
-    seen_from_behind,
-    to_map,
-    towards,
+    trace_texel_rays,
+    world_to_map,
 )
 from advsearch.scene.predictor import LinearMap
-from advsearch.scene.raster import rasterised
+from advsearch.scene.raster import Charts, rasterised
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import texels
 from advsearch.scene.transport.matrix import bilinear
 
 
 class SurfaceView:
-    """What one of several cameras sees: `rest`, and a sparse matrix from the fine grid,
-    front and (where it has light of its own, 2 sides) back, to the pixels.
+    """What one of several cameras sees.
+
+    Attributes:
+        rest: (H, W, 3) radiance that does not come from the matrix.
+        covered: (H, W, 1) fraction of each pixel that surfaces cover.
+        matrix: sparse, from the fine grid to the pixels; from its front and then, if
+            there are 2 sides with light of their own, from its back.
+
+    Args:
+        seen: of all cameras.
+        number: index of the camera.
+        shape: rows and columns of the fine grid.
+        sides: of the object that have light of their own.
     """
 
     def __init__(
@@ -57,20 +69,24 @@ class SurfaceView:
         self.rest = seen.rest[number]
         self.covered = seen.covered[number]
         height, width = self.rest.shape[:2]
-        ends = torch.tensor([number, number + 1]) * (height * width * RAYS)
-        begin, end = torch.searchsorted(seen.sample, ends).tolist()
-        pixel = (seen.sample[begin:end] - int(ends[0])) // RAYS
-        columns, shares = bilinear(seen.uv[begin:end].numpy(), shape)
-        columns += np.int32(shape[0] * shape[1]) * seen.back[begin:end].numpy()[:, None]
-        weights = shares * seen.weight[begin:end].numpy()[:, None]
-        starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
-        size = height * width, sides * shape[0] * shape[1]
-        entries = weights.ravel(), columns.ravel(), starts.astype(np.int32)
+        n_cells = shape[0] * shape[1]
+        first_sample = number * height * width * RAYS
+        bounds = torch.tensor([number, number + 1]) * (height * width * RAYS)
+        begin, end = torch.searchsorted(seen.sample, bounds).tolist()
+        pixel = (seen.sample[begin:end] - first_sample) // RAYS
+        columns, fractions = bilinear(seen.uv[begin:end].numpy(), shape)
+        is_back = seen.back[begin:end].numpy()
+        columns += np.int32(n_cells) * is_back[:, None]
+        weights = fractions * seen.weight[begin:end].numpy()[:, None]
+        row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
+        entries = weights.ravel(), columns.ravel(), row_starts.astype(np.int32)
+        size = height * width, sides * n_cells
         self.matrix = scipy.sparse.csr_matrix(entries, size, copy=False)
 
     def radiance(self, reflected: Tensor) -> Tensor:
-        """Return (H, W, 3) for what the fine grid reflects (sides x cells, 3);
-        differentiable in it.
+        """Return the radiance (H, W, 3) for what the fine grid reflects.
+
+        That is (sides x cells, 3); the result is differentiable in it.
         """
         return self.rest + product(self.matrix, reflected).reshape(self.rest.shape)
 
@@ -78,26 +94,27 @@ class SurfaceView:
 def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     """Return a sparse matrix times columns (k, 3); differentiable in these."""
 
-    def times(of: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
-        return torch.from_numpy(of @ values.numpy())
+    def multiply(factor: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
+        return torch.from_numpy(factor @ values.numpy())
 
-    both_ways = partial(times, matrix), partial(times, matrix.T)
-    rows: Tensor = LinearMap.apply(*both_ways, columns)  # type: ignore[no-untyped-call]
+    times = partial(multiply, matrix)
+    transposed_times = partial(multiply, matrix.T)
+    rows: Tensor = LinearMap.apply(times, transposed_times, columns)  # type: ignore[no-untyped-call]
     return rows
 
 
-SIDE = 160  # texels a side over the searched object
-GATHERED = 256  # rays from each texel that say what it sees
-# share of a texel's rays that meet the back of a surface from which on it lies inside
-# of something
+SIDE = 160  # texels along each side of the searched object's texture
+GATHERED = 256  # rays from each texel by which it is known what it sees
+# fraction of a texel's rays that meet the back of a surface above which it lies inside
+# something
 BURIED = 0.3
 BOUNCES = 4
-"""How often light goes from texel to texel: that and the camera's and the sky's
-segments make a path of `MAX_DEPTH`.
+"""How often light goes from texel to texel.
+
+With the camera's and the sky's segments that makes a path of `MAX_DEPTH`.
 """
-FINE = 192  # least side of the grid on which base colour and light are multiplied
-# reflectance that a photographed ground has at most, where light goes from surface to
-# surface
+FINE = 192  # smallest width of the grid on which base color and light are multiplied
+# largest reflectance of a photographed ground, where light goes from surface to surface
 WHITE = 0.95
 COLOR = f"{OBJECT}.base_color"
 MAP = "environment.padded"
@@ -106,33 +123,39 @@ CAMERAS = frozenset(
     {"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"}
 )
 FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
-"""Inputs that may change without anything being found anew but the light."""
+"""Inputs that may change: at most the light has to be computed again."""
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Light on the surfaces: (cells of the fine grid, 3) irradiance of the object's
-    front, and then of its back where that has its own; and the rest, for look-ups.
-    """
+    """Light on the surfaces."""
 
+    # (sides x cells of the fine grid, 3) irradiance of the object's front, and then of
+    # its back where that has its own
     on_object: Tensor
-    lit: Lit
+    lit: Lit  # all other light, for look-ups
 
     @property
     def bytes(self) -> int:
+        """Memory that it takes."""
         return 4 * (self.on_object.numel() + self.lit.numbers)
 
     def reflected(self, fine: Tensor) -> Tensor:
-        """Return what a base colour (cells of the fine grid, 3) reflects, on each side;
-        differentiable.
+        """Return what a base color (cells of the fine grid, 3) reflects on each side.
+
+        The result is differentiable.
         """
         return fine.repeat(len(self.on_object) // len(fine), 1) * self.on_object
 
 
 class Arrangement:
-    """Object and surroundings as they stand, and what they see of each other and of the
-    environment. The inputs are the scene's own, assembled, but for what may change; the
-    texture's size is that of the base colour, the seed that of the rays.
+    """Object and surroundings in fixed positions, and what their surfaces see.
+
+    Args:
+        renderer: of the scene.
+        inputs: the scene's own, assembled, without those that may change.
+        texture: rows and columns of the base color.
+        seed: of the rays.
     """
 
     def __init__(
@@ -147,87 +170,53 @@ class Arrangement:
         self.inputs = {name: inputs[name] for name in inputs if name not in ON_PICTURE}
         scene.held(self.inputs)
         description = scene.made[0]
-        names = (f"{OBJECT}.vertices", f"{OBJECT}.normals")
-        shape = [
-            self.inputs[name] if name in self.inputs else scene.base(name)
-            for name in names
-        ]
-        vertices, normals = (values.reshape(-1, 3).numpy() for values in shape)
-        charts = rasterised(description.meshes[OBJECT].mesh, SIDE)
-        some = [texels.on_mesh(OBJECT, charts, vertices, normals)]
-        if seen_from_behind(scene, OBJECT, some[0].places):
-            some = [
-                texels.on_mesh(OBJECT, charts, vertices, side * normals, side)
-                for side in (1, -1)
-            ]
-        self.sides = len(some)
+        vertices = self._object_buffer("vertices")
+        normals = self._object_buffer("normals")
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        charts = rasterised(description.meshes[OBJECT].mesh, SIDE)
+        surfaces = self._texels_on_object(charts, vertices, normals)
+        self.sides = len(surfaces)
         photograph = description.photograph
-        if description.number("ground.size") > 0.0:
-            reach = (
-                math.inf
-                if photograph is not None
-                else description.number("ground.size") / 2.0
-            )
-            some.append(
-                texels.on_ground(
-                    GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))
-                )
-            )
-        self._has_ground = len(some) > self.sides
-        self.texels: texels.LitTexels = texels.together(some)
+        self._has_ground = description.number("ground.size") > 0.0
+        if self._has_ground:
+            center = (float(middle[0]), float(middle[1]))
+            reach = self._ground_reach(photograph is not None)
+            surfaces.append(texels.on_ground(GROUND, 0.0, reach, center))
+        self.texels: texels.LitTexels = texels.together(surfaces)
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
-        # from the texels of a small texture to the fine grid
-        self._finer: scipy.sparse.csr_matrix | None = None
-        if factor > 1:
-            rows, columns = self.fine
-            y, x = np.meshgrid(
-                (np.arange(rows) + 0.5) / rows,
-                (np.arange(columns) + 0.5) / columns,
-                indexing="ij",
-            )
-            of_texel, shares = bilinear(
-                np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture
-            )
-            entries = (
-                shares.ravel(),
-                of_texel.ravel(),
-                np.arange(rows * columns + 1, dtype=np.int32) * 4,
-            )
-            self._finer = scipy.sparse.csr_matrix(
-                entries, (rows * columns, texture[0] * texture[1])
-            )
-        places = self.texels.places
-        facing = self.texels.normals
-        seen = gather(
-            scene, self.texels.grids, texels.CELLS, places, facing, GATHERED, seed
+        self._finer = _upsampling_matrix(texture, self.fine) if factor > 1 else None
+
+        met_cells = trace_texel_rays(
+            scene,
+            self.texels.grids,
+            texels.CELLS,
+            self.texels.places,
+            self.texels.normals,
+            GATHERED,
+            seed,
         )
-        self._sees = texels.seen_of(seen, self.texels.of_cell, len(places))
-        self._between = [
-            texels.between(
-                some[side],
-                charts,
-                self.fine,
-                vertices,
-                (1 - 2 * side) * normals,
-                self._buried(seen, side),
-            )
-            for side in range(self.sides)
-        ]
-        if self._has_ground:
-            above = np.asarray(
-                (seen[self.texels.of(self.sides)] >= len(self.texels.of_cell)).any(
-                    axis=1
+        self._view_matrices = texels.make_view_matrices(
+            met_cells, self.texels.of_cell, len(self.texels.places)
+        )
+        self._to_fine = []
+        for side in range(self.sides):
+            side_normals = (1 - 2 * side) * normals
+            buried = self._find_buried(met_cells, side)
+            self._to_fine.append(
+                texels.between(
+                    surfaces[side], charts, self.fine, vertices, side_normals, buried
                 )
             )
-            self._smooth = texels.smoothed(some[-1], above)
-        self.lobes = [self._measured()] * self.sides + [Lobes.matt()] * (
-            len(some) - self.sides
-        )
+        if self._has_ground:
+            ground_cells = met_cells[self.texels.of(self.sides)]
+            sees_sky = (ground_cells >= len(self.texels.of_cell)).any(axis=1)
+            self._smooth = texels.smoothed(surfaces[-1], np.asarray(sees_sky))
+        self.lobes = [self._measure_object()] * self.sides
+        self.lobes += [Lobes.matt()] * (len(surfaces) - self.sides)
         self._photographed = None if photograph is None else description.capture_height
-        self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
-        self._below = self._seen_below(middle)
+        self.to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
+        self._below = self._find_ground_below(middle)
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
@@ -241,172 +230,233 @@ class Arrangement:
             middle,
         )
 
-    def _buried(self, seen: Ints, side: int) -> Bools:
-        """Which texels of a side of the object lie inside of something: they see
-        nothing but backs, or much of them and no sky where backs have light of their
-        own.
-        """
-        here = seen[self.texels.of(side)]
-        if self.sides == 1:
-            return np.asarray((here < 0).mean(axis=1) > BURIED)
-        back = self.texels.grids[1]
-        inside = (here >= back.first) & (here < back.first + back.count)
-        return np.asarray(
-            (inside.mean(axis=1) > BURIED)
-            & ~(here >= len(self.texels.of_cell)).any(axis=1)
-        )
+    def _object_buffer(self, buffer: str) -> Floats:
+        """Return the object's vertices or normals (V, 3)."""
+        name = f"{OBJECT}.{buffer}"
+        values = self.inputs[name] if name in self.inputs else self._scene.base(name)
+        rows: Floats = values.reshape(-1, 3).numpy()
+        return rows
 
-    def _measured(self) -> Lobes:
-        here = self.texels.of(0)
+    def _texels_on_object(
+        self, charts: Charts, vertices: Floats, normals: Floats
+    ) -> list[texels.LitTexels]:
+        """Return the texels of the object; of both sides if its back is visible."""
+        single = texels.on_mesh(OBJECT, charts, vertices, normals)
+        if not is_visible_from_behind(self._scene, OBJECT, single.places):
+            return [single]
+        return [
+            texels.on_mesh(OBJECT, charts, vertices, side * normals, side)
+            for side in (1, -1)
+        ]
+
+    def _ground_reach(self, is_photographed: bool) -> float:
+        """Return half the width of the ground; a photographed one has no end."""
+        if is_photographed:
+            return math.inf
+        return self._scene.made[0].number("ground.size") / 2.0
+
+    def _find_buried(self, met_cells: Ints, side: int) -> Bools:
+        """Return which texels of a side of the object lie inside something.
+
+        They see nothing but backs; where backs have light of their own, they see many
+        of them and no sky.
+        """
+        cells = met_cells[self.texels.of(side)]
+        if self.sides == 1:
+            return np.asarray((cells < 0).mean(axis=1) > BURIED)
+        back = self.texels.grids[1]
+        is_back = (cells >= back.first) & (cells < back.first + back.count)
+        sees_sky = (cells >= len(self.texels.of_cell)).any(axis=1)
+        return np.asarray((is_back.mean(axis=1) > BURIED) & ~sees_sky)
+
+    def _measure_object(self) -> Lobes:
+        """Measure the object's BSDF at one of its most opaque texels."""
+        front = self.texels.of(0)
         opacity = self._scene.made[0].meshes[OBJECT].opacity
-        every = np.arange(here.start, here.stop)
+        candidates = np.arange(front.start, front.stop)
         if opacity is not None:
-            rows, columns = self.texels.grids[0].shape
-            row, column = np.divmod(self.texels.cells[here], columns)
-            opaque = opacity[
-                row * opacity.shape[0] // rows, column * opacity.shape[1] // columns
-            ]
-            every = every[opaque >= opaque.max()]
-        at = every[len(every) // 2]
+            n_rows, n_columns = self.texels.grids[0].shape
+            row, column = np.divmod(self.texels.cells[front], n_columns)
+            opacity_row = row * opacity.shape[0] // n_rows
+            opacity_column = column * opacity.shape[1] // n_columns
+            texel_opacity = opacity[opacity_row, opacity_column]
+            candidates = candidates[texel_opacity >= texel_opacity.max()]
+        texel = candidates[len(candidates) // 2]
         return measured(
             self._scene,
             self.inputs,
             self.texels.grids[0],
-            self.texels.places[at],
-            self.texels.normals[at],
+            self.texels.places[texel],
+            self.texels.normals[texel],
         )
 
-    def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Which cells of the blurred maps (h, w) the ground hides, seen from the
-        object's middle, and the directions (h, w, 3) in the map's axes in which its
-        photograph has what is seen there.
+    def _find_ground_below(self, middle: Floats) -> tuple[Tensor, Tensor]:
+        """Find the ground in the blurred maps, seen from the object's center.
+
+        Returns:
+            (h, w) which cells the ground hides; and (h, w, 3) the directions in the
+            map's axes in which its photograph has what is seen there.
         """
-        ways = texels.directions(texels.BLURRED)
-        world = ways @ self.to_map
+        directions = texels.directions(texels.BLURRED)
+        world = directions @ self.to_map
         if not self._has_ground:
-            return torch.zeros(texels.BLURRED, dtype=torch.bool), ways
-        far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
-        places = torch.from_numpy(middle).float() + world * far[..., None]
-        reach = (
-            self._scene.made[0].number("ground.size") / 2.0
-            if self._photographed is None
-            else math.inf
-        )
-        hidden = (world[..., 2] < -1e-3) & (places[..., :2].abs() <= reach).all(dim=-1)
+            return torch.zeros(texels.BLURRED, dtype=torch.bool), directions
+        distance = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
+        points = torch.from_numpy(middle).float() + world * distance[..., None]
+        reach = self._ground_reach(self._photographed is not None)
+        in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
         camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
-        return hidden, (places - camera) @ self.to_map.T
+        from_camera = (points - camera) @ self.to_map.T
+        return (world[..., 2] < -1e-3) & in_reach, from_camera
 
     @property
     def entries(self) -> int:
-        """Of all matrices, for one colour channel."""
-        return sum(
-            int(matrix.values().numel()) for matrix in (*self._sees, *self._between)
-        )
+        """Number of entries of all matrices, for one color channel."""
+        matrices = (*self._view_matrices, *self._to_fine)
+        return sum(int(matrix.values().numel()) for matrix in matrices)
 
     @property
     def bytes(self) -> int:
+        """Memory of the matrices."""
         return 8 * self.entries
 
     def look(
         self, cameras: Sequence[Mapping[str, Tensor]], light: Light
     ) -> Callable[[], Seen]:
-        """Begin to look through cameras under a light; see `Views`."""
+        """Start to trace rays through cameras under a light; see `Views`."""
         self._scene.stand(self.inputs)
         return self._views(cameras, light.lit)
 
     def view(self, seen: Seen, number: int) -> SurfaceView:
+        """Return what the camera with an index sees."""
         return SurfaceView(seen, number, self.fine, self.sides)
 
     def finer(self, color: Tensor) -> Tensor:
-        """Return a base colour (h, w, 3) on the fine grid, (cells, 3);
-        differentiable.
-        """
+        """Return a base color (h, w, 3) on the fine grid, (cells, 3); differentiable."""
         flat = color.reshape(-1, 3)
         return flat if self._finer is None else product(self._finer, flat)
 
     def light(self, padded: Tensor, color: Tensor) -> Light:
-        """Return the light of an environment (H, W + 2, 3) where the object has a base
-        colour (h, w, 3).
+        """Return the light of an environment, for a base color of the object.
+
+        Args:
+            padded: (H, W + 2, 3) map of the environment.
+            color: (h, w, 3).
         """
         with torch.no_grad():
             sky = texels.sky_of(padded)
-            direct = None
-            if len(sky.hot[0]):
-                self._scene.stand(self.inputs)
-                cosines = towards(
-                    self._scene,
-                    self.texels.places,
-                    self.texels.normals,
-                    sky.hot[0].numpy(),
-                )
-                direct = torch.from_numpy(cosines)
             reflectance = self._reflectance(color, padded)
-            arriving = texels.irradiance(self._sees, sky, direct, reflectance, BOUNCES)
+            arriving = texels.irradiance(
+                self._view_matrices,
+                sky,
+                self._hot_cosines(sky),
+                reflectance,
+                BOUNCES,
+            )
             leaving = reflectance * arriving / math.pi
-            shown = sky.map
-            unhidden = torch.ones(1, 3)
+            surroundings = sky.map
+            far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.of(self.sides)
-                (hidden, below) = self._below
-                if self._photographed is not None:
-                    leaving[ground] = arriving[ground] / unshadowed(
-                        padded[:, 1:-1]
-                    ).clamp_min(1e-12)
-                leaving[ground] = self._smooth @ leaving[ground]
-                cells = leaving[ground].reshape(*self.texels.grids[-1].shape, 3)
-                # the object hides little of it
-                rim = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
-                unhidden = rim.mean(dim=0, keepdim=True).clamp_min(1e-9)
-                seen = unhidden
-                if self._photographed is not None:
-                    seen = unhidden * texels.looked_up(
-                        padded, below.reshape(-1, 3)
-                    ).reshape(*texels.BLURRED, 3)
-                shown = torch.where(hidden[..., None], seen, shown)
-            on_object = torch.cat(
-                [
-                    fine @ arriving[self.texels.of(side)]
-                    for side, fine in enumerate(self._between)
-                ]
-            )
-            cells = torch.cat(
-                [leaving[torch.from_numpy(self.texels.of_cell)], unhidden]
-            )
-            return Light(on_object, lit_arrays(cells, padded, texels.blurred(shown)))
+                leaving[ground] = self._leaving_ground(arriving, leaving, padded)
+                far_ground = self._far_ground(leaving[ground])
+                surroundings = self._put_ground(surroundings, far_ground, padded)
+            on_sides = [
+                to_fine @ arriving[self.texels.of(side)]
+                for side, to_fine in enumerate(self._to_fine)
+            ]
+            texel_of_cell = torch.from_numpy(self.texels.of_cell)
+            cells = torch.cat([leaving[texel_of_cell], far_ground])
+            lit = lit_arrays(cells, padded, texels.blurred(surroundings))
+            return Light(torch.cat(on_sides), lit)
+
+    def _hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
+        """Return the visible cosines (n, k) towards what is hot; None if nothing is."""
+        hot_directions = sky.hot[0]
+        if not len(hot_directions):
+            return None
+        self._scene.stand(self.inputs)
+        cosines = compute_visible_cosines(
+            self._scene,
+            self.texels.places,
+            self.texels.normals,
+            hot_directions.numpy(),
+        )
+        return torch.from_numpy(cosines)
+
+    def _leaving_ground(
+        self, arriving: Tensor, leaving: Tensor, padded: Tensor
+    ) -> Tensor:
+        """Return what leaves the ground's texels, smoothed.
+
+        Of a photographed ground it is the fraction of its photograph that it shows.
+        """
+        ground = self.texels.of(self.sides)
+        if self._photographed is None:
+            return self._smooth @ leaving[ground]
+        full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        return self._smooth @ (arriving[ground] / full_light)
+
+    def _far_ground(self, leaving: Tensor) -> Tensor:
+        """Return what leaves the ground far off (1, 3): the object hides little there."""
+        cells = leaving.reshape(*self.texels.grids[-1].shape, 3)
+        border = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
+        return border.mean(dim=0, keepdim=True).clamp_min(1e-9)
+
+    def _put_ground(
+        self, surroundings: Tensor, far_ground: Tensor, padded: Tensor
+    ) -> Tensor:
+        """Put the ground into a map (h, w, 3) of what surrounds the object."""
+        is_hidden, from_camera = self._below
+        ground = far_ground
+        if self._photographed is not None:
+            photograph = texels.looked_up(padded, from_camera.reshape(-1, 3))
+            ground = far_ground * photograph.reshape(*texels.BLURRED, 3)
+        return torch.where(is_hidden[..., None], ground, surroundings)
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        rows, columns = self.texels.grids[0].shape
+        """Return the reflectance (n, 3) of all texels for even light."""
+        n_rows, n_columns = self.texels.grids[0].shape
         fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
-        pooled = (
-            functional.adaptive_avg_pool2d(fine, (rows, columns))[0]
-            .permute(1, 2, 0)
-            .reshape(-1, 3)
-        )
-        colors = [
-            pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]
-        ] * self.sides
+        pooled = functional.adaptive_avg_pool2d(fine, (n_rows, n_columns))[0]
+        pooled = pooled.permute(1, 2, 0).reshape(-1, 3)
+        object_cells = torch.from_numpy(self.texels.cells[self.texels.of(0)])
+        colors = [pooled[object_cells]] * self.sides
         if self._has_ground:
-            ground = self.texels.places[self.texels.of(self.sides)]
-            if self._photographed is None:
-                colors.append(
-                    srgb_to_linear(
-                        torch.tensor(self._scene.made[0].ground_color)
-                    ).expand(len(ground), 3)
-                )
-            else:
-                below = torch.from_numpy(ground) - torch.tensor(
-                    [0.0, 0.0, self._photographed]
-                )
-                shown = texels.looked_up(padded, below @ self.to_map.T)
-                colors.append(
-                    (
-                        shown * math.pi / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
-                    ).clamp_max(WHITE)
-                )
-        shares = [torch.tensor(surface.mean_shares) for surface in self.lobes]
-        return torch.cat(
-            [
-                color * share[0] + share[1]
-                for color, share in zip(colors, shares, strict=True)
-            ]
-        )
+            colors.append(self._ground_color(padded))
+        reflectances = []
+        for surface_color, surface in zip(colors, self.lobes, strict=True):
+            diffuse, gloss = torch.tensor(surface.mean_shares)
+            reflectances.append(surface_color * diffuse + gloss)
+        return torch.cat(reflectances)
+
+    def _ground_color(self, padded: Tensor) -> Tensor:
+        """Return the base color (n, 3) of the ground's texels."""
+        ground = self.texels.places[self.texels.of(self.sides)]
+        if self._photographed is None:
+            srgb = torch.tensor(self._scene.made[0].ground_color)
+            return srgb_to_linear(srgb).expand(len(ground), 3)
+        camera = torch.tensor([0.0, 0.0, self._photographed])
+        directions = (torch.from_numpy(ground) - camera) @ self.to_map.T
+        photograph = texels.looked_up(padded, directions)
+        full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        return (photograph * math.pi / full_light).clamp_max(WHITE)
+
+
+def _upsampling_matrix(
+    texture: tuple[int, int], fine: tuple[int, int]
+) -> scipy.sparse.csr_matrix:
+    """Return the matrix from the texels of a small texture to the fine grid."""
+    n_rows, n_columns = fine
+    y, x = np.meshgrid(
+        (np.arange(n_rows) + 0.5) / n_rows,
+        (np.arange(n_columns) + 0.5) / n_columns,
+        indexing="ij",
+    )
+    uv = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+    texel, fractions = bilinear(uv, texture)
+    row_starts = np.arange(n_rows * n_columns + 1, dtype=np.int32) * 4
+    entries = (fractions.ravel(), texel.ravel(), row_starts)
+    return scipy.sparse.csr_matrix(
+        entries, (n_rows * n_columns, texture[0] * texture[1])
+    )

@@ -1,6 +1,6 @@
-"""Pictures from many cameras and under many environments: light is kept on surfaces.
+"""Predict images from many cameras and under many environments by light on surfaces.
 
-`why_not` says which scenes and spaces have pictures that it may predict.
+`why_not` returns why a scene's or a space's images cannot be predicted.
 """
 
 from __future__ import annotations
@@ -37,38 +37,37 @@ from advsearch.scene.surface.arrangement import (
 from advsearch.trust.stored_files import scaled
 
 MOST_RAYS = 1 << 21  # rays of cameras of one launch
-TEXELS = 333  # of an environment's map, by which it is known again
+TEXELS = 333  # of an environment's map that are compared with those of others
 
 
 class Look(NamedTuple):
-    """What one of several cameras sees, by its number; under which light, and how many
-    times as bright (3,) that is.
-    """
+    """What one of several cameras sees, and under which light."""
 
-    number: int
+    number: int  # index of the camera
     view: SurfaceView
     light: Light
-    factor: Tensor | float
+    factor: Tensor | float  # (3,) how many times as bright the light is
 
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """What tells an environment's map from others: its means (3,), and some of its
-    texels (n, 3) over these.
-    """
+    """A fingerprint of an environment's map, for comparison with other maps."""
 
-    mean: Tensor
-    texels: Tensor
+    mean: Tensor  # (3,) of the map
+    texels: Tensor  # (n, 3) some of its texels over the means
 
     @classmethod
     def of(cls, padded: Tensor) -> Sketch:
+        """Return the fingerprint of a map (H, W + 2, 3)."""
         flat = padded.reshape(-1, 3)
-        mean = padded.reshape(-1, 3).mean(dim=0)
-        return cls(mean, flat[:: max(1, len(flat) // TEXELS)] / mean.clamp_min(1e-12))
+        mean = flat.mean(dim=0)
+        step = max(1, len(flat) // TEXELS)
+        return cls(mean, flat[::step] / mean.clamp_min(1e-12))
 
     def times(self, other: Sketch) -> Tensor | None:
-        """Return how many times as bright (3,) another map is; None where it differs in
-        more.
+        """Return how many times as bright (3,) another map is.
+
+        None if it differs in more than that.
         """
         if self.texels.shape != other.texels.shape or not torch.allclose(
             self.texels, other.texels, 1e-5, 1e-6
@@ -78,15 +77,24 @@ class Sketch:
 
 
 class SurfaceRenderer(Predictor):
-    """Predicts pictures by light on surfaces, in spaces that `why_not` says nothing
-    against. All but cameras, environment and base colour stays as it is at u; the seed
-    is that of the rays that say what texels see.
+    """Predict images by light on surfaces, in spaces that `why_not` does not refuse.
 
-    A picture is linear in the base colour of the object. Light that goes from the
-    object to itself, or to the ground and back, is that of the base colour (h, w, 3)
-    `there`; see `renew`. `lights_kept` are the lights of maps, the oldest first, and
-    `dropped` counts those that made room for others; `fixed` is the light of all
-    pictures, None for that of their own environment, see `under`.
+    An image is linear in the base color of the object. Light that goes from the object
+    to itself, or to the ground and back, is that of the base color `there`; see
+    `renew`.
+
+    Args:
+        traced: renderer of the scene.
+        u: (d,) configuration; all but cameras, environment and base color stays as it
+            is there.
+        seed: of the rays from texels.
+
+    Attributes:
+        there: (h, w, 3) base color.
+        lights_kept: the lights of maps, the oldest first.
+        dropped: how many lights were removed for others.
+        fixed: the light of all images, see `under`; None for that of the image's own
+            environment.
     """
 
     fixed: Light | None = None
@@ -103,11 +111,10 @@ class SurfaceRenderer(Predictor):
         }
         inputs = self.inputs(u)
         self.there = self.color(inputs)
-        standing = {name: inputs[name] for name in inputs if name not in FREE}
+        fixed_inputs = {name: inputs[name] for name in inputs if name not in FREE}
+        texture = (self.there.shape[0], self.there.shape[1])
         with torch.no_grad():
-            self.arrangement = Arrangement(
-                traced, standing, (self.there.shape[0], self.there.shape[1]), seed
-            )
+            self.arrangement = Arrangement(traced, fixed_inputs, texture, seed)
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration (d,), without a graph."""
@@ -115,29 +122,25 @@ class SurfaceRenderer(Predictor):
             return self.traced.scene.assembly(self.traced.space.inputs(u))
 
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the base color (h, w, 3) of scene inputs."""
         return inputs.get(COLOR, self._base[COLOR])
 
     def stands(self, inputs: Mapping[str, Tensor]) -> bool:
-        """Whether everything but cameras and environment is the same in scene
-        inputs.
-        """
-        standing = {**self.arrangement.inputs, COLOR: self.there}
-        others = {name: inputs[name] for name in inputs if name not in FREE} | {
-            COLOR: self.color(inputs)
-        }
-        return standing.keys() == others.keys() and not any(
-            differs(standing[name], others[name]) for name in standing
+        """Return whether only cameras and environment differ in some scene inputs."""
+        expected = {**self.arrangement.inputs, COLOR: self.there}
+        fixed_inputs = {name: inputs[name] for name in inputs if name not in FREE}
+        fixed_inputs[COLOR] = self.color(inputs)
+        return expected.keys() == fixed_inputs.keys() and not any(
+            differs(expected[name], fixed_inputs[name]) for name in expected
         )
 
     def renew(self, u: Tensor) -> None:
-        """Take the light between surfaces from the base colour at u from now on."""
+        """Take the light between surfaces from the base color at u from now on."""
         self.there = self.color(self.inputs(u))
         self.lights_kept.clear()
 
     def under(self, inputs: Mapping[str, Tensor]) -> SurfaceRenderer:
-        """Return what predicts pictures that are all under the environment of some
-        scene inputs.
-        """
+        """Return a predictor of images that are all under the environment of inputs."""
         other = copy.copy(self)
         other.fixed = self.light(inputs)
         other.lights_kept = {}
@@ -145,6 +148,7 @@ class SurfaceRenderer(Predictor):
 
     @property
     def at_once(self) -> int:
+        """Number of images in one launch."""
         height, width = self.traced.formation.resolution
         return max(1, MOST_RAYS // (height * width * RAYS))
 
@@ -154,61 +158,66 @@ class SurfaceRenderer(Predictor):
 
     @property
     def bytes(self) -> int:
-        if self.fixed is not None:  # of its own: the rest is shared
+        if self.fixed is not None:  # the rest is shared
             return self.fixed.bytes
-        return self.arrangement.bytes + sum(
-            light.bytes for light in self.lights_kept.values()
-        )
+        lights = sum(light.bytes for light in self.lights_kept.values())
+        return self.arrangement.bytes + lights
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
-        return self.arrangement.light(
-            inputs.get(MAP, self._base[MAP]).detach(), self.there
-        )
+        """Compute the light under the environment of scene inputs."""
+        padded = inputs.get(MAP, self._base[MAP]).detach()
+        return self.arrangement.light(padded, self.there)
 
     def kept_light(self, inputs: Mapping[str, Tensor]) -> tuple[Light, Tensor]:
-        """Return the light under the environment of scene inputs, and a factor (3,) on
-        it: exposures and tints of one map have one light. It is made on first use, and
-        `MOST_BYTES` of them are kept.
+        """Return the light under the environment of scene inputs, and its factor (3,).
+
+        Exposures and tints of one map have one light. It is computed on first use, and
+        up to `MOST_BYTES` of lights are stored.
         """
         sketch = Sketch.of(inputs.get(MAP, self._base[MAP]).detach())
-        for known, light in self.lights_kept.items():
-            factor = known.times(sketch)
+        for stored_sketch, light in self.lights_kept.items():
+            factor = stored_sketch.times(sketch)
             if factor is not None:
                 return light, factor
-        self.lights_kept[sketch] = light = self.light(inputs)
+        light = self.light(inputs)
+        self.lights_kept[sketch] = light
         while len(self.lights_kept) > 1 and self.bytes > scaled(MOST_BYTES):
-            self.lights_kept.pop(next(iter(self.lights_kept)))
+            oldest = next(iter(self.lights_kept))
+            self.lights_kept.pop(oldest)
             self.dropped += 1
         return light, torch.ones(3)
 
     def looks(self, inputs: Sequence[Mapping[str, Tensor]]) -> Iterator[Look]:
-        """Look through the cameras of scene inputs; those under one environment in one
-        launch, while the last launch's are made use of.
+        """Yield what the cameras of scene inputs see.
+
+        Those under one environment are traced in one launch, while the results of the
+        launch before are used.
         """
-        lights = [
-            self.kept_light(each) if self.fixed is None else (self.fixed, 1.0)
-            for each in inputs
-        ]
-        groups: dict[Light, list[int]] = {}
+        lights: list[tuple[Light, Tensor | float]] = []
+        for camera_inputs in inputs:
+            if self.fixed is None:
+                lights.append(self.kept_light(camera_inputs))
+            else:
+                lights.append((self.fixed, 1.0))
+        cameras_of_light: dict[Light, list[int]] = {}
         for number, (light, _) in enumerate(lights):
-            groups.setdefault(light, []).append(number)
+            cameras_of_light.setdefault(light, []).append(number)
         names = CAMERAS & self._base.keys()
         cameras = [
-            {name: each.get(name, self._base[name]) for name in names}
-            for each in inputs
+            {name: camera_inputs.get(name, self._base[name]) for name in names}
+            for camera_inputs in inputs
         ]
-        looks = (
-            self.arrangement.look([cameras[number] for number in some], light)
-            for light, some in groups.items()
+        launches = (
+            self.arrangement.look([cameras[number] for number in numbers], light)
+            for light, numbers in cameras_of_light.items()
         )
-        begun = next(looks)
-        for light, numbers in groups.items():
-            seen = begun()
-            begun = next(looks, begun)
-            for place, number in enumerate(numbers):
-                yield Look(
-                    number, self.arrangement.view(seen, place), light, lights[number][1]
-                )
+        running = next(launches)
+        for light, numbers in cameras_of_light.items():
+            samples = running()
+            running = next(launches, running)
+            for index, number in enumerate(numbers):
+                view = self.arrangement.view(samples, index)
+                yield Look(number, view, light, lights[number][1])
 
     def shown(
         self,
@@ -217,87 +226,85 @@ class SurfaceRenderer(Predictor):
         color: Tensor,
         wholes: Sequence[Tensor],
     ) -> Tensor:
-        """Return the pictures (n, H, W, 3) sRGB of what cameras see (`looks`) of a base
-        colour (h, w, 3), differentiable in that; by the inputs of the scene for each,
-        whose base colour does not count, and the configurations (d,), for what controls
-        do to the finished picture.
+        """Return the images (n, H, W, 3) sRGB of what cameras see of a base color.
+
+        Args:
+            looks: of the cameras.
+            inputs: scene inputs for each, whose base color is ignored.
+            color: (h, w, 3); the images are differentiable in it.
+            wholes: full configurations (d,), for what controls do to the finished
+                image.
         """
         fine = self.arrangement.finer(color)
         reflected = dict[Light, Tensor]()
-        pictures = dict[int, Tensor]()
+        images = dict[int, Tensor]()
         for look in looks:
             if look.light not in reflected:
                 reflected[look.light] = look.light.reflected(fine)
             radiance = look.view.radiance(reflected[look.light]) * look.factor
-            pictures[look.number] = self.traced.finished(
+            images[look.number] = self.traced.finished(
                 radiance, inputs[look.number], wholes[look.number]
             )
-        return torch.stack([pictures[number] for number in range(len(inputs))])
+        return torch.stack([images[number] for number in range(len(inputs))])
 
     def pictures(self, us: Sequence[Tensor]) -> list[Tensor]:
-        """Return pictures of configurations that differ in camera and environment
-        alone, many in one launch.
+        """Return images of configurations that differ in camera and environment alone.
+
+        Many are made in one launch.
         """
-        pictures = list[Tensor]()
+        images = list[Tensor]()
         with torch.no_grad():
             for begin in range(0, len(us), self.at_once):
-                some = us[begin : begin + self.at_once]
-                inputs = [self.inputs(u) for u in some]
-                pictures += self.shown(self.looks(inputs), inputs, self.there, some)
-        return pictures
+                batch = us[begin : begin + self.at_once]
+                inputs = [self.inputs(u) for u in batch]
+                images += self.shown(self.looks(inputs), inputs, self.there, batch)
+        return images
 
     def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
         (look,) = self.looks([inputs])
-        return (
-            look.view.radiance(
-                look.light.reflected(self.arrangement.finer(self.color(inputs)))
-            )
-            * look.factor
-        )
+        fine = self.arrangement.finer(self.color(inputs))
+        return look.view.radiance(look.light.reflected(fine)) * look.factor
 
 
 def why_not(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
-    """Why light on surfaces cannot predict the pictures of a renderer's space, in
-    words; None if it may: how far it is off is then for measurement. Some controls
-    vary; the others are searched, and may change base colours alone.
+    """Return why light on surfaces cannot predict images of a space; None if it may.
+
+    How far it is off is then for measurement.
+
+    Args:
+        renderer: of the space.
+        varying: names of the controls that vary; the others are searched, and may
+            change base colors alone.
     """
-    reason = why_not_kept(renderer)
-    if reason is not None:
-        return reason
+    refusal = why_not_kept(renderer)
+    if refusal is not None:
+        return refusal
     for group in renderer.plan.groups:
-        if group.control not in varying and group.estimator != "image":
-            if renderer.routes.get(group.name, frozenset()) != {COLOR}:
-                return Refusal(
-                    f"{group.name} changes more than the object's base colour"
-                )
+        if group.control in varying or group.estimator == "image":
+            continue
+        if renderer.routes.get(group.name, frozenset()) != {COLOR}:
+            return Refusal(f"{group.name} changes more than the object's base colour")
     changed = varied(renderer, varying)
     if not changed <= FREE:
         return Refusal(
             f"{', '.join(sorted(changed - FREE))} varies, and light on "
             "surfaces is kept for one arrangement"
         )
-    return (
-        None
-        if changed & CAMERAS
-        else Refusal("no camera varies", RefusalCause.NO_CAMERA)
-    )
+    if not changed & CAMERAS:
+        return Refusal("no camera varies", RefusalCause.NO_CAMERA)
+    return None
 
 
 def why_not_kept(renderer: Renderer) -> Refusal | None:
-    """Why light cannot be kept on the surfaces of a renderer's scene, in words; None if
-    it may be.
-    """
+    """Return why light cannot be stored on a scene's surfaces; None if it may be."""
     description = renderer.scene.made[0]
-    thing = description.meshes[OBJECT]
-    if thing.mesh.repeats or thing.surface is not None:
+    mesh_part = description.meshes[OBJECT]
+    if mesh_part.mesh.repeats or mesh_part.surface is not None:
         return Refusal(
             "the object's surface repeats its texture, or is one of Mitsuba's own"
         )
-    if (
-        description.environment is None
-        or description.emits
-        or len(description.parts) > 0
-    ):
+    has_more = len(description.parts) > 0 or description.emits
+    if description.environment is None or has_more:
         return Refusal(
             "there is more in the scene than the object, its ground and an environment"
         )
@@ -309,8 +316,9 @@ def why_not_kept(renderer: Renderer) -> Refusal | None:
 
 
 def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
-    """The scene inputs that some controls, or groups of coordinates, change; by their
-    names.
+    """Return the names of the scene inputs that some controls change.
+
+    `varying` has the names of controls, or of groups of coordinates.
     """
     changed: set[str] = set()
     with torch.no_grad():
@@ -320,10 +328,8 @@ def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
             for group in renderer.space.groups:
                 if group.control in varying or group.name in varying:
                     u[group.coordinates] = value
-            there = renderer.scene.assembly(renderer.space.inputs(u))
-            changed |= {
-                name
-                for name in start.keys() | there.keys()
-                if differs(start.get(name), there.get(name))
-            }
+            inputs = renderer.scene.assembly(renderer.space.inputs(u))
+            for name in start.keys() | inputs.keys():
+                if differs(start.get(name), inputs.get(name)):
+                    changed.add(name)
     return frozenset(changed)

@@ -1,19 +1,21 @@
-"""The texels of light that lie over the surfaces of a scene, and the light on them.
+"""Lay texels over the surfaces of a scene, and compute the light on them.
 
 What a texel sees of the others and of the environment is found once, by rays
-(`gather`), and is a sparse matrix:
+(`trace_texel_rays`), and is a sparse matrix:
 
-    E = S sky + F (reflectance E) / pi,        S: texels x cells of the environment, F: texels x texels
+    E = S sky + F (reflectance E) / pi
+
+    S: texels x cells of the environment, F: texels x texels
 
 so that the irradiance E under any environment and for any texture takes a few sparse
-products: radiosity (Goral et al.
-1984). Light of small bright lamps in the map, which few rays would meet, is found by rays towards them.
+products: radiosity (Goral et al. 1984). Light of small bright lamps in the map, which
+few rays would meet, is found by rays towards them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,24 +26,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.scene.assets import Bools, Floats, Ints
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints
 from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.raster import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
 
-GROUND = 112  # texels a side over the ground
-# half the side of the ground that has texels, object sizes; further out there is the
+GROUND = 112  # texels along each side of the ground
+# half the width of the ground that has texels, object sizes; further out there is the
 # light of its border
 NEAR = 12.0
+# width of the ground's texels under the center of the object, object sizes: contact
+# shadows are that sharp
 FINEST = 0.01
-"""Side of the ground's texels under the middle of the object, object sizes: contact
-shadows are that sharp.
-"""
-REACH = 2  # texels to each side that the light of a place is taken from
-WIDTH = 0.8  # standard deviation of the weight of these, texels
+REACH = 2  # texels in each direction whose light counts at a point
+WIDTH = 0.8  # standard deviation of the weight of their distance, texels
 SAME = 1.5
-"""Standard deviation of the weight of their distance in space, sides of a texel: those
-of another chart take no part, nor those of the other wall of a cup.
+"""Standard deviation of the weight of their distance in space, widths of a texel.
+
+Texels of another chart do not count, nor those of the other wall of a cup.
 """
 
 BINOMIAL = (1, 4, 6, 4, 1)
@@ -49,56 +51,64 @@ BINOMIAL = (1, 4, 6, 4, 1)
 
 @dataclass(frozen=True, eq=False)
 class LitTexels:
-    """Where light is kept: those cells of all grids that lie on a surface."""
+    """The texels that store light: those cells of all grids that lie on a surface."""
 
     grids: tuple[TexelGrid, ...]  # of each surface, the searched one first
-    places: Floats  # (n, 3) in world space
+    places: Floats  # (n, 3) positions in world space
     normals: Floats  # (n, 3)
-    cells: Ints  # (n,) the cell of all grids that each lies in
-    # (cells of all grids,) number of the texel that each cell has the light of, the
-    # nearest one
+    cells: Ints  # (n,) index of the cell of all grids that each lies in
+    # (cells of all grids,) index of the texel whose light each cell has, the nearest
     of_cell: Ints
     begin: tuple[int, ...]  # of each grid its first texel, and the number of all
 
     def of(self, number: int) -> slice:
+        """Return the texels of a grid, by its index."""
         return slice(self.begin[number], self.begin[number + 1])
 
 
 def together(some: Sequence[LitTexels]) -> LitTexels:
-    first = np.cumsum([0] + [len(each.places) for each in some])
-    cells = np.cumsum([0] + [each.grids[0].count for each in some])
+    """Join the texels of several surfaces, each with one grid."""
+    first_texels = np.cumsum([0] + [len(texels.places) for texels in some])
+    first_cells = np.cumsum([0] + [texels.grids[0].count for texels in some])
+    grids = []
+    cells = []
+    texel_of_cell = []
+    for texels, first_texel, first_cell in zip(
+        some, first_texels[:-1], first_cells[:-1], strict=True
+    ):
+        grids.append(replace(texels.grids[0], first=int(first_cell)))
+        cells.append(texels.cells + first_cell)
+        texel_of_cell.append(texels.of_cell + first_texel)
     return LitTexels(
-        grids=tuple(
-            replace(each.grids[0], first=int(cell))
-            for each, cell in zip(some, cells[:-1], strict=True)
-        ),
-        places=np.concatenate([each.places for each in some]),
-        normals=np.concatenate([each.normals for each in some]),
-        cells=np.concatenate(
-            [each.cells + cell for each, cell in zip(some, cells[:-1], strict=True)]
-        ),
-        of_cell=np.concatenate(
-            [each.of_cell + begin for each, begin in zip(some, first[:-1], strict=True)]
-        ),
-        begin=tuple(int(each) for each in first),
+        grids=tuple(grids),
+        places=np.concatenate([texels.places for texels in some]),
+        normals=np.concatenate([texels.normals for texels in some]),
+        cells=np.concatenate(cells),
+        of_cell=np.concatenate(texel_of_cell),
+        begin=tuple(int(first_texel) for first_texel in first_texels),
     )
 
 
 def on_mesh(
     name: str, charts: Charts, vertices: Floats, normals: Floats, side: int = 0
 ) -> LitTexels:
-    """Return the texels over a mesh with vertices and normals (V, 3) in world space and
-    rasterised texture coordinates; the side of its faces as `TexelGrid` has it.
+    """Return the texels over a mesh.
+
+    Args:
+        name: of the mesh.
+        charts: its rasterised texture coordinates.
+        vertices, normals: (V, 3) in world space.
+        side: of its faces, as `TexelGrid` has it.
     """
-    place, normal = _surface(charts, vertices, normals)
-    number = np.cumsum(charts.covered.ravel()) - 1
+    position, normal = _interpolate(charts, vertices, normals)
+    texel_of_covered = np.cumsum(charts.covered.ravel()) - 1
     rows, columns = np.nonzero(charts.covered)
     return LitTexels(
         grids=(TexelGrid(name, 0, charts.covered.shape, None, side),),
-        places=place[rows, columns],
+        places=position[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.covered),
-        of_cell=number[_nearest(charts.covered)],
+        of_cell=texel_of_covered[_find_nearest(charts.covered)],
         begin=(0, len(rows)),
     )
 
@@ -106,32 +116,43 @@ def on_mesh(
 def on_ground(
     name: str, height: float, reach: float, middle: tuple[float, float]
 ) -> LitTexels:
-    """Return the texels over a level plane at a height, with half its side as `reach`:
-    small under the object's middle (x, y), and large far off.
+    """Return the texels over a level plane, small under the object and large far off.
+
+    Args:
+        name: of the ground.
+        height: of the plane.
+        reach: half its width.
+        middle: x and y of the object's center.
     """
     reach = min(reach, NEAR)
-    ratio = reach / (FINEST * GROUND / 2.0)
-    rate = 1e-3
-    high = 20.0
-    # bisect for sinh(rate) / rate = ratio; the rate stays small where that is 1 or less
-    for _ in range(60):
-        half = 0.5 * (rate + high)
-        rate, high = (half, high) if math.sinh(half) / half < ratio else (rate, half)
+    rate = _find_warp_rate(reach / (FINEST * GROUND / 2.0))
     scale = reach / math.sinh(rate)
-    share = (np.arange(GROUND) + 0.5) * 2.0 / GROUND - 1.0
-    along = scale * np.sinh(rate * share)
-    y, x = np.meshgrid(along + middle[1], along + middle[0], indexing="ij")
-    places = (
-        np.stack([x, y, np.full_like(x, height)], axis=-1)
-        .reshape(-1, 3)
-        .astype(np.float32)
-    )
-    up = np.broadcast_to(
-        np.array([0.0, 0.0, 1.0], dtype=np.float32), places.shape
-    ).copy()
+    position = (np.arange(GROUND) + 0.5) * 2.0 / GROUND - 1.0
+    offset = scale * np.sinh(rate * position)
+    y, x = np.meshgrid(offset + middle[1], offset + middle[0], indexing="ij")
+    positions = np.stack([x, y, np.full_like(x, height)], axis=-1)
+    positions = positions.reshape(-1, 3).astype(np.float32)
+    up = np.array([0.0, 0.0, 1.0], dtype=np.float32)
+    normals = np.broadcast_to(up, positions.shape).copy()
     grid = TexelGrid(name, 0, (GROUND, GROUND), (middle[0], middle[1], scale, rate))
-    every = np.arange(GROUND * GROUND)
-    return LitTexels((grid,), places, up, every, every, (0, GROUND * GROUND))
+    cells = np.arange(GROUND * GROUND)
+    return LitTexels((grid,), positions, normals, cells, cells, (0, GROUND * GROUND))
+
+
+def _find_warp_rate(ratio: float) -> float:
+    """Bisect for the rate with sinh(rate) / rate = ratio.
+
+    The rate stays small where the ratio is 1 or less.
+    """
+    lower = 1e-3
+    upper = 20.0
+    for _ in range(60):
+        middle = 0.5 * (lower + upper)
+        if math.sinh(middle) / middle < ratio:
+            lower = middle
+        else:
+            upper = middle
+    return lower
 
 
 def between(
@@ -142,110 +163,128 @@ def between(
     normals: Floats,
     buried: Bools,
 ) -> Tensor:
-    """Return the matrix (cells of a finer grid of a `shape` x texels of the first
-    surface) that smooths light and looks it up, for texels of a mesh, alone or the
-    first, with vertices and normals (V, 3) in world space and its charts. The weights
-    are those of a joint bilateral filter (Petschnigg et al. 2004, section 4.1): near in
-    the grid, near in space, facing the same way. The darkness of texels that are buried
-    (n,) in something does not count outside.
+    """Return the matrix that smooths light and looks it up in a finer grid.
+
+    The weights are those of a joint bilateral filter (Petschnigg et al. 2004, section
+    4.1): near in the grid, near in space, facing the same direction.
+
+    Args:
+        texels: of the mesh; it is the only surface, or the first one.
+        charts: of the mesh.
+        shape: rows and columns of the finer grid.
+        vertices, normals: (V, 3) in world space.
+        buried: (n,) texels that lie inside something; their darkness does not count
+            outside.
+
+    Returns:
+        Sparse, (cells of the finer grid, texels of the first surface).
     """
     buried = buried & ~buried.all()
-    fine = rasterised(charts.mesh, shape)
-    place, normal = _surface(fine, vertices, normals)
-    rows, columns = np.nonzero(fine.distance <= BORDER)
-    at = place[rows, columns]
-    facing = normal[rows, columns]
-    scale = np.ptp(vertices, axis=0).max() / max(
-        float(np.ptp(charts.mesh.vertices, axis=0).max()), 1e-12
-    )
-    # of a texel, there
-    side = math.sqrt(
-        max(float(charts.areas()[charts.covered].mean()) * float(scale) ** 2, 1e-12)
-    )
-    tall, wide = charts.covered.shape
-    y = (rows + 0.5) * tall / shape[0] - 0.5
-    x = (columns + 0.5) * wide / shape[1] - 0.5
-    number = np.where(
-        charts.covered,
-        np.cumsum(charts.covered.ravel()).reshape(charts.covered.shape) - 1,
-        -1,
-    )
-    corners = []
-    weights = []
-    for down in range(-REACH, REACH + 1):
-        for across in range(-REACH, REACH + 1):
-            row = np.round(y).astype(int) + down
-            column = np.round(x).astype(int) + across
-            inside = (row >= 0) & (row < tall) & (column >= 0) & (column < wide)
-            one = np.where(
-                inside, number[row.clip(0, tall - 1), column.clip(0, wide - 1)], -1
-            )
-            far = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * WIDTH**2)
-            apart = ((texels.places[one] - at) ** 2).sum(axis=1) / (
-                2.0 * (SAME * side) ** 2
-            )
-            alike = np.clip((texels.normals[one] * facing).sum(axis=1), 0.0, 1.0) ** 8
-            corners.append(one)
-            weights.append(
-                np.where((one >= 0) & ~buried[one], np.exp(-far - apart) * alike, 0.0)
-            )
-    chosen = np.stack(corners, axis=1)
-    weight = np.stack(weights, axis=1)
-    lost = weight.sum(axis=1) < 1e-6
-    chosen[lost, 0] = texels.of_cell[
-        np.round(y[lost]).astype(int).clip(0, tall - 1) * wide
-        + np.round(x[lost]).astype(int).clip(0, wide - 1)
-    ]
-    weight[lost, 0] = 1.0
-    weight /= weight.sum(axis=1, keepdims=True)
-    taken = weight > 1e-3
-    cell = np.broadcast_to((rows * shape[1] + columns)[:, None], chosen.shape)[taken]
+    fine_charts = rasterised(charts.mesh, shape)
+    position, normal = _interpolate(fine_charts, vertices, normals)
+    rows, columns = np.nonzero(fine_charts.distance <= BORDER)
+    points = position[rows, columns]
+    point_normals = normal[rows, columns]
+    texel_width = _texel_width(charts, vertices)
+    n_rows, n_columns = charts.covered.shape
+    y = (rows + 0.5) * n_rows / shape[0] - 0.5
+    x = (columns + 0.5) * n_columns / shape[1] - 0.5
+
+    texel_of_position = np.cumsum(charts.covered.ravel()).reshape(n_rows, n_columns) - 1
+    texel_of_position = np.where(charts.covered, texel_of_position, -1)
+    neighbours = []
+    neighbour_weights = []
+    for row, column in _neighbourhood(y, x):
+        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
+        texel = np.where(inside, texel_of_position[clipped], -1)
+        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * WIDTH**2)
+        offset = texels.places[texel] - points
+        distance = (offset**2).sum(axis=1) / (2.0 * (SAME * texel_width) ** 2)
+        cosine = (texels.normals[texel] * point_normals).sum(axis=1)
+        similarity = np.clip(cosine, 0.0, 1.0) ** 8
+        weight = np.exp(-grid_distance - distance) * similarity
+        is_used = (texel >= 0) & ~buried[texel]
+        neighbours.append(texel)
+        neighbour_weights.append(np.where(is_used, weight, 0.0))
+    texel_index = np.stack(neighbours, axis=1)
+    weights = np.stack(neighbour_weights, axis=1)
+
+    # Where no neighbour counts, the nearest texel does.
+    lost = weights.sum(axis=1) < 1e-6
+    nearest_row = np.round(y[lost]).astype(int).clip(0, n_rows - 1)
+    nearest_column = np.round(x[lost]).astype(int).clip(0, n_columns - 1)
+    texel_index[lost, 0] = texels.of_cell[nearest_row * n_columns + nearest_column]
+    weights[lost, 0] = 1.0
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    is_entry = weights > 1e-3
+    fine_cell = (rows * shape[1] + columns)[:, None]
+    cell = np.broadcast_to(fine_cell, texel_index.shape)[is_entry]
+    entries = (weights[is_entry].astype(np.float32), (cell, texel_index[is_entry]))
     size = shape[0] * shape[1], texels.begin[1]
-    return by_rows(
-        scipy.sparse.coo_matrix(
-            (weight[taken].astype(np.float32), (cell, chosen[taken])), size
-        ).tocsr()
-    )
+    return by_rows(scipy.sparse.coo_matrix(entries, size).tocsr())
+
+
+def _texel_width(charts: Charts, vertices: Floats) -> float:
+    """Return the mean width of a texel in world space, for vertices (V, 3) there."""
+    extent = float(np.ptp(charts.mesh.vertices, axis=0).max())
+    scale = np.ptp(vertices, axis=0).max() / max(extent, 1e-12)
+    area = float(charts.areas()[charts.covered].mean()) * float(scale) ** 2
+    return math.sqrt(max(area, 1e-12))
+
+
+def _neighbourhood(y: Doubles, x: Doubles) -> Iterator[tuple[Ints, Ints]]:
+    """Yield rows and columns of texels around positions, one offset at a time."""
+    for row_offset in range(-REACH, REACH + 1):
+        for column_offset in range(-REACH, REACH + 1):
+            row = np.round(y).astype(int) + row_offset
+            column = np.round(x).astype(int) + column_offset
+            yield row, column
 
 
 def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
-    """Return the matrix (cells x texels of a ground) that smooths its light, by the
-    binomial of 5 x 5 texels.
+    """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
-    Those that see nothing of the sky (not `lit`, (n,); none is the same as all) lie
-    under something. What is next to it takes no part of their darkness, which a look-up
-    beside the edge would mix in.
+    Texels that see nothing of the sky lie under something. What is next to it is not
+    mixed with their darkness.
+
+    Args:
+        ground: the texels of a ground.
+        lit: (n,) whether each sees something of the sky; if none does, all count.
+
+    Returns:
+        Sparse, (cells, texels).
     """
-    side = ground.grids[0].shape[0]
-    inside = (lit if lit.any() else ~lit).reshape(side, side)
-    source = _nearest(inside)
+    width = ground.grids[0].shape[0]
+    is_used = (lit if lit.any() else ~lit).reshape(width, width)
+    source = _find_nearest(is_used)
     band = scipy.sparse.diags_array(
-        BINOMIAL, offsets=range(-2, 3), shape=(side, side), dtype=np.float64
+        BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
-    every = scipy.sparse.csr_array(
+    weights = scipy.sparse.csr_array(
         scipy.sparse.kron(band, band)
-        @ scipy.sparse.diags_array(inside.ravel().astype(float))
+        @ scipy.sparse.diags_array(is_used.ravel().astype(float))
     )
-    every.data /= np.maximum(np.repeat(every.sum(axis=1), np.diff(every.indptr)), 1e-12)
-    return by_rows(every.astype(np.float32)[source])
+    row_sums = np.repeat(weights.sum(axis=1), np.diff(weights.indptr))
+    weights.data /= np.maximum(row_sums, 1e-12)
+    return by_rows(weights.astype(np.float32)[source])
 
 
-def _surface(
+def _interpolate(
     charts: Charts, vertices: Floats, normals: Floats
 ) -> tuple[Floats, Floats]:
+    """Return the position and the unit normal of each cell, both (h, w, 3)."""
     corners = charts.mesh.faces[charts.face]
-    place = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
+    position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return place.astype(np.float32), (normal / np.maximum(length, 1e-12)).astype(
-        np.float32
-    )
+    unit_normal = normal / np.maximum(length, 1e-12)
+    return position.astype(np.float32), unit_normal.astype(np.float32)
 
 
-def _nearest(covered: Bools) -> Ints:
-    """For each cell of a grid the nearest covered one, by their places in the flat
-    grid.
-    """
+def _find_nearest(covered: Bools) -> Ints:
+    """Return for each cell of a grid the flat index of the nearest covered one."""
     # takes long to import
     from scipy import ndimage
 
@@ -264,137 +303,152 @@ WIDTHS = (
     math.radians(24.0),
     math.radians(48.0),
 )
-"""By which the environment is blurred for gloss, radians."""
+"""Angles by which the environment is blurred for gloss, radians."""
 BLURRED = (64, 128)  # rows and columns of the blurred maps
-# multiples of the mean luminance above which light of the environment is found by rays
-# of its own
+# multiples of the mean luminance above which light of the environment is hot: it has
+# rays of its own
 HOT = 8.0
 HOT_RAYS = 48  # rays from each texel towards such light
 SPREAD = (7, 11)
-"""Steps, down and across, of a lattice of so many points: 11 / 7 is 29 of 48, the
-golden ratio's neighbour, and both coordinates are even.
+"""Steps along rows and columns of a lattice of `HOT_RAYS` points.
+
+11 / 7 is 29 modulo 48, next to the golden ratio, and both coordinates are even.
 """
-LITTLE = 0.02  # share of the light up to which it is left to the cells
+LITTLE = 0.02  # fraction of the light up to which what is hot is left to the cells
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True, eq=False)
 class SkyLight:
-    """An environment, as the scene takes it, cut for look-ups."""
+    """An environment's light, prepared for look-ups."""
 
     padded: Tensor  # (H, W + 2, 3)
     # (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot
     cells: Tensor
     map: Tensor  # `BLURRED`, (h, w, 3)
+    # (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3)
+    # radiance times solid angle
     hot: tuple[Tensor, Tensor]
-    """(k, 3) unit directions in the map's own axes towards what is hot, and (k, 3)
-    radiance times solid angle.
-    """
 
 
 def sky_of(padded: Tensor) -> SkyLight:
+    """Prepare an environment's map (H, W + 2, 3) for look-ups."""
     radiance = padded[:, 1:-1].detach()
-    rows, columns = radiance.shape[:2]
-    polar = torch.linspace(0.0, math.pi, rows)
-    sine = (
-        polar.sin()
-        .clamp_min(math.sin(0.25 * math.pi / rows))[:, None]
-        .expand(rows, columns)
-    )
+    n_rows, n_columns = radiance.shape[:2]
+    polar = torch.linspace(0.0, math.pi, n_rows)
+    # the solid angle of a texel; at the poles it is not zero
+    sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
+    sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE
     mean = float((luminance * sine).sum() / sine.sum())
-    spare = (1.0 - HOT * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
-    power = spare * luminance * sine
-    if float(power.sum()) > LITTLE * mean * float(sine.sum()):
-        hot = _hot(radiance * spare[..., None], power)
-        even = radiance * (1.0 - spare[..., None])
+    hot_fraction = (1.0 - HOT * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
+    hot_power = hot_fraction * luminance * sine
+    if float(hot_power.sum()) > LITTLE * mean * float(sine.sum()):
+        hot = _sample_hot(radiance * hot_fraction[..., None], hot_power)
+        even = radiance * (1.0 - hot_fraction[..., None])
     else:
         hot = (torch.zeros(0, 3), torch.zeros(0, 3))
         even = radiance
     return SkyLight(
         padded,
-        _pooled(even, sine, CELLS).reshape(-1, 3),
-        _pooled(radiance, sine, BLURRED),
+        _pool(even, sine, CELLS).reshape(-1, 3),
+        _pool(radiance, sine, BLURRED),
         hot,
     )
 
 
-def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions spread over what is hot by its power, and what comes from each.
+def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample directions to what is hot by its power, and what comes from each.
 
     A map is looked up between its texels, so that each shines over a tent that reaches
     its neighbours. Directions are spread over that by `SPREAD`: a sun of one texel has
     a soft shadow.
+
+    Args:
+        radiance: (H, W, 3) of what is hot.
+        power: (H, W) luminance times solid angle.
+
+    Returns:
+        (k, 3) unit directions, and (k, 3) radiance times solid angle.
     """
-    rows, columns = power.shape
-    total = power.sum()
-    order = torch.cumsum(power.double().reshape(-1), 0)
-    steps = (torch.arange(HOT_RAYS, dtype=torch.float64) + 0.5) / HOT_RAYS * order[-1]
-    index = torch.searchsorted(order, steps).clamp_max(power.numel() - 1)
-    row = index // columns
-    column = index % columns
-    number = torch.arange(HOT_RAYS, dtype=torch.float64)
-    even = [(number * step % HOT_RAYS + 0.5) / HOT_RAYS for step in SPREAD]
-    down, beside = (
-        torch.where(
-            part < 0.5, (2.0 * part).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * part).sqrt()
-        )
-        for part in even
-    )  # with a tent's density in [-1, 1]
-    polar = ((row + down) * (math.pi / (rows - 1))).clamp(0.0, math.pi)
-    across = (column + 0.5 + beside) * (2.0 * math.pi / columns)
-    ways = torch.stack(
-        [polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=1
-    ).float()
-    angle = math.pi / (rows - 1) * 2.0 * math.pi / columns
-    colour = radiance[row, column] / (radiance[row, column] @ LUMINANCE)[
-        :, None
-    ].clamp_min(1e-12)
-    return ways, colour * (float(total) * angle / HOT_RAYS)
+    n_rows, n_columns = power.shape
+    cumulative = torch.cumsum(power.double().reshape(-1), 0)
+    index = torch.arange(HOT_RAYS, dtype=torch.float64)
+    steps = (index + 0.5) / HOT_RAYS * cumulative[-1]
+    texel = torch.searchsorted(cumulative, steps).clamp_max(power.numel() - 1)
+    row = texel // n_columns
+    column = texel % n_columns
+    row_offset = _to_tent((index * SPREAD[0] % HOT_RAYS + 0.5) / HOT_RAYS)
+    column_offset = _to_tent((index * SPREAD[1] % HOT_RAYS + 0.5) / HOT_RAYS)
+    polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
+    azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
+    solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
+    color = radiance[row, column]
+    color = color / (color @ LUMINANCE)[:, None].clamp_min(1e-12)
+    power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
+    return _to_direction(polar, azimuth, dim=1).float(), color * power_per_ray
 
 
-def _pooled(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
-    weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1).permute(
-        2, 0, 1
-    )[None]
-    pooled = functional.adaptive_avg_pool2d(weighted, size)[0].permute(1, 2, 0)
+def _to_tent(uniform: Tensor) -> Tensor:
+    """Map numbers in [0, 1] to [-1, 1] with the density of a tent."""
+    return torch.where(
+        uniform < 0.5,
+        (2.0 * uniform).sqrt() - 1.0,
+        1.0 - (2.0 - 2.0 * uniform).sqrt(),
+    )
+
+
+def _to_direction(polar: Tensor, azimuth: Tensor, dim: int) -> Tensor:
+    """Return unit directions in the axes of the environment's map."""
+    x = polar.sin() * azimuth.sin()
+    z = -polar.sin() * azimuth.cos()
+    return torch.stack([x, polar.cos(), z], dim=dim)
+
+
+def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return mean radiance by solid angle in the cells of a coarser map."""
+    weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1)
+    pooled = functional.adaptive_avg_pool2d(weighted.permute(2, 0, 1)[None], size)
+    pooled = pooled[0].permute(1, 2, 0)
     return pooled[..., :3] / pooled[..., 3:].clamp_min(1e-12)
 
 
 def blurred(radiance: Tensor) -> Tensor:
-    """Blur a map (h, w, 3) by each of `WIDTHS`, root mean square over both directions:
-    (widths, h, w, 3).
+    """Blur a map (h, w, 3) by each of `WIDTHS`.
 
-    Along rows and columns one after the other, wider along rows towards the poles.
+    They are root mean squares over both directions. Rows and columns are blurred one
+    after the other, more along rows towards the poles.
+
+    Returns:
+        (widths, h, w, 3).
     """
-    rows, columns = radiance.shape[:2]
-    polar = (torch.arange(rows) + 0.5) * math.pi / rows
-    frequency = torch.arange(columns // 2 + 1)
+    n_rows, n_columns = radiance.shape[:2]
+    polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
+    frequency = torch.arange(n_columns // 2 + 1)
     maps = []
     for width in WIDTHS:
         sigma = width / math.sqrt(2.0)
-        apart = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
-        down = torch.exp(-apart) * polar.sin()[None, :]
-        down = down / down.sum(dim=1, keepdim=True)
-        across = torch.exp(
+        squared = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
+        across_rows = torch.exp(-squared) * polar.sin()[None, :]
+        across_rows = across_rows / across_rows.sum(dim=1, keepdim=True)
+        along_rows = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
-        spectrum = torch.fft.rfft(
-            (down @ radiance.reshape(rows, -1)).reshape(rows, columns, 3), dim=1
+        rows_blurred = across_rows @ radiance.reshape(n_rows, -1)
+        spectrum = torch.fft.rfft(rows_blurred.reshape(n_rows, n_columns, 3), dim=1)
+        maps.append(
+            torch.fft.irfft(spectrum * along_rows[..., None], n=n_columns, dim=1)
         )
-        maps.append(torch.fft.irfft(spectrum * across[..., None], n=columns, dim=1))
     return torch.stack(maps).clamp_min(0.0)
 
 
 def directions(size: tuple[int, int]) -> Tensor:
     """Return the unit directions (h, w, 3) of the cells of a map, in its own axes."""
-    rows, columns = size
-    polar = (torch.arange(rows) + 0.5) * math.pi / rows
-    across = (torch.arange(columns) + 0.5) * 2.0 * math.pi / columns
-    polar, across = torch.meshgrid(polar, across, indexing="ij")
-    return torch.stack(
-        [polar.sin() * across.sin(), polar.cos(), -polar.sin() * across.cos()], dim=-1
-    )
+    n_rows, n_columns = size
+    polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
+    azimuth = (torch.arange(n_columns) + 0.5) * 2.0 * math.pi / n_columns
+    polar, azimuth = torch.meshgrid(polar, azimuth, indexing="ij")
+    return _to_direction(polar, azimuth, dim=-1)
 
 
 def irradiance(
@@ -404,54 +458,67 @@ def irradiance(
     reflectance: Tensor,
     bounces: int,
 ) -> Tensor:
-    """Return the irradiance (n, 3) of texels with some reflectance (n, 3), after so
-    many bounces from texel to texel. `seen` are their views of the sky (n, cells) and
-    of each other (n, n), sparse, times the cosine and pi; `direct` the (n, k) cosines
-    towards what is hot where it is visible, None where nothing is.
+    """Return the irradiance (n, 3) of texels.
+
+    Args:
+        seen: views of the sky (n, cells) and of each other (n, n), sparse, times the
+            cosine and pi.
+        sky: the environment.
+        direct: (n, k) cosines towards what is hot where it is visible; None if nothing
+            is hot.
+        reflectance: (n, 3) of the texels.
+        bounces: how often light goes from texel to texel.
     """
-    of_sky, of_each_other = seen
-    first = of_sky @ sky.cells
+    sky_view, texel_view = seen
+    from_sky = sky_view @ sky.cells
     if direct is not None:
-        first = first + direct @ sky.hot[1]
-    arriving = first
+        from_sky = from_sky + direct @ sky.hot[1]
+    arriving = from_sky
     for _ in range(bounces):
-        arriving = first + of_each_other @ (reflectance * arriving / math.pi)
+        arriving = from_sky + texel_view @ (reflectance * arriving / math.pi)
     return arriving
 
 
-def seen_of(
-    columns: npt.NDArray[np.int32], of_cell: Ints, texels: int
+def make_view_matrices(
+    met_cells: npt.NDArray[np.int32], texel_of_cell: Ints, n_texels: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the sparse matrices of `irradiance` from what rays met, as `gather` has
-    it.
+    """Return the sparse matrices that `irradiance` needs, from what rays met.
+
+    Args:
+        met_cells: (n, rays) as of `trace_texel_rays`.
+        texel_of_cell: index of the texel of each cell, see `LitTexels`.
+        n_texels: of all grids.
     """
-    count, rays = columns.shape
-    row = np.repeat(np.arange(count), rays)
-    flat = columns.ravel()
-    of_sky = flat >= len(of_cell)
-    of_texel = (flat >= 0) & (flat < len(of_cell))
+    count, n_rays = met_cells.shape
+    row = np.repeat(np.arange(count), n_rays)
+    cell = met_cells.ravel()
+    is_sky = cell >= len(texel_of_cell)
+    is_texel = (cell >= 0) & (cell < len(texel_of_cell))
 
-    def matrix(
-        taken: Bools, column: npt.NDArray[np.integer[Any]], width: int
+    def make_matrix(
+        mask: Bools, column: npt.NDArray[np.integer[Any]], width: int
     ) -> Tensor:
-        values = np.full(len(column), math.pi / rays, dtype=np.float32)
-        return by_rows(
-            scipy.sparse.coo_matrix(
-                (values, (row[taken], column)), (count, width)
-            ).tocsr()
-        )
+        values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
+        entries = (values, (row[mask], column))
+        return by_rows(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())
 
-    sky = matrix(of_sky, flat[of_sky] - len(of_cell), CELLS[0] * CELLS[1])
-    return sky, matrix(of_texel, of_cell[flat[of_texel]], texels)
+    sky_column = cell[is_sky] - len(texel_of_cell)
+    sky_view = make_matrix(is_sky, sky_column, CELLS[0] * CELLS[1])
+    texel_view = make_matrix(is_texel, texel_of_cell[cell[is_texel]], n_texels)
+    return sky_view, texel_view
 
 
 def looked_up(padded: Tensor, ways: Tensor) -> Tensor:
-    """Return what an environment (H, W + 2, 3) has in directions (n, 3) in the map's
-    own axes, the nearest texel.
+    """Look an environment up in given directions, at the nearest texel.
+
+    Args:
+        padded: (H, W + 2, 3) map.
+        ways: (n, 3) directions in the map's own axes.
     """
-    rows = padded.shape[0]
-    columns = padded.shape[1] - 2
+    n_rows = padded.shape[0]
+    n_columns = padded.shape[1] - 2
     x, y, z = (ways / ways.norm(dim=1, keepdim=True)).unbind(dim=1)
-    across = torch.remainder(torch.atan2(x, -z) / (2.0 * math.pi), 1.0)
-    row = (torch.acos(y.clamp(-1.0, 1.0)) * ((rows - 1) / math.pi)).round().long()
-    return padded[row, 1 + (across * columns).long().clamp_max(columns - 1)]
+    azimuth = torch.remainder(torch.atan2(x, -z) / (2.0 * math.pi), 1.0)
+    row = (torch.acos(y.clamp(-1.0, 1.0)) * ((n_rows - 1) / math.pi)).round().long()
+    column = (azimuth * n_columns).long().clamp_max(n_columns - 1)
+    return padded[row, 1 + column]

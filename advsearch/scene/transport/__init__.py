@@ -1,3 +1,1 @@
-"""Linear light transport: pictures of a scene in which nothing moves, predicted without
-rendering.
-"""
+"""Predict images by linear light transport, where nothing moves."""

@@ -1,17 +1,19 @@
-"""The matrix of light transport from the texels of a base colour to the pixels of a
-picture, and renderers by it.
+"""Light transport as a matrix from the texels of a base color to pixels, and renderers
+that use it.
 
 Where camera, meshes and lights stand still, the radiance of a pixel is, to first order
-in the base colour,
+in the base color,
 
-    radiance = base + J (base colour - base colour there),        J: pixels x texels, one weight a colour channel,
+    radiance = base + J (base color - base color there)
+
+    J: pixels x texels, one weight for each color channel
 
 and J is sparse: a pixel sees few texels directly, in a mirror or through glass
-(bilinear lookups), and many a little (light from the object to the object), for which
-coarse cells of `COARSE` texels a side are enough. What a pixel sees of the texels
-hardly depends on the colour of the light, so that a row of J is kept as shares of
-texels, which add up to one, times a colour. A matrix that is one of many keeps its
-shares in 16 bits; one that serves a whole search keeps them in 32, by rows and by
+(bilinear look-ups), and many a little (light from the object to the object), for which
+coarse cells of `COARSE` x `COARSE` texels are enough. What a pixel sees of the texels
+hardly depends on the color of the light, so that a row of J is stored as fractions of
+texels, which add up to one, times a color. A matrix that is one of many stores its
+fractions in 16 bits; one that serves a full search stores them in 32, by rows and by
 columns, so that a product with it is one call.
 """
 
@@ -21,7 +23,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,18 +42,23 @@ from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 from advsearch.trust.stored_files import scaled
 
-# from a noisy picture (H, W, 3) to one without noise
+# from a noisy image (H, W, 3) to one without noise
 Smooth = Callable[[Tensor], Tensor]
-# multiples of its mean up to which a picture is kept; any exposure has clipped them
-# long before
+# multiples of its mean at which an image is clipped; any exposure has clipped them long
+# before
 MOST_MEANS = 6e4
-COARSE = 8  # side of the cells of later vertices, in texels
+COARSE = 8  # width of the cells of later vertices, in texels
 
 
 class Halves:
-    """A picture, of any shape, in 16 bits a number, in multiples of its mean, so that
-    it may be as bright as it likes; if `small` it is unpacked each time it is asked
-    for, otherwise once, where each step of a search asks.
+    """An image, of any shape, stored in 16 bits per number.
+
+    The numbers are multiples of its mean, so that the image may have any brightness.
+
+    Args:
+        picture: the image.
+        small: unpack it at each call; otherwise it is unpacked once, for a search that
+            needs it in every step.
     """
 
     def __init__(self, picture: Tensor, small: bool = True) -> None:
@@ -61,127 +68,146 @@ class Halves:
         self._unpacked = None if small else self._values.float() * self._scale
 
     def __call__(self) -> Tensor:
-        return (
-            self._values.float() * self._scale
-            if self._unpacked is None
-            else self._unpacked
-        )
+        """Return the image in float32."""
+        if self._unpacked is not None:
+            return self._unpacked
+        return self._values.float() * self._scale
+
+
+class _PackedRows(NamedTuple):
+    """A sparse matrix by rows in little memory."""
+
+    fractions: npt.NDArray[np.float16]
+    columns: npt.NDArray[np.integer[Any]]
+    row_starts: npt.NDArray[np.int32]
 
 
 class ColouredRows:
-    """A sparse matrix (rows, columns) for three colour channels whose rows are shares
-    times a colour; filled by `add`, then finished. If `small`, it is kept in 16 bits a
-    share, and as many a column where there are no more than 65,536, and unpacked for
-    each product.
+    """A sparse matrix (rows, columns) for three color channels.
+
+    Its rows are fractions that add up to one, times a color. It is filled by `add`, and
+    then `finish` is called once.
+
+    Args:
+        rows, columns: its size.
+        small: store it in 16 bits per fraction, and as many per column where there are
+            no more than 65,536, and unpack it for each product.
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
-        self._both_ways: tuple[Tensor, Tensor] | None = None
+        self._csr_pair: tuple[Tensor, Tensor] | None = None  # and its transpose
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        self._kept: (
-            tuple[
-                npt.NDArray[np.float16],
-                npt.NDArray[np.integer[Any]],
-                npt.NDArray[np.int32],
-            ]
-            | None
-        ) = None
-        self._column = np.dtype(np.uint16 if small and columns <= 1 << 16 else np.int32)
-        self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
-        self._kept_colours = Halves(torch.zeros(0))
+        self._packed: _PackedRows | None = None
+        has_small_columns = small and columns <= 1 << 16
+        self._column_type = np.dtype(np.uint16 if has_small_columns else np.int32)
+        self._colors: Floats = np.zeros((rows, 3), dtype=np.float32)
+        self._stored_colors = Halves(torch.zeros(0))
 
     @property
     def bytes(self) -> int:
-        """Memory when it is finished: a share and its column an entry, a beginning and
-        a colour a row; a share and its row an entry, a beginning a column and the
-        unpacked colours as well, where it is kept both ways.
+        """Memory when it is finished.
+
+        That is a fraction and its column for each entry, and a start and a color for
+        each row. If it is not small, there is the transpose, a fraction and its row for
+        each entry and a start for each column, and the unpacked colors.
         """
-        small = (2 + self._column.itemsize) * self.entries + (4 + 6) * self._shape[0]
-        return (
-            small
-            if self._small
-            else small + 10 * self.entries + 12 * self._shape[0] + 4 * self._shape[1]
-        )
+        n_rows, n_columns = self._shape
+        packed = (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
+        if self._small:
+            return packed
+        return packed + 10 * self.entries + 12 * n_rows + 4 * n_columns
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
-        """Add entries in rows (n,), ascending: the columns (n, k) that take part in
-        each, several of which may be the same, with shares (n, k), and weights (n, 3).
+        """Add entries.
+
+        Args:
+            rows: (n,) ascending.
+            columns: (n, k) that take part in each; several may be the same.
+            shares: (n, k) fractions of the columns.
+            weights: (n, 3) colors.
         """
         if not len(rows):
             return
-        begin = np.searchsorted(rows, np.arange(self._shape[0] + 1)) * columns.shape[1]
+        row_starts = np.searchsorted(rows, np.arange(self._shape[0] + 1))
+        row_starts = row_starts * columns.shape[1]
         values = (shares * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
-        more = scipy.sparse.csr_matrix(
-            (values, columns.ravel().astype(np.int32), begin.astype(np.int32)),
+        added = scipy.sparse.csr_matrix(
+            (values, columns.ravel().astype(np.int32), row_starts.astype(np.int32)),
             self._shape,
         )
-        more.sum_duplicates()
-        self._sum = self._sum + more if self._sum.nnz else more
+        added.sum_duplicates()
+        self._sum = self._sum + added if self._sum.nnz else added
         self.entries = int(self._sum.nnz)
         for channel in range(3):
-            self._colours[:, channel] += np.bincount(
+            self._colors[:, channel] += np.bincount(
                 rows, weights[:, channel], minlength=self._shape[0]
             )
 
     def finish(self, picture: tuple[int, int], smooth: Smooth | None) -> None:
-        """Be ready to multiply; `smooth` takes the noise out of the picture of all
-        colours.
+        """Get ready to multiply.
+
+        Args:
+            picture: height and width of the image whose pixels are the rows.
+            smooth: removes the noise from the image of all rows' colors.
         """
         sums = np.asarray(self._sum.sum(axis=1)).ravel()
         factors = np.where(sums > 0.0, 1.0 / np.maximum(sums, 1e-30), 0.0)
-        shares = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
+        fractions = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
         if self._small:
-            self._kept = (
-                shares.astype(np.float16),
-                self._sum.indices.astype(self._column),
+            self._packed = _PackedRows(
+                fractions.astype(np.float16),
+                self._sum.indices.astype(self._column_type),
                 self._sum.indptr,
             )
         else:
-            rows = scipy.sparse.csr_matrix(
-                (shares, self._sum.indices, self._sum.indptr), self._shape
+            matrix = scipy.sparse.csr_matrix(
+                (fractions, self._sum.indices, self._sum.indptr), self._shape
             )
-            self._both_ways = by_rows(rows), by_rows(rows.T.tocsr())
+            self._csr_pair = by_rows(matrix), by_rows(matrix.T.tocsr())
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        colours = torch.from_numpy(self._colours).reshape(*picture, 3)
-        self._kept_colours = Halves(
-            colours if smooth is None else smooth(colours), self._small
-        )
-        self._colours = np.zeros((0, 3), dtype=np.float32)
+        colors = torch.from_numpy(self._colors).reshape(*picture, 3)
+        if smooth is not None:
+            colors = smooth(colors)
+        self._stored_colors = Halves(colors, self._small)
+        self._colors = np.zeros((0, 3), dtype=np.float32)
 
     def times(self, values: Tensor) -> Tensor:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        ours = self._both_ways
-        product = (
-            ours[0] @ values
-            if ours
-            else torch.from_numpy(self._shares() @ values.numpy())
-        )
-        return product.mul_(self._kept_colours().reshape(-1, 3))
+        if self._csr_pair is not None:
+            product = self._csr_pair[0] @ values
+        else:
+            product = torch.from_numpy(self._unpack() @ values.numpy())
+        return product.mul_(self._stored_colors().reshape(-1, 3))
 
     def transposed_times(self, values: Tensor) -> Tensor:
-        coloured = values * self._kept_colours().reshape(-1, 3)
-        ours = self._both_ways
-        return (
-            ours[1] @ coloured
-            if ours
-            else torch.from_numpy(self._shares().T @ coloured.numpy())
-        )
+        """Return the transposed matrix times (rows, 3): (columns, 3)."""
+        colored = values * self._stored_colors().reshape(-1, 3)
+        if self._csr_pair is not None:
+            return self._csr_pair[1] @ colored
+        return torch.from_numpy(self._unpack().T @ colored.numpy())
 
-    def _shares(self) -> scipy.sparse.csr_matrix:
-        assert self._kept is not None, "finish it first"
-        shares, columns, begin = self._kept
+    def _unpack(self) -> scipy.sparse.csr_matrix:
+        """Return the matrix of fractions in float32."""
+        assert self._packed is not None, "finish it first"
+        fractions, columns, row_starts = self._packed
         return scipy.sparse.csr_matrix(
-            (shares.astype(np.float32), columns.astype(np.int32), begin), self._shape
+            (fractions.astype(np.float32), columns.astype(np.int32), row_starts),
+            self._shape,
         )
 
 
 class TextureTransport:
-    """From a change of a base colour (height and width in texels) to the change of
-    radiance (in pixels), and back. Filled by `add`, then finished; if `small`, in as
-    little memory as there is room for one of many matrices.
+    """Linear map from a change of a base color to the change of radiance, and back.
+
+    It is filled by `add`, and then `finish` is called once.
+
+    Args:
+        picture: height and width of the radiance in pixels.
+        texture: height and width of the base color in texels.
+        small: take as little memory as there is room for one of many matrices.
     """
 
     def __init__(
@@ -190,16 +216,14 @@ class TextureTransport:
         self._picture = picture
         self._texture = texture
         self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
-        # texels of each cell along one side, of which the last one may have fewer
-        sides = zip(texture, self._cells, strict=True)
-        tall, wide = (
-            (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).float()
-            for texels, cells in sides
-        )
-        self._in_cell = (tall[:, None] * wide[None, :])[:, :, None]
-        pixels = picture[0] * picture[1]
-        self._first = ColouredRows(pixels, texture[0] * texture[1], small)
-        self._later = ColouredRows(pixels, self._cells[0] * self._cells[1], small)
+        cell_heights = _cell_sizes(texture[0], self._cells[0])
+        cell_widths = _cell_sizes(texture[1], self._cells[1])
+        self._texels_in_cell = (cell_heights[:, None] * cell_widths[None, :])[
+            :, :, None
+        ]
+        n_pixels = picture[0] * picture[1]
+        self._first = ColouredRows(n_pixels, texture[0] * texture[1], small)
+        self._later = ColouredRows(n_pixels, self._cells[0] * self._cells[1], small)
 
     @property
     def entries(self) -> int:
@@ -210,59 +234,65 @@ class TextureTransport:
         return self._first.bytes + self._later.bytes
 
     def add(self, vertices: Sequence[Vertices], share: float) -> None:
-        """Add a pass of paths, vertices by their place in the path; it counts as this
-        share of the samples.
+        """Add a pass of paths.
+
+        Args:
+            vertices: by their index in the path.
+            share: the fraction of all samples that the pass has.
         """
-        rows, columns = self._cells
+        n_rows, n_columns = self._cells
         for vertex in vertices:
-            seen = vertex.only(vertex.sharp)
-            scattered = vertex.only(~vertex.sharp)
-            texels, shares = bilinear(seen.uv.numpy(), self._texture)
-            weights = seen.weight.numpy() * np.float32(share)
+            sharp = vertex.only(vertex.sharp)
+            texels, fractions = bilinear(sharp.uv.numpy(), self._texture)
             self._first.add(
-                seen.pixel.numpy(), texels.astype(np.int64), shares, weights
+                sharp.pixel.numpy(),
+                texels.astype(np.int64),
+                fractions,
+                sharp.weight.numpy() * np.float32(share),
             )
+            scattered = vertex.only(~vertex.sharp)
             uv = scattered.uv.numpy() % 1.0
-            column = np.floor(uv[:, 0] * columns).astype(np.int64).clip(0, columns - 1)
-            row = np.floor(uv[:, 1] * rows).astype(np.int64).clip(0, rows - 1)
-            cell = (row * columns + column)[:, None]
-            weights = scattered.weight.numpy() * np.float32(share)
+            column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
+            row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
+            cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
+            cell = cell[:, None]
             self._later.add(
                 scattered.pixel.numpy(),
                 cell,
                 np.ones_like(cell, dtype=np.float32),
-                weights,
+                scattered.weight.numpy() * np.float32(share),
             )
 
     def finish(self, smooth: Smooth | None = None) -> None:
-        """End the collecting. `smooth` takes the noise out of a picture: what a change
-        of all texels by one does to the picture is one. None leaves the colours of the
-        rows as they were sampled.
+        """Get ready to multiply.
+
+        Args:
+            smooth: removes the noise from an image: the change of the image when all
+                texels change by one is such an image. None leaves the colors of the
+                rows as they were sampled.
         """
         self._first.finish(self._picture, smooth)
         self._later.finish(self._picture, smooth)
 
     def __call__(self, change: Tensor) -> Tensor:
-        """Return the change of radiance (H, W, 3) for a change of the base colour (h,
-        w, 3); differentiable.
+        """Return the change of radiance (H, W, 3) for a change of the base color.
+
+        That is (h, w, 3); the result is differentiable.
         """
         radiance: Tensor = LinearMap.apply(self.times, self.transposed_times, change)  # type: ignore[no-untyped-call]
         return radiance
 
     def times(self, change: Tensor) -> Tensor:
         """Return J times (h, w, 3), as (H, W, 3)."""
-        rows, columns = self._cells
-        below, right = (
-            COARSE * cells - texels
-            for cells, texels in zip(self._cells, self._texture, strict=True)
-        )
-        whole = (
-            functional.pad(change, (0, 0, 0, right, 0, below))
-            if right or below
-            else change
-        )
-        across = whole.reshape(rows * COARSE, columns, COARSE, 3).sum(dim=2)
-        pooled = across.reshape(rows, COARSE, columns, 3).sum(dim=1) / self._in_cell
+        n_rows, n_columns = self._cells
+        bottom = COARSE * n_rows - self._texture[0]
+        right = COARSE * n_columns - self._texture[1]
+        padded = change
+        if right or bottom:
+            padded = functional.pad(change, (0, 0, 0, right, 0, bottom))
+        row_sums = padded.reshape(n_rows * COARSE, n_columns, COARSE, 3).sum(dim=2)
+        cell_sums = row_sums.reshape(n_rows, COARSE, n_columns, 3).sum(dim=1)
+        pooled = cell_sums / self._texels_in_cell
         radiance = self._first.times(change.reshape(-1, 3)).add_(
             self._later.times(pooled.reshape(-1, 3))
         )
@@ -271,74 +301,89 @@ class TextureTransport:
     def transposed_times(self, cotangent: Tensor) -> Tensor:
         """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
         flat = cotangent.reshape(-1, 3)
-        near = self._first.transposed_times(flat).reshape(*self._texture, 3)
-        far = (
-            self._later.transposed_times(flat).reshape(*self._cells, 3) / self._in_cell
-        )
-        spread = far[:, None, :, None].expand(-1, COARSE, -1, COARSE, -1)
-        return (
-            near
-            + spread.reshape(self._cells[0] * COARSE, -1, 3)[
-                : self._texture[0], : self._texture[1]
-            ]
-        )
+        first = self._first.transposed_times(flat).reshape(*self._texture, 3)
+        later = self._later.transposed_times(flat).reshape(*self._cells, 3)
+        later = later / self._texels_in_cell
+        spread = later[:, None, :, None].expand(-1, COARSE, -1, COARSE, -1)
+        spread = spread.reshape(self._cells[0] * COARSE, -1, 3)
+        return first + spread[: self._texture[0], : self._texture[1]]
+
+
+def _cell_sizes(n_texels: int, n_cells: int) -> Tensor:
+    """Return how many texels each cell has along one axis; the last may have fewer."""
+    first_texels = COARSE * torch.arange(n_cells)
+    return (n_texels - first_texels).clamp(max=COARSE).float()
 
 
 def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
-    """The same for torch, whose products with it are twice as fast as scipy's."""
-    parts = [
-        torch.from_numpy(part) for part in (matrix.indptr, matrix.indices, matrix.data)
-    ]
+    """Convert a sparse matrix to torch, whose products are twice as fast as scipy's."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
         return torch.sparse_csr_tensor(
-            parts[0], parts[1], parts[2], matrix.shape, check_invariants=False
+            torch.from_numpy(matrix.indptr),
+            torch.from_numpy(matrix.indices),
+            torch.from_numpy(matrix.data),
+            matrix.shape,
+            check_invariants=False,
         )
 
 
 def bilinear(
     uv: Floats, texture: tuple[int, int]
 ) -> tuple[npt.NDArray[np.int32], Floats]:
-    """The four texels (n, 4) of the bilinear lookup at texture coordinates (n, 2),
-    which repeats at the border, by their places in the flat texture; and their shares
-    (n, 4).
+    """Return the four texels of each bilinear look-up, and their fractions.
+
+    The look-up repeats at the border.
+
+    Args:
+        uv: (n, 2) texture coordinates.
+        texture: height and width in texels.
+
+    Returns:
+        (n, 4) indices in the flat texture, and (n, 4) fractions.
     """
-
-    def both(
-        at: Floats, count: int
-    ) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
-        first = np.floor(at).astype(np.int32)
-        share = (at - np.floor(at)).astype(np.float32)
-        return [first % count, (first + 1) % count], [1.0 - share, share]
-
     height, width = texture
-    (across, wide) = both(uv[:, 0] * width - 0.5, width)
-    (down, tall) = both(uv[:, 1] * height - 0.5, height)
-    columns = np.stack(
-        [row * width + column for row in down for column in across], axis=1
-    )
-    return columns, np.stack([high * broad for high in tall for broad in wide], axis=1)
+    columns, column_fractions = _linear(uv[:, 0] * width - 0.5, width)
+    rows, row_fractions = _linear(uv[:, 1] * height - 0.5, height)
+    texels = [row * width + column for row in rows for column in columns]
+    fractions = [
+        row_fraction * column_fraction
+        for row_fraction in row_fractions
+        for column_fraction in column_fractions
+    ]
+    return np.stack(texels, axis=1), np.stack(fractions, axis=1)
+
+
+def _linear(
+    position: Floats, count: int
+) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
+    """Return the two neighbours of positions among `count`, and their fractions."""
+    first = np.floor(position).astype(np.int32)
+    fraction = (position - np.floor(position)).astype(np.float32)
+    return [first % count, (first + 1) % count], [1.0 - fraction, fraction]
 
 
 SPP = 128
-"""Samples a pixel of the paths whose vertices become the matrix and which make the base
-picture; what noise the denoiser leaves in it is in all predicted pictures.
+"""Samples per pixel of the paths that make the matrix and the base image.
+
+The noise that the denoiser leaves in the base image is in all predicted images.
 """
 PASS = 2**20  # samples of all pixels in one pass; its vertices are held in memory
-MOST = 4.0  # factor by which the noise of the base picture corrects a row at most
+MOST = 4.0  # largest factor by which the noise of the base image corrects a row
 TOO_LARGE = "the matrix would take more than"
 LINEAR = (".base_color", PATTERN)
-"""What the names of inputs end in to which radiance is linear, but for light that meets
-a base colour twice.
+"""Ends of names of inputs to which radiance is linear.
+
+That is but for light that meets a base color twice.
 """
 
 Inputs = Mapping[str, Tensor]
 SomeNames = Collection[str] | None
-Tick = Callable[[int], None]  # told of samples a pixel as they are traced
+Tick = Callable[[int], None]  # called with samples per pixel as they are traced
 
 
 def untold(samples: int) -> None:
-    """Tell nobody."""
+    """Ignore progress: the default of what is called with samples per pixel."""
 
 
 class TransportTooLargeError(Exception):
@@ -351,22 +396,32 @@ class Linearised:
 
     transports: Mapping[str, TextureTransport]  # by input, finished
     there: dict[str, Tensor]  # the inputs where it was linearised
-    applied: Inputs  # those that belong to the picture, not to the scene
-    # the picture there, linear radiance, and coverage where there is a backdrop
+    applied: Inputs  # those that belong to the finished image, not to the scene
+    # the image there, linear radiance, and coverage where there is a backdrop
     base: Halves
-    non_finite: int = 0
+    non_finite: int = 0  # values that were not finite
 
 
 class LinearRenderer(Predictor):
-    """Predicts pictures by a matrix for each base colour, linearised at u with the
-    noise of a seed, of so many samples a pixel, of which `tick` is told as they are
-    traced (`samples_to_collect` in all). If `quick`, the noise is taken out of the rows
-    of the matrix as out of the base picture, which they resemble, and not by the
-    denoiser. `names` are the inputs that get a matrix, None for all base colours that
-    the space sets; without any there is the base picture alone. Inputs that are `light`
-    stand in the place of those of u. Of what was `collected` elsewhere with the same
-    arguments nothing is traced. Raises TransportTooLargeError: a matrix would take more
-    than `MOST_BYTES`.
+    """Predict images by a matrix for each base color, linearised at a configuration.
+
+    Args:
+        traced: renderer of the scene.
+        u: (d,) configuration at which it is linearised.
+        seed: of the noise.
+        tick: is called with samples per pixel as they are traced; there are
+            `samples_to_collect` in all.
+        spp: samples per pixel.
+        quick: remove the noise from the rows of the matrix as from the base image,
+            which they resemble, and not by the denoiser.
+        names: inputs that get a matrix; None for all base colors that the space sets.
+            Without any there is the base image alone.
+        light: inputs that replace those of u.
+        collected: what was collected elsewhere with the same arguments; then nothing is
+            traced.
+
+    Raises:
+        TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
     """
 
     def __init__(
@@ -385,7 +440,7 @@ class LinearRenderer(Predictor):
         super().__init__(traced)
         if collected is None:
             with torch.no_grad():
-                collected = _collected(
+                collected = _collect(
                     traced.like(), u, seed, tick, spp, quick, names, light
                 )
         self.collected = collected
@@ -394,21 +449,19 @@ class LinearRenderer(Predictor):
 
     @property
     def entries(self) -> int:
-        return sum(
-            transport.entries for transport in self.collected.transports.values()
-        )
+        transports = self.collected.transports.values()
+        return sum(transport.entries for transport in transports)
 
     @property
     def bytes(self) -> int:
         height, width = self.traced.formation.resolution
-        return (
-            sum(transport.bytes for transport in self.collected.transports.values())
-            + 8 * height * width
-        )
+        transports = self.collected.transports.values()
+        return sum(transport.bytes for transport in transports) + 8 * height * width
 
     def let_go(self, space: InputSpace) -> None:
-        """Let go of the scene, which only tracing takes; the pictures stay, and `space`
-        is the same without a scene.
+        """Release the scene, which only tracing needs; the images stay.
+
+        `space` is the same space without a scene.
         """
         self.traced = self.traced.like()
         del self.traced.scene
@@ -419,21 +472,20 @@ class LinearRenderer(Predictor):
         radiance = base[..., :3]
         for name, transport in self.collected.transports.items():
             radiance = radiance + transport(inputs[name] - self.there[name])
-        return (
-            radiance
-            if base.shape[-1] == 3
-            else torch.cat([radiance, base[..., 3:]], dim=-1)
-        )
+        if base.shape[-1] == 3:
+            return radiance
+        return torch.cat([radiance, base[..., 3:]], dim=-1)
 
     def shown(self, inputs: Inputs, u: Tensor) -> Tensor:
-        """The picture (H, W, 3) sRGB of scene inputs, of which only those to which
-        radiance is linear count; what controls do to the finished picture comes from
-        `u`.
+        """Return the image (H, W, 3) sRGB of scene inputs.
+
+        Only inputs to which radiance is linear count; what controls do to the finished
+        image comes from `u`.
         """
         return self.traced.finished(self.radiance(inputs), self.collected.applied, u)
 
 
-def _collected(
+def _collect(
     renderer: Renderer,
     u: Tensor,
     seed: int,
@@ -443,84 +495,100 @@ def _collected(
     names: SomeNames,
     light: Inputs,
 ) -> Linearised:
-    before = renderer.non_finite
-    (height, width) = renderer.formation.resolution
+    """Trace what a `LinearRenderer` needs; arguments as there."""
+    non_finite_before = renderer.non_finite
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
     applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
-    traced = {
-        name: value for name, value in inputs.items() if name not in ON_PICTURE
-    } | dict(light)
+    traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+    traced |= dict(light)
     linear = linear_inputs(renderer) if names is None else names
     there = {name: value.clone() for name, value in traced.items() if name in linear}
     transports = {
         name: TextureTransport(
-            (height, width), (value.shape[0], value.shape[1]), small=quick
+            renderer.formation.resolution,
+            (value.shape[0], value.shape[1]),
+            small=quick,
         )
         for name, value in there.items()
     }
     hide = "backdrop.color" in applied
-
-    def finished(base: Tensor) -> Linearised:
-        return Linearised(
-            transports,
-            there,
-            applied,
-            Halves(base, small=quick),
-            renderer.non_finite - before,
-        )
-
     if not transports:
         base = renderer.rendered(traced, seed, spp, hide)
         tick(spp)
-        return finished(base)
-    samples, count = passes(renderer, spp)
-    traces: list[Paths] = []
+    else:
+        paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
+        radiance = paths.radiance - paths.background if hide else paths.radiance
+        radiance = renderer.finite(radiance)
+        base, smooth = _make_smooth(renderer, radiance, paths, quick)
+        for transport in transports.values():
+            transport.finish(smooth)
+        if hide:
+            base = torch.cat([base, paths.coverage], dim=-1)
+    return Linearised(
+        transports=transports,
+        there=there,
+        applied=applied,
+        base=Halves(base, small=quick),
+        non_finite=renderer.non_finite - non_finite_before,
+    )
+
+
+def _fill_transports(
+    renderer: Renderer,
+    transports: Mapping[str, TextureTransport],
+    traced: Inputs,
+    seed: int,
+    tick: Tick,
+    spp: int,
+) -> Paths:
+    """Trace paths for each matrix and add them; return the mean images of all."""
+    samples, n_passes = passes(renderer, spp)
+    height, width = renderer.formation.resolution
+    images: list[Paths] = []
     for name, transport in transports.items():
-        for number in range(count):
-            noise = seeds.stream(seed, f"transport {name}", number)
-            paths = renderer.scene.transport(traced, name, noise, samples)
-            transport.add(paths.vertices, 1.0 / count)
-            if sum(
-                kept.bytes for kept in transports.values()
-            ) + 8 * height * width > scaled(MOST_BYTES):
+        for index in range(n_passes):
+            noise_seed = seeds.stream(seed, f"transport {name}", index)
+            paths = renderer.scene.transport(traced, name, noise_seed, samples)
+            transport.add(paths.vertices, 1.0 / n_passes)
+            size = sum(filled.bytes for filled in transports.values())
+            if size + 8 * height * width > scaled(MOST_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB"
                 )
-            traces.append(replace(paths, vertices=[]))
+            images.append(replace(paths, vertices=[]))
             tick(samples)
-    seen = mean_of(traces)
-    radiance = clean = renderer.finite(
-        seen.radiance - seen.background if hide else seen.radiance
-    )
-    smooth: Smooth | None = None
-    if renderer.formation.denoiser == "oidn":
-        clean = denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
-        ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
-        even = (
-            (seen.albedo.sum(dim=-1, keepdim=True) > 0.0)
-            .to(torch.float32)
-            .expand(-1, -1, 3)
-            .contiguous()
-        )
+    return mean_of(images)
 
-        def smooth(picture: Tensor) -> Tensor:
-            return (
-                picture * ratio
-                if quick
-                else denoise(picture.contiguous(), even, seen.normal)
-            )
 
-    for transport in transports.values():
-        transport.finish(smooth)
-    return finished(torch.cat([clean, seen.coverage], dim=-1) if hide else clean)
+def _make_smooth(
+    renderer: Renderer, radiance: Tensor, paths: Paths, quick: bool
+) -> tuple[Tensor, Smooth | None]:
+    """Denoise the base image; return it, and what removes the noise from a row's image.
+
+    Without a denoiser the image stays as it is, and there is no such function.
+    """
+    if renderer.formation.denoiser != "oidn":
+        return radiance, None
+    clean = denoise(radiance, paths.albedo.clamp(0.0, 1.0), paths.normal)
+    ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
+    is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
+    even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
+
+    def smooth(image: Tensor) -> Tensor:
+        if quick:
+            return image * ratio
+        return denoise(image.contiguous(), even_albedo, paths.normal)
+
+    return clean, smooth
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:
+    """Return the names of a scene's inputs to which radiance is linear."""
     return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
 
 
 def passes(renderer: Renderer, spp: int) -> tuple[int, int]:
-    """Samples a pixel of a pass, and how many passes there are."""
+    """Return the samples per pixel of a pass, and the number of passes."""
     height, width = renderer.formation.resolution
     samples = max(1, min(spp, PASS // (height * width)))
     return samples, -(-spp // samples)
