@@ -177,8 +177,7 @@ def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
     return table
 
 
-# ---- label files
-# -----------------------------------------------------------------------------------------------------
+# ---- label files ----
 
 
 def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ...]:

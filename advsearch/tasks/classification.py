@@ -215,7 +215,7 @@ class Classification(ClassTask):
         else:
             k = min(count, logits.shape[1])
             top_probabilities, top_classes = probabilities.topk(k, dim=1)
-        predictions_of_images = []
+        predictions_of_images: list[tuple[Prediction, ...]] = []
         for classes, class_probabilities in zip(
             top_classes.tolist(), top_probabilities.tolist(), strict=True
         ):

@@ -678,7 +678,7 @@ class Detection(ClassTask):
         self, output: Sequence[Detections], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
         """See `Task.predictions`: the boxes with the best scores."""
-        predictions_of_images = []
+        predictions_of_images: list[tuple[Prediction, ...]] = []
         for detections in self._read(output):
             if self._is_broken(detections):
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
@@ -717,7 +717,7 @@ class Detection(ClassTask):
         for box, label, score in listed(
             detections, MOST, self._min_score, self.suppression
         ):
-            pixels = [
+            pixels: list[JsonValue] = [
                 round(fraction * size, 1)
                 for fraction, size in zip(box, scale, strict=True)
             ]
