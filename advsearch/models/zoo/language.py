@@ -301,7 +301,9 @@ class _Speaker(nn.Module):
         return tokens_of_names
 
     def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
-        """Return the network's inputs for a gray image of (height, width) pixels and the question."""
+        """Return the network's inputs for a gray image of (height, width) pixels and the
+        question.
+        """
         if side not in self._prompts:
             self._prompts[side] = self._inputs(np.full((*side, 3), 128, np.uint8))
         return self._prompts[side]
