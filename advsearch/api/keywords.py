@@ -117,7 +117,7 @@ RAISED = "InputError: anything that the caller can put right; nothing is written
 errors.
 """
 Function = TypeVar("Function", bound=Callable[..., Any])
-Made = TypeVar("Made", bound=Config)
+ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 def asks(config: type[Config]) -> Callable[[Function], Function]:
@@ -225,13 +225,15 @@ def _check_name(function_name: str, key: str, value: object) -> None:
 
 
 WRITTEN = {
-    "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | "
-                                                         "Names | None",
-    "resolution": "int | str | tuple[int, int] | None", "set_": "Mapping[str, float | str | Sequence[float]] | None",
-    "estimators": "str | Mapping[str, str]", "value_range": "str | Sequence[float] | "
-                                                            "None",
-}  # fmt: skip
-"""What may be written for some settings beside what they become."""
+    "controls": "Controls",
+    "over": "Controls",
+    "label": "int | np.integer[Any] | Names | None",
+    "resolution": "int | str | tuple[int, int] | None",
+    "set_": "Mapping[str, float | str | Sequence[float]] | None",
+    "estimators": "str | Mapping[str, str]",
+    "value_range": "str | Sequence[float] | None",
+}
+"""Annotations of settings that take other values in Python than they are stored as."""
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
 """Settings that may be a list of names."""
 
@@ -290,7 +292,7 @@ def _docstring(
     return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {RAISED}"
 
 
-def configured(config: type[Made], **keywords: Any) -> Made:
+def configured(config: type[ConfigType], **keywords: Any) -> ConfigType:
     """Create a configuration from settings as Python callers pass them; None counts as
     not passed.
 

@@ -69,9 +69,7 @@ class Features:
 
 
 def features_of(model: Model) -> Features:
-    """Return the penultimate features of a model, found by showing it grey images; see
-    the module's docstring.
-    """
+    """Find the penultimate features of a model by running it on gray images; see the module."""
     grey = torch.full((min(2, model.batch_limits[1]), *model.input_size, 3), 0.5)
     with torch.no_grad():
         x = model.prepared(grey)
@@ -140,7 +138,7 @@ def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
 
 
 def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
-    """Those of a module that calls its layers."""
+    """Return the calls of the layers of a module, or of one layer."""
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(
         network, torch.jit.ScriptModule
@@ -179,7 +177,7 @@ def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
 
 
 def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
-    """Those of a graph of operators, such as a program of `torch.export`."""
+    """Return the calls of the layers of a graph of operators, such as a `torch.export` program."""
     calls: list[_Call] = []
 
     class Reader(fx.Interpreter):
@@ -211,10 +209,11 @@ PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has
-    one of `PARTS`; None where there are none. Maps (N, D, H, W) are averaged over their
-    positions. Of several tokens (N, T, D), the first stands for the picture if `token`,
-    otherwise their mean.
+    """Return the features (N, D) in an output of a network, a tensor or what has one of
+    `PARTS`; None if there are none.
+
+    Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the
+    first is taken with `token`, otherwise their mean.
     """
     for part in PARTS:
         value = (

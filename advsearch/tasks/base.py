@@ -29,7 +29,7 @@ from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW, Outcome, get_
 Output = Any
 # The ground truth of a scene, as its task needs it: right classes, a number, boxes.
 Truth = Any
-Own = TypeVar("Own", bound="Task")
+TaskType = TypeVar("TaskType", bound="Task")
 
 
 @dataclass(frozen=True)
@@ -378,7 +378,9 @@ class Task(ABC):
         """
         return False
 
-    def after_calibration(self: Own, output: Output, truth: Truth | None) -> Own:
+    def after_calibration(
+        self: TaskType, output: Output, truth: Truth | None
+    ) -> TaskType:
         """Return the task with what the output for a clean image of the scene shows.
 
         Args:
@@ -403,8 +405,12 @@ class Task(ABC):
         return None if self.reads_logits else self.read
 
     def on(
-        self: Own, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> Own:
+        self: TaskType,
+        model: Model,
+        *,
+        target: str | None = None,
+        minimise: bool = False,
+    ) -> TaskType:
         """Return the task for one model, with what is sought.
 
         Args:
@@ -419,7 +425,7 @@ class Task(ABC):
             raise InputError(f"target: task {self.name} has none; leave it out")
         return replace(self, minimise=minimise)
 
-    def seeking(self: Own, objective: str) -> Own:
+    def seeking(self: TaskType, objective: str) -> TaskType:
         """Return the task with one of its objectives, which may define what counts as success."""
         return self
 

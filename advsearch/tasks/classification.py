@@ -21,7 +21,7 @@ from advsearch.options import FROM_RUN, NOT_A_NUMBER
 from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
 Labels = tuple[int, ...]
-Own = TypeVar("Own", bound="ClassTask")
+ClassTaskType = TypeVar("ClassTaskType", bound="ClassTask")
 
 NO = "no "  # prefix of the label of an object that is not found
 
@@ -47,8 +47,12 @@ class ClassTask(Task):
             )
 
     def on(
-        self: Own, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> Own:
+        self: ClassTaskType,
+        model: Model,
+        *,
+        target: str | None = None,
+        minimise: bool = False,
+    ) -> ClassTaskType:
         """See `Task.on`: the target is one of the model's classes, or several.
 
         Raises:

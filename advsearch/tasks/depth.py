@@ -157,7 +157,7 @@ class Depth(Task):
     size: float = 0.0
     seek: str = ""
     # Which of `KINDS` the network states.
-    seen_kind: str = field(default="", metadata=tasks.FROM_RUN)
+    resolved_kind: str = field(default="", metadata=tasks.FROM_RUN)
     # What the user has to state before predictions can be judged.
     missing: str = field(default="", metadata=tasks.FROM_RUN)
 
@@ -235,7 +235,7 @@ class Depth(Task):
     ) -> Depth:
         """See `Task.after_calibration`: find out what the values are."""
         kind = self.kind or next(iter(output[0]))
-        return replace(self, seen_kind=kind, missing=self._missing(kind, truth))
+        return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
     def _missing(self, kind: str, truth: Distances | None) -> str:
         """Return what the user has to state before predictions can be judged, "" if nothing."""
@@ -268,12 +268,10 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        if not self.seen_kind:
+        if not self.resolved_kind:
             return ()
-        text = (
-            f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
-        )
-        if self.seen_kind != METRIC:
+        text = f"The model's numbers are read as {self.resolved_kind}: {KINDS[self.resolved_kind]}"
+        if self.resolved_kind != METRIC:
             return (
                 f"{text}, which are found by least squares on what is seen beside the "
                 "object.",

@@ -140,16 +140,16 @@ class Detection(ClassTask):
     # of the model, (height, width) in pixels
     input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
     # Inferred from the model's outputs; "" as long as they leave it open.
-    seen_unit: str = field(default="", metadata=FROM_RUN)
-    seen_order: str = field(default="", metadata=FROM_RUN)
+    inferred_unit: str = field(default="", metadata=FROM_RUN)
+    inferred_order: str = field(default="", metadata=FROM_RUN)
     # Only the values distinguish scores from classes in the outputs.
-    undecided: bool = field(default=False, metadata=FROM_RUN)
+    is_order_ambiguous: bool = field(default=False, metadata=FROM_RUN)
     # (A, B) of an output that is read as a YOLO head.
-    shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
+    head_shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
     # The outputs contain mask coefficients, which are ignored.
-    masks: bool = field(default=False, metadata=FROM_RUN)
+    ignores_masks: bool = field(default=False, metadata=FROM_RUN)
     # The network declares the format of its boxes, see `KNOWN`.
-    told: bool = field(default=False, metadata=FROM_RUN)
+    has_declared_format: bool = field(default=False, metadata=FROM_RUN)
     # The model fills its output with rows of NaN when it detects nothing.
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
     # Why the boxes may be read wrongly; "" if nothing is odd.
@@ -208,14 +208,14 @@ class Detection(ClassTask):
             task,
             input_size=model.input_size,
             fills_with_nan=fills_with_nan,
-            told=is_declared,
+            has_declared_format=is_declared,
         )
         return task._infer_format(output)
 
     @property
     def calibrates(self) -> bool:
-        knows_format = self.told or bool(self.boxes and self.unit)
-        needs_order = self.undecided and not self.order
+        knows_format = self.has_declared_format or bool(self.boxes and self.unit)
+        needs_order = self.is_order_ambiguous and not self.order
         return not knows_format or needs_order
 
     def after_calibration(
@@ -258,26 +258,26 @@ class Detection(ClassTask):
         grids = [detections["raw"] for detections in output if "raw" in detections]
         is_ambiguous = any("either" in detections for detections in output)
         order = self._infer_order(output)
-        has_masks = self.masks or self._has_mask_coefficients(output, order)
+        has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
         task = replace(
             self,
-            seen_order=order or self.seen_order,
-            undecided=self.undecided or is_ambiguous,
-            shape=tuple(grids[0].shape) if grids else self.shape,
-            masks=has_masks,
+            inferred_order=order or self.inferred_order,
+            is_order_ambiguous=self.is_order_ambiguous or is_ambiguous,
+            head_shape=tuple(grids[0].shape) if grids else self.head_shape,
+            ignores_masks=has_masks,
         )
         resolved = task._resolve_grids(output)
-        if self.told:
+        if self.has_declared_format:
             unit = UNITS[1]
         else:
-            unit = unit_in(strongest_boxes(resolved)) or self.seen_unit
+            unit = unit_in(strongest_boxes(resolved)) or self.inferred_unit
         has_nan_rows = any(
             "blank" in detections and len(detections["boxes"])
             for detections in resolved
         )
         return replace(
             task,
-            seen_unit=unit,
+            inferred_unit=unit,
             fills_with_nan=self.fills_with_nan or has_nan_rows,
         )
 
@@ -324,12 +324,12 @@ class Detection(ClassTask):
 
     @property
     def ambiguities(self) -> str:
-        if self.undecided and not (self.order or self.seen_order):
+        if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
                 f"the model does; {ASK_ORDER}"
             )
-        if not (self.unit or self.seen_unit):
+        if not (self.unit or self.inferred_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in "
                 "noise and in the clean scene "
@@ -342,19 +342,19 @@ class Detection(ClassTask):
     @property
     def remarks(self) -> tuple[str, ...]:
         remarks = []
-        order = as_option(f"order: {self.seen_order}")
+        order = as_option(f"order: {self.inferred_order}")
         is_order_inferred = not self.order
-        if self.shape and is_order_inferred:
+        if self.head_shape and is_order_inferred:
             remarks.append(
-                f"The detector's output of {self.shape} is read as a YOLO's: {order}."
+                f"The detector's output of {self.head_shape} is read as a YOLO's: {order}."
             )
-        if self.seen_order in QUERIES and is_order_inferred:
+        if self.inferred_order in QUERIES and is_order_inferred:
             remarks.append(f"The detector's output is read as a DETR's: {order}.")
-        if self.masks:
+        if self.ignores_masks:
             remarks.append(
                 "The detector's masks are left out: its boxes and scores are read."
             )
-        if self.undecided and self.seen_order and is_order_inferred:
+        if self.is_order_ambiguous and self.inferred_order and is_order_inferred:
             remarks.append(
                 "Scores and classes of the detector's boxes are told apart by their "
                 f"values: they are read as {order}."
@@ -366,9 +366,9 @@ class Detection(ClassTask):
     @property
     def _reading(self) -> Reading:
         """How the model's boxes are read: by the options, else as inferred."""
-        order = self._head or self.seen_order
+        order = self._head or self.inferred_order
         default_form = "cxcywh" if order in TOLD_BY_CLASSES else FORMS[0]
-        unit = self.unit or self.seen_unit or UNITS[1]
+        unit = self.unit or self.inferred_unit or UNITS[1]
         return Reading(self.boxes or default_form, unit, self.input_size)
 
     @property
@@ -519,7 +519,7 @@ class Detection(ClassTask):
         n_classes = len(self.labels) or None
         try:
             return [
-                outputs.settled(detections, self.seen_order, n_classes)
+                outputs.settled(detections, self.inferred_order, n_classes)
                 for detections in output
             ]
         except ValueError as error:

@@ -39,7 +39,7 @@ class Gallery:
         owners: (R,) int64, the index of each image's name.
         paths: of each image, relative to the folder.
         features: (R, D), of length 1.
-        seen_by: the network that embedded them, and its preprocessing.
+        embedder: the network that embedded them, and its preprocessing.
         head: of `linear`: weights (names, D) and biases (names,).
     """
 
@@ -47,7 +47,7 @@ class Gallery:
     owners: Tensor
     paths: tuple[str, ...]
     features: Tensor
-    seen_by: tuple[Any, ...] = field(repr=False)
+    embedder: tuple[Any, ...] = field(repr=False)
     head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
     def cosines(self, features: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
         owners=owners,
         paths=tuple(path.relative_to(root).as_posix() for path in paths),
         features=features,
-        seen_by=(model.module, model.preprocessing),
+        embedder=(model.module, model.preprocessing),
         head=fitted(features, owners) if linear else None,
     )
 
@@ -328,7 +328,7 @@ class Similarity(tasks.Classification):
             )
         task = super().on(model, target=target, minimise=minimise)
         embedder = (model.module, model.preprocessing)
-        is_embedded = self.gallery is not None and self.gallery.seen_by == embedder
+        is_embedded = self.gallery is not None and self.gallery.embedder == embedder
         if is_embedded or not self.references:
             return task
         gallery = embedded(self.references, model, linear=self.method == "linear")
