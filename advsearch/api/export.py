@@ -244,29 +244,42 @@ def _charts(
     is_printed = raster.covered
     if faces is not None:
         is_printed = is_printed & np.isin(raster.face, faces)
-    labels, count = ndimage.label(is_printed)
-    boxes = ndimage.find_objects(labels)
-    n_texels = [int((labels[boxes[k]] == k + 1).sum()) for k in range(count)]
-    order = sorted(range(count), key=lambda index: -n_texels[index])
-    for number, index in enumerate(order, 1):
-        box = boxes[index]
-        inside = labels[box] == index + 1
+    charts = _label_charts(is_printed)
+    for number, (box, inside) in enumerate(charts, 1):
         measured = _texel_size(positions[box] * scale, inside)
         if measured is None:
             continue
         texel_size, distortion = measured
-        nearest_inside = ndimage.distance_transform_edt(
-            ~inside, return_distances=False, return_indices=True
-        )
-        image = texture[box][tuple(nearest_inside)]
+        image = _extend_inside(texture[box], inside)
         is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
         if is_mirrored:
             image = image[:, ::-1]
             inside = inside[:, ::-1]
-        title = name if count == 1 else f"{name}, piece {number}"
+        title = name if len(charts) == 1 else f"{name}, piece {number}"
         if distortion >= 0.005:
             title += f" (sizes within it differ by {100 * distortion:.0f} %)"
         yield _piece(title, image, texel_size, inside)
+
+
+def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
+    """Find the connected parts of a mask (h, w), the largest first.
+
+    Returns:
+        The bounding box of each part, and its mask inside the box.
+    """
+    labels, count = ndimage.label(is_printed)
+    boxes = ndimage.find_objects(labels)
+    charts = [(boxes[k], labels[boxes[k]] == k + 1) for k in range(count)]
+    return sorted(charts, key=lambda chart: -int(chart[1].sum()))
+
+
+def _extend_inside(image: Floats, inside: Mask) -> Floats:
+    """Replace the pixels outside a mask by the nearest ones inside."""
+    nearest_inside = ndimage.distance_transform_edt(
+        ~inside, return_distances=False, return_indices=True
+    )
+    extended: Floats = image[tuple(nearest_inside)]
+    return extended
 
 
 def _texel_size(

@@ -26,7 +26,7 @@ from advsearch.questions.attack.carry_out import (
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.job import KIND, OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
 from advsearch.runs.store import NAME, Row, Store
@@ -138,25 +138,32 @@ def _render_sweep(
         )
     progress.stage("rendering pictures", len(images))
     for image in images:
-        view, (query, *_) = scenes.asked(image)
-        scene = job.places[view.number]
         rows = sorted(rows_of_image[image], key=lambda row: row.step)
-        picture = view.picture(query)
-        first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
-        stored = first_model[0] if first_model else None
-        same = stored in (None, view.problems[0].judge(picture, query.u).right)
-        yield RenderedRow(
-            name=f"{image:06d}",
-            picture=picture,
-            task=job.tasks[0],
-            facts=object_facts(scene.scene, scene.object, job.config),
-            renderer=view.renderers[job.sizes[0]],
-            u=query.u,
-            rows=rows,
-            values=rows[0].values,
-            same=same,
-        )
+        yield _render_sweep_image(scenes, image, rows)
         progress.advance(1)
+
+
+def _render_sweep_image(
+    scenes: OpenScenes, image: int, rows: Sequence[Row]
+) -> RenderedRow:
+    """Render one image of a sweep by its index."""
+    job = scenes.job
+    view, (query, *_) = scenes.asked(image)
+    scene = job.places[view.number]
+    picture = view.picture(query)
+    first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
+    stored = first_model[0] if first_model else None
+    return RenderedRow(
+        name=f"{image:06d}",
+        picture=picture,
+        task=job.tasks[0],
+        facts=object_facts(scene.scene, scene.object, job.config),
+        renderer=view.renderers[job.sizes[0]],
+        u=query.u,
+        rows=rows,
+        values=rows[0].values,
+        same=stored in (None, view.problems[0].judge(picture, query.u).right),
+    )
 
 
 def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:

@@ -217,35 +217,47 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     inputs = [nodes[name].meta.get("val") for name in names]
     is_rig = _check_inputs(source, names, inputs)
     images = inputs[0]
+    if len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2:
+        size_type = inputs[1].dtype
+        source = replace(source, size_type=size_type)
+    else:
+        source = replace(source, takes_more=len(inputs) > 1, size_type=None)
+    source = _with_image_input(source, images, is_rig=is_rig)
+    min_batch, max_batch = _batch_limits(program, images.shape[0])
+    if not is_rig:
+        return replace(source, batch_limits=(min_batch, max_batch))
+    cameras = int(images.shape[1])
+    layout = "NKHWC" if source.layout == "NHWC" else "NKCHW"
+    return replace(
+        source,
+        module=AllAtOnce(cast(nn.Module, source.module), cameras, layout),
+        layout=None,
+        batch_limits=(min_batch * cameras, max_batch * cameras),
+    )
+
+
+def _with_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
+    """Return the source with input size, layout and dtype of an input of images.
+
+    Raises:
+        ModelError: it is of another dtype.
+    """
     is_eight_bit = images.dtype == torch.uint8 and not is_rig
     if not images.is_floating_point() and not is_eight_bit:
         expected = "an image as input, floating-point or uint8, got"
         if is_rig:
             expected = "floating-point images as input, got"
         raise ModelError(f"model {source.name}: expected {expected} {images.dtype}")
-    if len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2:
-        source = replace(source, size_type=inputs[1].dtype)
-    else:
-        source = replace(source, takes_more=len(inputs) > 1, size_type=None)
     image_shape = images.shape[-3:]
     is_channels_last = image_shape[2] == 3 and image_shape[0] != 3
     height, width = image_shape[:2] if is_channels_last else image_shape[1:]
     is_fixed_size = isinstance(height, int) and isinstance(width, int)
-    source = replace(source, input_size=(height, width) if is_fixed_size else None)
-    source = (
-        as_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
-    )
-    min_batch, max_batch = _batch_limits(program, images.shape[0])
-    if not is_rig:
-        layout = "NHWC" if is_channels_last else "NCHW"
-        return replace(source, batch_limits=(min_batch, max_batch), layout=layout)
-    cameras = int(images.shape[1])
-    layout = "NKHWC" if is_channels_last else "NKCHW"
-    return replace(
+    source = replace(
         source,
-        module=AllAtOnce(cast(nn.Module, source.module), cameras, layout),
-        batch_limits=(min_batch * cameras, max_batch * cameras),
+        input_size=(height, width) if is_fixed_size else None,
+        layout="NHWC" if is_channels_last else "NCHW",
     )
+    return as_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
 
 
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:

@@ -126,7 +126,9 @@ class WithState(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor) -> Any:
-        """Return the policy's output for images (N, ...); each entry of the state is (N, numbers)."""
+        """Return the policy's output for images (N, ...); each entry of the state is
+        (N, numbers).
+        """
         state = {
             name: images.new_tensor(numbers).expand(len(images), -1)
             for name, numbers in self.state.items()

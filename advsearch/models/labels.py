@@ -38,8 +38,8 @@ NOTHING = frozenset(
 
 
 def names_nothing(name: str) -> bool:
-    """Whether a class of that name stands for no thing: background, "no object", a
-    number that nothing has.
+    """Whether the name of a class stands for no thing: background, "no object", an index
+    without a class.
     """
     return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING
 
@@ -183,6 +183,7 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
 
 
 def _key(name: str) -> str:  # what is compared
+    """Return a name in the form in which names are compared."""
     return " ".join(name.casefold().split())
 
 
@@ -329,6 +330,7 @@ def sets_of(classes: int) -> list[str]:
 
 
 def _label_sets() -> dict[str, tuple[str, ...]]:
+    """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
@@ -357,6 +359,7 @@ def fitting_labels(
 
 
 def _read_file(path: Path) -> tuple[str, ...]:
+    """Read label names from a JSON or text file; see `read_labels`."""
     where = f"label file {path}"
     try:
         text = read_text(path, "a label file", LARGEST)
@@ -402,12 +405,16 @@ def _read_file(path: Path) -> tuple[str, ...]:
 def _checked(
     names: Sequence[Any], kind: type[InputError], where: str
 ) -> tuple[str, ...]:
+    """Return label names without surrounding spaces; raise an error of a kind if one is
+    invalid.
+    """
     if problem := _problem(names):
         raise kind(f"{where}: {problem}")
     return tuple(name.strip() for name in names)
 
 
 def _problem(names: Sequence[Any]) -> str:
+    """Return what is wrong with label names, "" if nothing is."""
     if not names:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):

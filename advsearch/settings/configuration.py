@@ -321,6 +321,7 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
+        """Check settings that the command does not have, and those that contradict others."""
         for name in self.without:
             field = type(self).model_fields[name]
             if getattr(self, name) != field.get_default(call_default_factory=True):

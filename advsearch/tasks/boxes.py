@@ -186,25 +186,28 @@ def listed(
     Returns:
         Tuples of box, class and score.
     """
-    boxes = detections["boxes"].detach()
+    rows, classes, scores = _top_scores(detections)
+    boxes = detections["boxes"].detach()[rows]
+    results: list[tuple[Box, int, float]] = []
+    for label in classes[scores >= least].unique().tolist():
+        is_candidate = (classes == label) & (scores >= least)
+        candidates = is_candidate.nonzero().flatten()
+        survives = left_over(boxes[candidates], scores[candidates], iou)
+        # The scores are sorted, so the first are the best.
+        for index in candidates[survives][:count].tolist():
+            x0, y0, x1, y1 = boxes[index].tolist()
+            results.append(((x0, y0, x1, y1), label, float(scores[index])))
+    return sorted(results, key=lambda result: -result[2])[:count]
+
+
+def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the row, class and score (K,) each of the best scores, falling."""
     scores = detections["scores"].detach()
     top_scores, flat_index = scores.flatten().topk(min(AMONG, scores.numel()))
     if "labels" in detections:
-        rows = flat_index
-        classes = detections["labels"][rows]
-    else:
-        rows = flat_index // scores.shape[1]
-        classes = flat_index % scores.shape[1]
-    results: list[tuple[Box, int, float]] = []
-    for label in classes[top_scores >= least].unique().tolist():
-        is_candidate = (classes == label) & (top_scores >= least)
-        candidates = is_candidate.nonzero().flatten()
-        survives = left_over(boxes[rows[candidates]], top_scores[candidates], iou)
-        # The scores are sorted, so the first are the best.
-        for index in candidates[survives][:count].tolist():
-            x0, y0, x1, y1 = boxes[rows[index]].tolist()
-            results.append(((x0, y0, x1, y1), label, float(top_scores[index])))
-    return sorted(results, key=lambda result: -result[2])[:count]
+        return flat_index, detections["labels"][flat_index], top_scores
+    n_classes = scores.shape[1]
+    return flat_index // n_classes, flat_index % n_classes, top_scores
 
 
 def log_odds(probabilities: Tensor) -> Tensor:

@@ -798,19 +798,24 @@ class Detection(ClassTask):
 
     def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
         """See `Task.marks`: the true box, and every box with a score of `confidence`."""
-        height, width = truth.size
         true_marks = []
         if truth.box is not None:
             true_name = " or ".join(self.names(truth.labels))
             true_marks.append(Mark(true_name, True, box=truth.box))
-        marks_of_images = []
-        for detections in self._read(output):
-            marks = list(true_marks)
-            boxes = []
-            if not self._is_broken(detections):
-                boxes = listed(detections, MOST, self.confidence, self.suppression)
-            for (x0, y0, x1, y1), label, score in boxes:
-                box = (x0 * width, y0 * height, x1 * width, y1 * height)
-                marks.append(Mark(f"{self.name_of(label)} {score:.2f}", False, box=box))
-            marks_of_images.append(marks)
-        return marks_of_images
+        return [
+            [*true_marks, *self._predicted_marks(detections, truth)]
+            for detections in self._read(output)
+        ]
+
+    def _predicted_marks(self, detections: Detections, truth: Place) -> list[Mark]:
+        """Return a mark for every box of an image with a score of `confidence`."""
+        if self._is_broken(detections):
+            return []
+        height, width = truth.size
+        marks = []
+        for (x0, y0, x1, y1), label, score in listed(
+            detections, MOST, self.confidence, self.suppression
+        ):
+            box = (x0 * width, y0 * height, x1 * width, y1 * height)
+            marks.append(Mark(f"{self.name_of(label)} {score:.2f}", False, box=box))
+        return marks
