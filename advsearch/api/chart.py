@@ -75,9 +75,8 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
         )
 
     colors = Image.fromarray(np.round(255.0 * COLOURS[None]).astype(np.uint8))
-    if convert is not None:
-        colors = ImageCms.applyTransform(colors, convert)
-    levels = np.asarray(colors)[0] / 255.0
+    printed = colors if convert is None else ImageCms.applyTransform(colors, convert)
+    levels = np.asarray(printed)[0] / 255.0
     for (x, y), color in zip(MIDDLES, levels, strict=True):
         draw_square(x, y, PATCH, tuple(color))
     for x, y in CORNERS:

@@ -475,10 +475,7 @@ class AskedModel(models.RemoteNetwork):
                 responses up to then are yielded before.
         """
         pending = [_Request(index, TRIES, FIRST_WAIT) for index in range(len(bodies))]
-        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
-        # Only a response shows whether another request is allowed.
-        is_sequential = self.limits["tokens"] < LIMITS["tokens"] or by_token
-        max_concurrent = 1 if is_sequential else int(self.limits["at_once"])
+        max_concurrent = self._max_concurrent()
         while pending:
             models.INTERRUPTS.look()
             count = self._reserve(min(max_concurrent, len(pending)))
@@ -489,19 +486,18 @@ class AskedModel(models.RemoteNetwork):
             )
             failures = list[str]()
             retries = list[_Request]()
+            is_first = self.spent["calls"] <= len(wave)
             for request, response in zip(wave, responses, strict=True):
                 if isinstance(response, dict):
                     yield request.index, response
-                    continue
-                if isinstance(response, errors.ModelError):
+                elif isinstance(response, errors.ModelError):
                     failures.append(str(response))
-                    continue
-                is_first = self.spent["calls"] <= len(wave)
-                reason, may_retry, retry_after = self._failure(response, first=is_first)
-                if not may_retry or request.tries == 1:
-                    failures.append(f"model {self.name}: {reason} ({self.url})")
-                delay = max(request.delay, retry_after)
-                retries.append(_Request(request.index, request.tries - 1, delay))
+                else:
+                    reason, retry = self._plan_retry(request, response, first=is_first)
+                    if retry is None:
+                        failures.append(reason)
+                    else:
+                        retries.append(retry)
             if failures:
                 raise errors.ModelError(failures[0])
             if retries:
@@ -510,6 +506,24 @@ class AskedModel(models.RemoteNetwork):
                     replace(request, delay=2 * request.delay) for request in retries
                 ]
                 pending = delayed + pending
+
+    def _max_concurrent(self) -> int:
+        """Return how many requests may be sent at once."""
+        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
+        # Only a response shows whether another request is allowed.
+        is_sequential = self.limits["tokens"] < LIMITS["tokens"] or by_token
+        return 1 if is_sequential else int(self.limits["at_once"])
+
+    def _plan_retry(
+        self, request: _Request, error: Exception, *, first: bool
+    ) -> tuple[str, _Request | None]:
+        """Return why a request failed, and its next try; None if there is none."""
+        reason, may_retry, retry_after = self._failure(error, first=first)
+        text = f"model {self.name}: {reason} ({self.url})"
+        if not may_retry or request.tries == 1:
+            return text, None
+        delay = max(request.delay, retry_after)
+        return text, _Request(request.index, request.tries - 1, delay)
 
     def _reserve(self, max_count: int) -> int:
         """Count calls before they are made, as many as the limits allow.

@@ -368,21 +368,16 @@ class _Named(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        max_tokens = max(map(len, tokens))
-        rows = torch.zeros((len(tokens), max_tokens), dtype=torch.long)
+        # For each token of a name: the row of likelihoods after the tokens before it, the
+        # token, and whether there is one.
+        rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
         columns = torch.zeros_like(rows)
         counts = torch.zeros_like(rows)
         for index, name_tokens in enumerate(self.tokens):
-            prefix = tuple(name_tokens[:-1])
-            matches = [
-                k for k, stem in enumerate(stems) if stem[: len(prefix)] == prefix
-            ]
-            first_row = 1 + matches[0] * stem_length if matches else 1
+            # Row 0 is after the prompt, the others are after each token of a stem.
+            stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
             for position, token in enumerate(name_tokens):
-                # Row 0 of the likelihoods is after the prompt, the others after each token
-                # of a stem.
-                if position:
-                    rows[index, position] = first_row + position - 1
+                rows[index, position] = stem_row + position - 1 if position else 0
                 columns[index, position] = token
                 counts[index, position] = 1
         padded_stems = torch.tensor(
@@ -405,6 +400,16 @@ class _Named(nn.Module):
                 likelihoods = torch.cat([likelihoods, stem_likelihoods])
             scores.append((likelihoods[rows, columns] * counts).sum(dim=1))
         return torch.stack(scores)
+
+
+def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
+    """Return the index of the first stem that begins with a prefix; 0 if there is
+    none.
+    """
+    for index, stem in enumerate(stems):
+        if list(stem[: len(prefix)]) == list(prefix):
+            return index
+    return 0
 
 
 def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
