@@ -1,5 +1,5 @@
-"""What calls from Python give: keywords of other libraries are told what they are
-called here, and wrong types are refused in a sentence.
+"""Check calls from Python: suggest the keyword that another library's keyword corresponds
+to, and reject wrong types with a sentence.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from advsearch.files import either
 from advsearch.options import told
 
 OTHER_TERMS = {"eot": "over", "minimal_perturbation": "smallest"}
-"""Terms of the literature for settings that are called otherwise here."""
+"""Terms of the literature for settings that have another name here."""
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
 
 NOWHERE = {
@@ -31,67 +31,76 @@ NOWHERE = {
 }
 
 WORDS = {
-    "str": "a text", "Path": "a path", "bool": "True or False", "int": "a whole number", "float": "a number",
-    "None": "None", "Mapping": "a mapping", "Sequence": "a list", "Callable": "a function",
-}  # fmt: skip
+    "str": "a text",
+    "Path": "a path",
+    "bool": "True or False",
+    "int": "a whole number",
+    "float": "a number",
+    "None": "None",
+    "Mapping": "a mapping",
+    "Sequence": "a list",
+    "Callable": "a function",
+}
+"""Types by name, for messages."""
 
 ALIASES = {
     *"Controls Watched Given Texture Read MakeOptimiser Examples Unpack Literal "
     "Names Named Tensor".split()
 }
-"""Names in annotations that are of no class."""
+"""Names in annotations that are no classes."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def unexpected(
-    function: str, given: Mapping[str, object], known: Sequence[str]
+    function: str, keywords: Mapping[str, object], known: Sequence[str]
 ) -> TypeError | None:
-    """Return the error for the first keyword that a function has not, with what it may
-    be called here; or None.
+    """Return the error for the first keyword that a function does not have, with the
+    keyword that is probably meant; None if there is no such keyword.
     """
-    for name in given:
+    for name in keywords:
         if name in known:
             continue
-        meant, reason = meant_by(name, known)
-        meant = meant or (
-            [] if name.lower() in DEVICES else resembling(name, known)[:2]
-        )
-        hint = (
-            f"; did you mean {' or '.join(f'`{known}`' for known in meant)}?"
-            if meant
-            else ""
-        )
-        reason = f" ({reason})" if reason else ""
+        suggestions, reason = meant_by(name, known)
+        if not suggestions and name.lower() not in DEVICES:
+            suggestions = resembling(name, known)[:2]
+        hint = ""
+        if suggestions:
+            names = " or ".join(f"`{suggestion}`" for suggestion in suggestions)
+            hint = f"; did you mean {names}?"
+        if reason:
+            hint += f" ({reason})"
         return TypeError(
-            f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}"
+            f"{function}() got an unexpected keyword argument {name!r}{hint}"
         )
     return None
 
 
 def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
-    """Return the known keywords that the literature calls so, and why there is none
-    like it here.
+    """Return the known keyword that the literature gives this name, in a list, and why
+    there is no such keyword here, if there is a reason.
     """
-    meant = OTHER_TERMS.get(name.lower())
-    return [meant] if meant is not None and meant in known else [], NOWHERE.get(
-        name.lower(), ""
-    )
+    term = OTHER_TERMS.get(name.lower())
+    suggestions = [term] if term is not None and term in known else []
+    return suggestions, NOWHERE.get(name.lower(), "")
 
 
 def check_types(
-    parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]
+    parameters: Mapping[str, inspect.Parameter], values: Mapping[str, object]
 ) -> None:
-    """Check values against the annotations of a function's own parameters, as far as
-    these name types and classes. Raises InputError where a value is of none of them.
+    """Check values against the annotations of parameters, as far as these name types
+    and classes.
+
+    Raises:
+        InputError: a value has none of the types.
     """
-    for name, value in given.items():
+    for name, value in values.items():
         parameter = parameters.get(name)
         if parameter is None or value is parameter.default or hasattr(value, "tolist"):
             continue
-        kinds = _kinds(str(parameter.annotation))
-        if kinds and not any(_fits(kind, value) for kind in kinds):
+        type_names = _kinds(str(parameter.annotation))
+        if type_names and not any(_fits(kind, value) for kind in type_names):
             expected = either(
-                [WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in kinds]
+                [WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in type_names]
             )
             raise InputError(f"{name}: expected {expected}, got {told(value)}")
         if name == "run" and isinstance(value, str) and not value.strip():
@@ -102,50 +111,51 @@ def check_types(
 
 
 def _kinds(annotation: str) -> list[str]:
-    plain = annotation
-    count = 1
-    while count:
-        plain, count = re.subn(r"\[[^][]*\]", "", plain)
-    kinds = dict.fromkeys(
-        kind.strip().replace("os.PathLike", "Path") for kind in plain.split("|")
-    )
-    return (
-        []
-        if kinds.keys() & ALIASES or any(kind.startswith("Any") for kind in kinds)
-        else list(kinds)
-    )
+    """Return the names of the types in an annotation; empty if it allows others."""
+    without_parameters = annotation
+    n_replaced = 1
+    while n_replaced:  # from the innermost brackets outwards
+        without_parameters, n_replaced = re.subn(r"\[[^][]*\]", "", without_parameters)
+    names = [
+        name.strip().replace("os.PathLike", "Path")
+        for name in without_parameters.split("|")
+    ]
+    if ALIASES & set(names) or any(name.startswith("Any") for name in names):
+        return []
+    return list(dict.fromkeys(names))
 
 
 def _fits(kind: str, value: object) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    """Whether a value has the type of a name."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    is_text = isinstance(value, (str, bytes))
     fits = {
         "None": value is None,
-        "int": number and value == value // 1,  # type: ignore[operator]
-        "float": number,
+        "int": is_number and value == value // 1,  # type: ignore[operator]
+        "float": is_number,
         "Path": hasattr(value, "__fspath__"),
         "Callable": callable(value),
         "Mapping": isinstance(value, Mapping),
-        "Sequence": isinstance(value, Sequence) and not isinstance(value, (str, bytes)),
+        "Sequence": isinstance(value, Sequence) and not is_text,
     }
-    return fits.get(
-        kind, kind.rpartition(".")[2] in [base.__name__ for base in type(value).__mro__]
-    )
+    if kind in fits:
+        return fits[kind]
+    class_names = [base.__name__ for base in type(value).__mro__]
+    return kind.rpartition(".")[2] in class_names
 
 
 def helped(function: Function) -> Function:
-    """Have a function of the interface refuse keywords that it has not, and values of
-    wrong types, as said above.
-    """
+    """Make a function reject unknown keywords and values of wrong types, see above."""
     signature = inspect.signature(function)
+    parameters = signature.parameters
 
     @wraps(function)
-    def called(*args: Any, **given: Any) -> Any:
-        if error := unexpected(function.__name__, given, list(signature.parameters)):
+    def wrapper(*args: Any, **keywords: Any) -> Any:
+        error = unexpected(function.__name__, keywords, list(parameters))
+        if error:
             raise error
-        check_types(
-            signature.parameters,
-            {**dict(zip(signature.parameters, args, strict=False)), **given},
-        )
-        return function(*args, **given)
+        positional = dict(zip(parameters, args, strict=False))
+        check_types(parameters, {**positional, **keywords})
+        return function(*args, **keywords)
 
-    return called  # type: ignore[return-value]
+    return wrapper  # type: ignore[return-value]

@@ -1,9 +1,9 @@
-"""The typed description of a run: what YAML files, flags and Python calls all become.
+"""Declare the settings of a run, which YAML files, flags and Python calls all become.
 
 Each setting states its flag, unit, range and default once; the command line's help and
-the docs are made from that (`settings`). Here is what many commands need to know, and
-what `render` does; the rest is with each question. Names of objects, controls, policies
-and the rest are checked by whoever looks them up, so that settings stay light.
+the docs are made from that (`settings`). This module has what many commands need, and
+`render`; the rest is with each experiment. Names of objects, controls and policies are
+checked by what loads them, so that settings stay light.
 """
 
 from __future__ import annotations
@@ -25,76 +25,70 @@ from advsearch.settings import values as written
 from advsearch.trust import powers
 
 FOLDERS = ("references", "state")
-"""Options that may be a folder or a file. It is kept by its absolute path, so that a
-run may go on from anywhere.
+"""Options that may be a directory or a file. Its absolute path is stored, so that a run
+may be resumed anywhere.
 """
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:
-    """Return a name, or a mapping with a `name` and options, from ``NAME``,
-    ``NAME={OPTION: VALUE}`` or such a mapping, which may leave out the name
-    `otherwise`.
+    """Read a name, or a mapping with a `name` and options.
+
+    Args:
+        value: ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping.
+        setting: its name, for messages.
+        otherwise: the name of a mapping without one.
     """
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
-        value = {
-            "name": name,
-            **(options if isinstance(options, Mapping) else {"": options}),
-        }
+        if not isinstance(options, Mapping):
+            options = {"": options}
+        value = {"name": name, **options}
     if not isinstance(value, Mapping):
         return value
-    options = {option: given for option, given in value.items() if option != "name"}
-    for option in FOLDERS:
-        given = options.get(option)
-        if isinstance(given, (str, os.PathLike)) and given:
-            options[option] = str(Path(given).expanduser().absolute())
+    options = {key: option for key, option in value.items() if key != "name"}
+    for key in FOLDERS:
+        path = options.get(key)
+        if isinstance(path, (str, os.PathLike)) and path:
+            options[key] = str(Path(path).expanduser().absolute())
     name = value.get("name", otherwise)
     return {"name": name, **options} if options else name
 
 
 def read_joined(value: Any, setting: str, otherwise: str) -> Any:
-    """Return what `read_named` returns, of one or of several joined with + or in a
-    list: the names with + between them, and under each name its options: ``{"name":
-    "detection+depth", "detection": {"iou": 0.7}}``.
+    """Read one name with options as `read_named`, or several joined with + or in a list.
+
+    Several become their names with + between them, and under each name its options:
+    ``{"name": "detection+depth", "detection": {"iou": 0.7}}``.
     """
-    parts = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
-    if not isinstance(parts, (list, tuple)) or len(parts) < 2:
+    entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
+    if not isinstance(entries, (list, tuple)) or len(entries) < 2:
         return read_named(value, setting, otherwise)
-    read = [
-        read_named(part.strip() if isinstance(part, str) else part, setting, otherwise)
-        for part in parts
-    ]
-    mappings = [part if isinstance(part, Mapping) else {"name": part} for part in read]
-    names = [
-        name for part in mappings if isinstance(name := part.get("name"), str) and name
-    ]
-    if len(names) < len(read):
-        return value
-    options = {
-        part["name"]: {k: v for k, v in part.items() if k != "name"}
-        for part in mappings
-        if len(part) > 1
-    }
-    last = options.get(names[-1], {})
-    # as a command is written back: detection+depth={depth: {seek: gone}}
-    if last.keys() <= set(names):
-        options = (
-            {**options, **last}
-            if names[-1] in last
-            else {**options, names[-1]: {}, **last}
-        )
-    return read_named(
-        {**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)},
-        setting,
-        otherwise,
-    )
+    names = []
+    options: dict[str, dict[str, Any]] = {}
+    for entry in entries:
+        text = entry.strip() if isinstance(entry, str) else entry
+        named = read_named(text, setting, otherwise)
+        mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
+        name = mapping.pop("name", None)
+        if not isinstance(name, str) or not name:
+            return value
+        names.append(name)
+        if mapping:
+            options[name] = mapping
+    last_options = options.get(names[-1], {})
+    # A command is written back as detection+depth={depth: {seek: gone}}: the options of
+    # the last name are then those of all names.
+    if last_options.keys() <= set(names):
+        options[names[-1]] = {}
+        options.update(last_options)
+    options = {name: value for name, value in options.items() if value}
+    return read_named({**options, "name": JOINED.join(names)}, setting, otherwise)
 
 
 def has_address(model: str) -> bool:
-    """Whether a model's name is an address, or names one among several."""
-    return any(
-        re.match("https?:", name, re.IGNORECASE) for name in written.split_names(model)
-    )
+    """Whether the name of a model, or one of several, is an address."""
+    names = written.split_names(model)
+    return any(re.match("https?:", name, re.IGNORECASE) for name in names)
 
 
 def name_in(named: str | Mapping[str, object]) -> str:
@@ -103,8 +97,8 @@ def name_in(named: str | Mapping[str, object]) -> str:
 
 
 DEFAULT_ENVIRONMENT = "studio"
-"""What lights a scene of which nothing is said:
-`scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to.
+"""The environment that lights a scene by default. Equal to
+`scene.description.DEFAULT_ENVIRONMENT`, as a test checks.
 """
 SEVERAL = (
     "object",
@@ -139,191 +133,263 @@ class SceneConfig(Config):
     default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
     # which of object, environment and model may be several, with commas
     several: ClassVar[tuple[str, ...]] = ()
-    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
-            "threads", lambda one: one.deterministic and one.threads != 1,
+            "threads",
+            lambda one: one.deterministic and one.threads != 1,
             "`deterministic` works on one thread; leave one of them out",
         ),
         Clash(
-            "overwrite", lambda one: one.run is None,
+            "overwrite",
+            lambda one: one.run is None,
             "replaces the run that `run` names, and none is named; name it, or leave "
             "`overwrite` out",
         ),
     )
 
     object: str = setting(
-        ..., "scene", "the object that the model should recognise", f"the name of an object or a {either(MESHES)} file"
+        ...,
+        "scene",
+        "the object that the model should recognise",
+        f"the name of an object or a {either(MESHES)} file",
     )
     environment: str | None = setting(
-        None, "scene", "the environment map that lights the scene",
+        None,
+        "scene",
+        "the environment map that lights the scene",
         "the name of an environment, a .hdr or .exr file, the .yaml file of a place, "
         "or none",
         otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(
-        None, "scene", "which axis of an imported object points up",
+        None,
+        "scene",
+        "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
     facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
-        None, "scene", "which axis of an imported object's file its front faces, "
-                       "turned towards +x here",
+        None,
+        "scene",
+        "which axis of an imported object's file its front faces, "
+        "turned towards +x here",
         otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in "
-                  "others",
+        "others",
     )
     size: float | None = setting(
-        None, "scene", "how large the object is: its longest side; distances are then "
-                       "in metres",
-        "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file "
-                                                         "says: glTF is in metres", ge=1e-4,
+        None,
+        "scene",
+        "how large the object is: its longest side; distances are then in metres",
+        "a number of metres from 1e-4 to 1e4",
+        otherwise="as bundled, or as its file says: glTF is in metres",
+        ge=1e-4,
         le=1e4,
     )
     unit: Literal["mm", "cm", "m", "in"] | None = setting(
-        None, "scene", "unit of the coordinates of the object's file, which says how "
-                       "large it is",
+        None,
+        "scene",
+        "unit of the coordinates of the object's file, which says how large it is",
         otherwise="as its file says: glTF is in metres",
     )
     camera: str | None = setting(
-        None, "scene",
+        None,
+        "scene",
         "which camera takes the picture: one of a scene file, or the one around the "
         "object, mounted somewhere or with "
         "a lens of its own",
         "a name that advsearch import lists, orbit, dashcam, robot, fisheye, "
         "equirectangular, or a camera file of "
         "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
-        metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* "
-                                  "describes", min_length=1,
+        metavar="NAME",
+        otherwise="orbit, the pinhole around the object that camera.* describes",
+        min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
-        dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may "
-                       "be repeated",
-        "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
+        dict,
+        "scene",
+        "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
+        "PARAMETER=VALUE with a finite number, a name or a list of numbers",
+        alias="set",
+        flag="--set",
         metavar="PARAMETER=VALUE",
     )
     things: str | None = setting(
-        None, "scene", "what stands beside the object, in metres from it: x forwards, "
-                       "y to its left",
+        None,
+        "scene",
+        "what stands beside the object, in metres from it: x forwards, y to its left",
         "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after "
         "it, several with ; between them",
-        flag="--with", otherwise="nothing",
+        flag="--with",
+        otherwise="nothing",
     )
     judge: str = setting(
-        "object", "model", "which thing the predictions are judged by", "object, the name of a thing beside it, or all",
+        "object",
+        "model",
+        "which thing the predictions are judged by",
+        "object, the name of a thing beside it, or all",
         min_length=1,
     )
     exposure: float = setting(
-        0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
+        0.0,
+        "scene",
+        "brightness, relative to the metered exposure",
+        unit="stops",
+        ge=-10.0,
+        le=10.0,
     )
     resolution: tuple[int, int] | None = setting(
-        None, "scene", "size of the rendered picture", "SIDE or HEIGHTxWIDTH, each "
-                                                       "from 8 to 4096",
-        otherwise="what the model takes", unit="pixels",
+        None,
+        "scene",
+        "size of the rendered picture",
+        "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
+        otherwise="what the model takes",
+        unit="pixels",
     )
 
     model: str = setting(
-        "reference", "model", "the network under test",
+        "reference",
+        "model",
+        "the network under test",
         "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, "
         "hf:REPOSITORY, an address such as "
         "http://localhost:8000, or package.module:callable",
     )
     labels: str | None = setting(
-        None, "model", "names of the model's classes",
+        None,
+        "model",
+        "names of the model's classes",
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, "
         "or the names with commas between "
         "them",
-        metavar="FILE", otherwise="the model's own",
+        metavar="FILE",
+        otherwise="the model's own",
     )
     prompt: str | None = setting(
-        None, "model",
+        None,
+        "model",
         "text for a model that takes text beside the picture: for CLIP what a picture "
         "is compared with, one text for "
         "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
-        otherwise="a photo of a {}, or What is this?", metavar="TEXT",
+        otherwise="a photo of a {}, or What is this?",
+        metavar="TEXT",
     )
     value_range: tuple[float, float] | None = setting(
-        None, "model", "which values black and white have in the pictures that the "
-                       "model takes",
-        "LOW,HIGH with LOW below HIGH, such as 0,255", otherwise="what the model says, or 0,1", metavar="LOW,HIGH",
+        None,
+        "model",
+        "which values black and white have in the pictures that the model takes",
+        "LOW,HIGH with LOW below HIGH, such as 0,255",
+        otherwise="what the model says, or 0,1",
+        metavar="LOW,HIGH",
     )
     ask: dict[str, float] = setting(
-        dict, "model",
+        dict,
+        "model",
         "a limit for a model behind an address, such as calls=500: calls (2000), "
         "tokens and money of a run, seconds of "
         "an answer (120), requests at_once (4), and the prices per_call, "
         "per_million_in and per_million_out; may be "
         "repeated",
-        "LIMIT=NUMBER", metavar="LIMIT=NUMBER",
+        "LIMIT=NUMBER",
+        metavar="LIMIT=NUMBER",
     )
     task: str | dict[str, JsonValue] = setting(
-        "classification", "model",
+        "classification",
+        "model",
         "what the model does, and how its predictions are judged; for several models "
         "one task each, with + between "
         "them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
-        None, "model", "the labels that count as right, separated by commas",
-        'names of classes or their numbers, such as "coffee mug,cup" or #504', otherwise="the object's own",
+        None,
+        "model",
+        "the labels that count as right, separated by commas",
+        'names of classes or their numbers, such as "coffee mug,cup" or #504',
+        otherwise="the object's own",
     )
 
     controls: ControlsByName = setting(
-        lambda: {"texture": {}}, "search", "what may change in the scene, separated by "
-                                           "commas",
-        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}", flag="--control", metavar="NAME",
-        read_texts=written.read_controls, min_length=1,
+        lambda: {"texture": {}},
+        "search",
+        "what may change in the scene, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+        flag="--control",
+        metavar="NAME",
+        read_texts=written.read_controls,
+        min_length=1,
     )
     texture_resolution: int | None = setting(
-        None, "search", "side length of the searched texture", unit="texels", otherwise="chosen from the object's own",
-        ge=2, le=4096,
+        None,
+        "search",
+        "side length of the searched texture",
+        unit="texels",
+        otherwise="chosen from the object's own",
+        ge=2,
+        le=4096,
     )
     spp: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] | None = setting(
-        None, "search",
+        None,
+        "search",
         "samples per pixel of a render of the search; auto takes half of the default, "
         "and renders the best candidates "
         "again while they are close",
-        "a whole number from 1 to 65536, or auto", otherwise="8 with the denoiser, 16 "
-                                                             "without", unit="samples",
+        "a whole number from 1 to 65536, or auto",
+        otherwise="8 with the denoiser, 16 without",
+        unit="samples",
     )
-    denoise: Literal["oidn", "none"] = setting("oidn", "search", "denoiser of every render, in search and verification")
+    denoise: Literal["oidn", "none"] = setting(
+        "oidn", "search", "denoiser of every render, in search and verification"
+    )
     pixel_sampler: Literal["independent", "multijitter"] = setting(
-        "multijitter", "search",
+        "multijitter",
+        "search",
         "how samples are spread over a pixel, in search and verification; multijitter "
         "has less noise and rounds the "
         "number of samples up to a product of two near numbers",
     )
 
     seed: int = setting(
-        0, "run", "seed of all random numbers", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
+        0,
+        "run",
+        "seed of all random numbers",
+        "a whole number from 0 to 2**63 - 1",
+        ge=0,
+        le=2**63 - 1,
     )
-    threads: int | None = setting(None, "run", "number of processor threads", otherwise="all", ge=1, le=1024)
-    deterministic: bool = setting(False, "run", "use one thread, so that a run repeats "
-                                                "bit for bit; slower")
+    threads: int | None = setting(
+        None, "run", "number of processor threads", otherwise="all", ge=1, le=1024
+    )
+    deterministic: bool = setting(
+        False, "run", "use one thread, so that a run repeats bit for bit; slower"
+    )
     run: str | None = setting(
-        None, "run", "where the run is stored", "a name (kept in runs/) or the path of "
-                                                "a folder",
-        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=powers.place,
+        None,
+        "run",
+        "where the run is stored",
+        "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-CONTROL-NNN",
+        min_length=1,
+        power=powers.place,
     )
-    # fmt: on
     overwrite: bool = setting(
         False, "run", "replace a run that is already there", power=powers.replacing
     )
 
     @model_validator(mode="after")
-    def _one_of_each(self) -> SceneConfig:
-        for name in ("object", "environment", "model"):
-            names = written.split_names(getattr(self, name) or "")
-            tasks = self.task_name.split(JOINED)
-            if name == "model" and len(tasks) > 1:
+    def _check_counts(self) -> SceneConfig:
+        """Check that settings with one name have no several."""
+        tasks = self.task_name.split(JOINED)
+        for setting_name in ("object", "environment", "model"):
+            names = written.split_names(getattr(self, setting_name) or "")
+            if setting_name == "model" and len(tasks) > 1:
                 if len(names) != len(tasks):
                     raise InputError(
                         f"model: expected {len(tasks)} with commas between them, one "
                         f"for each of {', '.join(tasks)}, "
                         f"got {len(names)}"
                     )
-                continue
-            if len(names) > 1 and name not in self.several:
-                raise one_only(name, names)
+            elif len(names) > 1 and setting_name not in self.several:
+                raise one_only(setting_name, names)
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
                 "size: it is the size of one object, and there are "
@@ -337,6 +403,7 @@ class SceneConfig(Config):
 
     @property
     def task_name(self) -> str:
+        """The name of the task."""
         return name_in(self.task)
 
     @property
@@ -355,7 +422,7 @@ class SceneConfig(Config):
         their settings.
         """
         named = {**self.controls, **getattr(self, "over", {})}
-        return tuple(str(given.get("kind", name)) for name, given in named.items())
+        return tuple(str(options.get("kind", name)) for name, options in named.items())
 
     @property
     def search_spp(self) -> int:
@@ -440,14 +507,12 @@ class SceneConfig(Config):
     @field_validator("resolution", mode="before")
     @classmethod
     def _resolution_from_text(cls, value: Any) -> Any:
-        parts = value.lower().split("x") if isinstance(value, str) else value
-        if isinstance(parts, int):
-            parts = [parts]
-        return (
-            [*parts, *parts]
-            if isinstance(parts, (list, tuple)) and len(parts) == 1
-            else parts
-        )
+        sizes = value.lower().split("x") if isinstance(value, str) else value
+        if isinstance(sizes, int):
+            sizes = [sizes]
+        if isinstance(sizes, (list, tuple)) and len(sizes) == 1:
+            return [*sizes, *sizes]
+        return sizes
 
     @field_validator("resolution")
     @classmethod
@@ -476,11 +541,11 @@ class SceneConfig(Config):
         if not isinstance(value, Mapping):
             return value
         # YAML takes 1e-3 for text
-        return {name: written.number_or_text(given) for name, given in value.items()}
+        return {name: written.number_or_text(text) for name, text in value.items()}
 
 
 def one_only(name: str, names: Sequence[str]) -> InputError:
-    """The error for several objects, environments or models where one is looked at."""
+    """Return the error for several objects, environments or models where one is expected."""
     listed = written.shown(",".join(names))
     return InputError(
         f"{name}: expected one {name}, got {listed}; give one, or "
@@ -500,31 +565,44 @@ class RenderConfig(SceneConfig):
     command: ClassVar[str] = "render"
     without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
 
-    # fmt: off
     controls: ControlsByName = setting_as_in(
-        SceneConfig, "controls", default=dict, group="picture",
+        SceneConfig,
+        "controls",
+        default=dict,
+        group="picture",
         description="what differs from the scene, separated by commas; a range stays "
-                    "where a search would start",
-        expects="names of controls, or NAME={PARAMETER: VALUE}", min_length=None,
+        "where a search would start",
+        expects="names of controls, or NAME={PARAMETER: VALUE}",
+        min_length=None,
     )
     around: int | None = setting(
-        None, "picture", "one sheet of so many views, from azimuths all around the "
-                         "object", otherwise="one view",
-        unit="views", ge=2, le=64,
+        None,
+        "picture",
+        "one sheet of so many views, from azimuths all around the object",
+        otherwise="one view",
+        unit="views",
+        ge=2,
+        le=64,
     )
-    spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
+    spp: int = setting(
+        PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536
+    )
     aov: str | None = setting(
-        None, "picture",
+        None,
+        "picture",
         "write ground truth of each pixel, names separated by commas, as layers of an "
         "EXR beside the picture",
-        "names among mask, depth, normal, uv, id", otherwise="none", metavar="NAMES",
+        "names among mask, depth, normal, uv, id",
+        otherwise="none",
+        metavar="NAMES",
     )
     out: str = setting(
-        ..., "picture", "the file to write: a .png holds what the model sees, an .exr "
-                        "linear radiance times the gain",
+        ...,
+        "picture",
+        "the file to write: a .png holds what the model sees, an .exr "
+        "linear radiance times the gain",
         "the path of a .png or .exr file",
     )
-    # fmt: on
 
     @field_validator("out", mode="before")
     @classmethod
@@ -548,71 +626,87 @@ class DerivativeConfig(SceneConfig):
     controls, and what is maximised.
     """
 
-    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
-            "epsilon", lambda one: one.epsilons and "epsilon" not in one.several,
+            "epsilon",
+            lambda config: config.epsilons and "epsilon" not in config.several,
             "several make a curve, which only `advsearch attack` draws; give one",
         ),
     )
 
     object: str = setting_as_in(SceneConfig, "object", default="mug")
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
-        None, "search",
+        None,
+        "search",
         "how far a control may move from its start, in its own unit (for several "
         "controls CONTROL=NUMBER,...; in "
         "`attack` also NUMBER,NUMBER,... for a curve)",
-        f"a number greater than 0 and at most {LARGEST_EPSILON:g}", otherwise="the control's own",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
+        otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] | None = setting(
-        None, "search", "norm in which epsilon is measured", otherwise="the control's own"
+        None,
+        "search",
+        "norm in which epsilon is measured",
+        otherwise="the control's own",
     )
     estimators: dict[str, str] = setting(
-        dict, "search", "force a gradient estimator",
+        dict,
+        "search",
+        "force a gradient estimator",
         "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch "
         "check` shows the names",
-        alias="estimator", flag="--estimator", metavar="NAME",
+        alias="estimator",
+        flag="--estimator",
+        metavar="NAME",
         read_texts=written.parse_choices,
     )
     objective: str | None = setting(
-        None, "search", "the objective that the search maximises", "the name of an objective",
+        None,
+        "search",
+        "the objective that the search maximises",
+        "the name of an objective",
         otherwise="the task's own: margin",
     )
     specialise: bool = setting(
-        True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
+        True,
+        "search",
+        "leave out what the scene and the search don't need",
+        flag="--no-specialise",
         switched="compute everything, also what this search does not need; `advsearch "
-                 "check` shows what is left out "
+        "check` shows what is left out "
         "otherwise",
     )
-    # fmt: on
 
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
         """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in
-        range, and none twice.
+        range, without duplicates.
         """
         if isinstance(value, str):
-            parts = [part.strip() for part in value.split(",")]
+            entries = [entry.strip() for entry in value.split(",")]
             if "=" in value:
-                pairs = [written.parse_assignment(part, "epsilon") for part in parts]
+                pairs = [
+                    written.parse_assignment(entry, "epsilon") for entry in entries
+                ]
                 written.check_once((name for name, _ in pairs), "epsilon")
                 value = dict(pairs)
             else:
-                value = tuple(parts)
+                value = tuple(entries)
         if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
-        numbers = value.values() if isinstance(value, Mapping) else value
-        numbers = (
-            numbers
-            if isinstance(value, (Mapping, list, tuple))
-            else [1.0 if value is None else value]
-        )
-        read = [_positive(number) for number in numbers]
+        if isinstance(value, Mapping):
+            values = list(value.values())
+        elif isinstance(value, (list, tuple)):
+            values = list(value)
+        else:
+            values = [1.0 if value is None else value]
+        numbers = [_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
-            written.check_once((f"{number:g}" for number in read), "epsilon")
-        if not read:
+            written.check_once((f"{number:g}" for number in numbers), "epsilon")
+        if not numbers:
             raise ValueError("nothing is named")
         return value
 
@@ -633,7 +727,7 @@ def _positive(value: Any) -> float:
     return number
 
 
-FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
+FIRST = ("attack", "render", "sweep")  # the first commands in the docs
 
 
 class _Configs(Mapping[str, type[Config]]):
@@ -651,6 +745,6 @@ class _Configs(Mapping[str, type[Config]]):
 
 
 CONFIGS: Mapping[str, type[Config]] = _Configs()
-"""What the settings of each command are, in the order in which the docs show them;
-those of a question are read when somebody first asks for them.
+"""The settings of each command, in the order of the docs; they are imported on first
+use.
 """

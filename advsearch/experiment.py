@@ -114,16 +114,17 @@ class RunContext(ExitStack, Generic[Settings]):
             self.ending = INTERRUPTED
 
     def run_part(self, name: str, config: Config) -> Result:
-        """Run an experiment in a folder of its own within this run, or read its result
-        if it has ended.
+        """Run an experiment in its own directory within this run, or read its result if it has
+        ended.
         """
         return run_part(
             RunDirectory.locate_part(self.run.path, name), config, self.progress
         )
 
     def open_measurements(self, seconds: float | None = None) -> Measurements:
-        """Return what the run has measured, and what measures the rest; none begins
-        after so many seconds.
+        """Return the run's stored measurements, with a way to measure the rest.
+
+        None is started after so many seconds.
         """
         return Measurements(self, seconds)
 
@@ -212,10 +213,10 @@ def find_stopped_run(config: Config) -> Path | None:
     """Return the folder of the run that the settings name; None where there is none
     yet.
     """
-    place, _ = config.place
-    if place is None or not is_run(run_path(place)):
+    run, _ = config.place
+    if run is None or not is_run(run_path(run)):
         return None
-    return run_path(place)
+    return run_path(run)
 
 
 def run_part(
@@ -354,46 +355,29 @@ class Experiment(Generic[AnyResult]):
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
+        """Create the function for Python callers from the settings."""
         from advsearch.api.keywords import asks, configured  # imports torch
 
-        kinds = inspect.Parameter
-        own = self._find_python_arguments()
+        own_arguments = self._find_python_arguments()
 
         def function(
             *args: Any, progress: Any = None, resume: bool = False, **settings: Any
         ) -> AnyResult:
-            given = {**dict(zip(self.positional_args, args, strict=False)), **settings}
-            arguments = {name: given[name] for name in own if name in given}
-            given = {
+            positional = dict(zip(self.positional_args, args, strict=False))
+            values = {**positional, **settings}
+            arguments = {name: values[name] for name in own_arguments if name in values}
+            config_values = {
                 name: value
-                for name, value in given.items()
-                if name not in own or name in self.positional_args
+                for name, value in values.items()
+                if name not in own_arguments or name in self.positional_args
             }
-            config = configured(self.settings, **given)
+            config = configured(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
             return self.run(
                 config, progress=watcher(progress), resumed=resumed, **arguments
             )
 
-        parameters = [
-            self._make_positional_parameter(name) for name in self.positional_args
-        ]
-        parameters += [
-            parameter
-            for name, parameter in own.items()
-            if name not in self.positional_args
-        ]
-        if self.resumes_in_python:
-            parameters.append(
-                kinds("resume", kinds.KEYWORD_ONLY, default=False, annotation="bool")
-            )
-        parameters.append(
-            kinds("progress", kinds.KEYWORD_ONLY, default=None, annotation="Watched")
-        )
-        parameters.append(kinds("settings", kinds.VAR_KEYWORD))
-        signature = inspect.Signature(
-            parameters, return_annotation=self.result.__name__
-        )
+        signature = self._make_signature(own_arguments)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__ = self.settings.command
         function.__qualname__ = self.settings.command
@@ -401,29 +385,50 @@ class Experiment(Generic[AnyResult]):
         function.__module__ = self.function.__module__
         return asks(self.settings)(function)
 
+    def _make_signature(
+        self, own_arguments: Mapping[str, inspect.Parameter]
+    ) -> inspect.Signature:
+        """Return the signature of the function for Python callers, without settings."""
+        make = inspect.Parameter
+        parameters = [
+            self._make_positional_parameter(name) for name in self.positional_args
+        ]
+        parameters += [
+            parameter
+            for name, parameter in own_arguments.items()
+            if name not in self.positional_args
+        ]
+        if self.resumes_in_python:
+            parameters.append(
+                make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
+            )
+        parameters.append(
+            make("progress", make.KEYWORD_ONLY, default=None, annotation="Watched")
+        )
+        parameters.append(make("settings", make.VAR_KEYWORD))
+        return inspect.Signature(parameters, return_annotation=self.result.__name__)
+
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters that Python callers may pass beside settings, by
-        name.
-        """
+        """Return the parameters by name that Python callers may pass next to settings."""
         if not self.python_arguments:
             return {}
-        parameters = inspect.signature(
-            registry.imported(self.python_arguments)
-        ).parameters
+        function = registry.imported(self.python_arguments)
         return {
-            name: one
-            for name, one in parameters.items()
-            if one.kind is one.KEYWORD_ONLY
+            name: parameter
+            for name, parameter in inspect.signature(function).parameters.items()
+            if parameter.kind is parameter.KEYWORD_ONLY
         }
 
     def _make_positional_parameter(self, name: str) -> inspect.Parameter:
+        """Return the parameter of a setting that is passed by position."""
         setting = self.settings.model_fields[name]
+        default = inspect.Parameter.empty
+        if not setting.is_required():
+            default = setting.default
         return inspect.Parameter(
             name,
             inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=inspect.Parameter.empty
-            if setting.is_required()
-            else setting.default,
+            default=default,
             annotation=PYTHON_TYPES.get(name, "str | Path"),
         )
 

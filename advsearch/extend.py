@@ -1,9 +1,12 @@
-"""What an added experiment, control, task, policy, model source, reader or exporter may import from advsearch.
+"""Names that an added experiment, control, task, policy, model source, reader or exporter
+may import from advsearch.
+
     from advsearch.extend import Control, Parameter, Values
 
-Everything else in the package may change without notice. The built-in parts that the core does without use this module
-too, and nothing but it. A name is imported when it is first used, so that a control does not wait for the modules of
-an experiment. docs/extending.md has an example of each name.
+Everything else in the package may change without notice. The optional built-in parts
+use this module too, and nothing but it. A name is imported on first use, so that a
+control does not wait for the modules of an experiment. docs/extending.md has an example
+of each name.
 """
 
 from __future__ import annotations

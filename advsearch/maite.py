@@ -37,7 +37,7 @@ __all__ = ["Detections", "Scenes", "load_model"]
 
 
 class _Theirs(nn.Module):
-    """A model of MAITE as torchvision's are called."""
+    """A model of MAITE, called as torchvision's models are."""
 
     def __init__(self, model: Any, task: str) -> None:
         super().__init__()
@@ -47,23 +47,23 @@ class _Theirs(nn.Module):
             model.eval()
 
     def forward(self, images: Tensor) -> Any:
-        said = list(self.model(list(images)))
-        if len(said) != len(images):
+        targets = list(self.model(list(images)))
+        if len(targets) != len(images):
             raise InputError(
                 "MAITE model: expected a target for each of "
-                f"{len(images)} images, got {len(said)}"
+                f"{len(images)} images, got {len(targets)}"
             )
         if self.task == "classification":
-            return torch.stack([torch.as_tensor(scores).float() for scores in said])
-        return [_detected(target) for target in said]
+            return torch.stack([torch.as_tensor(scores).float() for scores in targets])
+        return [_to_detections(target) for target in targets]
 
 
-def _detected(target: Any) -> dict[str, Tensor]:
+def _to_detections(target: Any) -> dict[str, Tensor]:
+    """Convert an `ObjectDetectionTarget` to boxes, labels and scores."""
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # of every class; `labels` has the likeliest
-        scores = (
-            scores.amax(dim=1) if scores.shape[1] else scores.new_zeros(len(scores))
-        )
+        n_classes = scores.shape[1]
+        scores = scores.amax(dim=1) if n_classes else scores.new_zeros(len(scores))
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
         "boxes": boxes,
@@ -80,18 +80,17 @@ def load_model(
     labels: Any = None,
     **options: Any,
 ) -> models.Model:
-    """Return a model of MAITE, an image classifier or an object detector, as a model of
-    ours.
+    """Convert a model of MAITE, an image classifier or an object detector, to a `Model`.
 
-    It is called with a list of images (3, H, W), float32 tensors. MAITE does not say
-    what size and range of values a model takes: say it by `input_size` and
-    `value_range`. Where its output is no tensor with a graph back to these, searches
-    without gradients are left (`policy="random"`, `"cmaes"`).
+    It is called with a list of images (3, H, W), float32 tensors. MAITE does not state
+    the size and the range of values that a model takes: give `input_size` and
+    `value_range`. If its output is no tensor with a graph back to the images, only
+    searches without gradients work (`policy="random"`, `"cmaes"`).
 
     Args:
         model: called with a sequence of images; returns for each its scores (classes,),
             or an `ObjectDetectionTarget`.
-        input_size: side, or (height, width), in pixels.
+        input_size: size, or (height, width), in pixels.
         task: "classification" or "detection".
         labels: names by index; None takes `index2label` of its metadata.
         options: the others of `advsearch.load_model`, such as `value_range` and `mean`.
@@ -105,14 +104,15 @@ def load_model(
             f"protocols of, got {task!r}"
         )
     metadata = getattr(model, "metadata", {})
-    if labels is None and (named := metadata.get("index2label")):
+    index2label = metadata.get("index2label")
+    if labels is None and index2label:
         labels = [
-            named.get(number, f"class {number}") for number in range(max(named) + 1)
+            index2label.get(index, f"class {index}")
+            for index in range(max(index2label) + 1)
         ]
     name = options.pop("name", str(metadata.get("id", type(model).__name__)))
-    made = _Theirs(model, task)
     return models.load_model(
-        made,
+        _Theirs(model, task),
         task=make_task(task),
         input_size=input_size,
         labels=labels,
@@ -123,7 +123,7 @@ def load_model(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What is true of a picture, as MAITE's `ObjectDetectionTarget`."""
+    """The ground truth of an image, as MAITE's `ObjectDetectionTarget`."""
 
     boxes: Tensor  # (D, 4) float32: x0, y0, x1, y1 in pixels
     labels: Tensor  # (D,) int64
@@ -131,12 +131,12 @@ class Detections:
 
 
 class Scenes:
-    """Pictures of a scene, drawn from its controls, as a dataset of MAITE.
+    """Images of a scene, sampled from its controls, as a dataset of MAITE.
 
     Item k is an image (3, H, W) float32, sRGB in [0, 1] rounded to 8 bits; its target;
     and its metadata: `id`, and the configuration by parameter. The target is one-hot
-    (classes,), or the `Detections` of what is seen and has a name among the labels. An
-    item is rendered when it is asked for, and is the same every time.
+    (classes,), or the `Detections` of what is visible and has a name among the labels.
+    An item is rendered on access, and is the same every time.
 
     Args:
         scene: from `load_scene`, or what that takes.
@@ -173,8 +173,9 @@ class Scenes:
             )
         if count < 1:
             raise InputError(f"count: expected a whole number from 1, got {count}")
-        made = scene if isinstance(scene, loading.Scene) else loading.load_scene(scene)
-        self.renderer = made.renderer(controls, resolution=resolution, seed=seed)
+        if not isinstance(scene, loading.Scene):
+            scene = loading.load_scene(scene)
+        self.renderer = scene.renderer(controls, resolution=resolution, seed=seed)
         self.labels = tuple(labels)
         self.task = task
         self.spp = spp
@@ -198,42 +199,44 @@ class Scenes:
     def __getitem__(
         self, number: int
     ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
-        # raises IndexError, which ends a loop over it
-        number = range(len(self))[number]
-        u = self.us[number]
+        # Raises IndexError, which ends a loop.
+        index = range(len(self))[number]
+        u = self.us[index]
         with torch.no_grad():
-            picture = (
-                to_8_bit(self.renderer(u, seed=number, spp=self.spp))
-                .permute(2, 0, 1)
-                .contiguous()
-            )
+            image = to_8_bit(self.renderer(u, seed=index, spp=self.spp))
         values = self.space.describe(u)
         metadata = {
-            "id": number,
+            "id": index,
             **{name: value["value"] for name, value in values.items()},
         }
-        return picture, self._target(u), metadata
+        return image.permute(2, 0, 1).contiguous(), self._target(u), metadata
 
     def _target(self, u: Tensor) -> Tensor | Detections:
-        right = self.right.indices[0]
+        """Return the target of a configuration (d,)."""
+        right_class = self.right.indices[0]
         if self.task == "classification":
-            return nn.functional.one_hot(torch.tensor(right), len(self.labels)).float()
+            one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
+            return one_hot.float()
         meshes = self.renderer.scene.made[0].meshes
         boxes = []
         classes = []
         for thing in seen_things(self.renderer, u):
-            name = meshes[thing.name].label or thing.name
-            named = right if thing.name == "object" else _index(name, self.labels)
-            if named is not None:
+            class_id: int | None = right_class
+            if thing.name != "object":
+                name = meshes[thing.name].label or thing.name
+                class_id = _find_class(name, self.labels)
+            if class_id is not None:
                 boxes.append(thing.box)
-                classes.append(named)
-        shaped = torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4)
+                classes.append(class_id)
         return Detections(
-            shaped, torch.tensor(classes, dtype=torch.int64), torch.ones(len(boxes))
+            torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4),
+            torch.tensor(classes, dtype=torch.int64),
+            torch.ones(len(boxes)),
         )
 
 
-def _index(name: str, labels: Sequence[str]) -> int | None:
+def _find_class(name: str, labels: Sequence[str]) -> int | None:
+    """Return the index of the class of a name; None if there is none."""
     try:
         return find_label_set(name, labels).indices[0]
     except InputError:

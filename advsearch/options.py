@@ -1,5 +1,5 @@
-"""Options of what has a name on the command line: the fields of a policy's or a task's
-dataclass, Mitsuba's names.
+"""Handle options of what has a name on the command line: the fields of a policy's or a
+task's dataclass, and Mitsuba's names.
 """
 
 from __future__ import annotations
@@ -16,98 +16,110 @@ from typing import Any, TypedDict
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 
-# metadata of a field that is no option: what a run works with decides it
+# Metadata of a field that is no option: it depends on what a run works with.
 FROM_RUN = {"set by": "the run"}
-MOST = 1_000_000  # of whatever an option counts: no budget has more renders
+MOST = 1_000_000  # maximum of a number in options: no budget has more renders
 BY_KEY = "mitsuba"  # the control whose parameters have Mitsuba's names
-JOINED = "+"  # between the names of tasks that are asked of several models at once
+JOINED = "+"  # separates the names of joint tasks, one for each of several models
 
 
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
-    """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``,
-    all keys together. ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
-    Raises InputError: a key has no range, or two.
+    """Group Mitsuba's keys: return controls with ``{"mitsuba:KEY": RANGE}`` as
+    ``{"mitsuba": {KEY: RANGE}}``.
+
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
+
+    Raises:
+        InputError: a key has no range, or two.
     """
     plain = dict[str, object]()
     ranges = dict[str, object]()
-    for name, given in controls.items():
+    for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
-            _, dot, parameter = str(name).partition(".")
-            spec = isinstance(given, Mapping) and bool(
-                given.keys() & {"distribution", "choices", "range"}
-            )
-            alone = (
-                dot
-                and ":" not in name
-                and not (given is None or (isinstance(given, Mapping) and not spec))
-            )
-            plain[name] = {parameter: given} if alone else given
-        elif not key or given is None or given in ({}, ""):
+            plain[name] = _with_parameter(str(name), options)
+        elif not key or options is None or options in ({}, ""):
             raise InputError(
                 f"`controls` {name}: expected a range, as in "
                 f"{BY_KEY}:{key or 'KEY'}=[0.2, 0.8]"
             )
         else:
-            ranges[key] = given
+            ranges[key] = options
     if not ranges:
         return plain
-    together = plain.get(BY_KEY) or {}
-    if not isinstance(together, Mapping) or together.keys() & ranges.keys():
+    grouped = plain.get(BY_KEY) or {}
+    if not isinstance(grouped, Mapping) or grouped.keys() & ranges.keys():
         raise InputError(
             f"`controls` {BY_KEY}: expected each of Mitsuba's names once, with a range"
         )
-    return {**plain, BY_KEY: {**together, **ranges}}
+    return {**plain, BY_KEY: {**grouped, **ranges}}
+
+
+def _with_parameter(name: str, options: object) -> object:
+    """Return the options of a control; a range of "pose.yaw" is that of its parameter
+    "yaw".
+    """
+    _, dot, parameter = name.partition(".")
+    if not dot or ":" in name or options is None:
+        return options
+    is_range = not isinstance(options, Mapping) or bool(
+        options.keys() & {"distribution", "choices", "range"}
+    )
+    return {parameter: options} if is_range else options
 
 
 def things_as_text(things: object) -> str | None:
-    """Return things beside an object in the one text that settings have, of a text, a
-    mapping, or a list of such: ``car@12,3.5,heading=180; person@6,-2``. Files are named
-    by their absolute paths, so that a run may go on from anywhere. Raises InputError
-    where it is something else.
+    """Return things in a scene as the text that settings have: ``car@12,3.5,heading=180;
+    person@6,-2``.
+
+    Files are named by their absolute paths, so that a run may be resumed anywhere.
+
+    Args:
+        things: a text, a mapping, or a list of such; None for none.
+
+    Raises:
+        InputError: it is something else.
     """
-    listed = (
-        things
-        if isinstance(things, (list, tuple))
-        else []
-        if things is None
-        else [things]
-    )
-    if not all(isinstance(thing, (str, Mapping)) for thing in listed):
+    if isinstance(things, (list, tuple)):
+        items = things
+    else:
+        items = [] if things is None else [things]
+    if not all(isinstance(item, (str, Mapping)) for item in items):
         raise InputError(
             "things: expected a text such as 'car@12,3.5', a mapping or a list of "
             f"these, got {things!r:.80}"
         )
     text = ";".join(
-        _thing_as_text(thing) if isinstance(thing, Mapping) else str(thing)
-        for thing in listed
+        _thing_as_text(item) if isinstance(item, Mapping) else str(item)
+        for item in items
     )
-    named = []
-    for part in filter(None, map(str.strip, text.split(";"))):
-        what, at, rest = part.rpartition("@")
-        file, mark, node = what.strip().partition("#")
-        what = (
-            f"{Path(file).resolve()}{mark}{node}"
-            if "." in file and Path(file).is_file()
-            else what.strip()
-        )
-        named.append(f"{what}{at}{rest}")
-    return "; ".join(named) or None
+    texts = []
+    for thing in filter(None, map(str.strip, text.split(";"))):
+        object_name, at, options = thing.rpartition("@")
+        object_name = object_name.strip()
+        file, mark, node = object_name.partition("#")
+        if "." in file and Path(file).is_file():
+            object_name = f"{Path(file).resolve()}{mark}{node}"
+        texts.append(f"{object_name}{at}{options}")
+    return "; ".join(texts) or None
 
 
 def _thing_as_text(thing: Mapping[str, Any]) -> str:
-    needed = ("object", "x", "y")
-    if not thing.keys() >= {*needed}:
+    """Return a thing as text: its object, x and y, and further options."""
+    required = ("object", "x", "y")
+    if not thing.keys() >= {*required}:
         raise InputError(
             f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, "
             f"'y': 3.5}}, "
             f"got {dict(thing)!r:.80}"
         )
-    options = [f"{name}={value}" for name, value in thing.items() if name not in needed]
-    return ",".join([f"{thing['object']}@{thing['x']}", f"{thing['y']}", *options])
+    position = [f"{thing['object']}@{thing['x']}", f"{thing['y']}"]
+    options = [f"{name}={thing[name]}" for name in thing if name not in required]
+    return ",".join([*position, *options])
 
 
 def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
+    """Return the fields of a dataclass that are options, by name."""
     return {
         field.name: field
         for field in fields(kind)
@@ -116,28 +128,38 @@ def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
 
 
 def check_options(
-    what: str, name: str, kind: type[Any], given: Mapping[str, object]
+    what: str, name: str, kind: type[Any], options: Mapping[str, object]
 ) -> None:
-    """Check that a dataclass has such options of `what` ("policy", say), and that a
-    number, a truth value or a text is one; ranges are theirs. Raises UnknownNameError:
-    there is no such option; InputError: a value is of another type.
+    """Check that a dataclass has such options, and that their values have its types.
+
+    The class checks ranges itself.
+
+    Args:
+        what: "policy", say, for messages.
+        name: of the policy.
+        kind: the dataclass.
+        options: by name.
+
+    Raises:
+        UnknownNameError: there is no such option.
+        InputError: a value is of another type.
     """
-    known = declared_options(kind)
-    for option, value in given.items():
-        if option not in known:
-            raise UnknownNameError(f"option of {what} {name!r}:", option, known)
-        number = (
+    declared = declared_options(kind)
+    for option, value in options.items():
+        if option not in declared:
+            raise UnknownNameError(f"option of {what} {name!r}:", option, declared)
+        is_number = (
             isinstance(value, (int, float))
             and not isinstance(value, bool)
             and not abs(value) > MOST
         )
-        whole = number and value % 1 == 0  # type: ignore[operator]
+        is_integer = is_number and value % 1 == 0  # type: ignore[operator]
         fits, expected = {
-            "float": (number, f"a finite number from {-MOST} to {MOST}"),
-            "int": (whole, f"a whole number from {-MOST} to {MOST}"),
+            "float": (is_number, f"a finite number from {-MOST} to {MOST}"),
+            "int": (is_integer, f"a whole number from {-MOST} to {MOST}"),
             "bool": (isinstance(value, bool), "true or false"),
             "str": (isinstance(value, str), "a text"),
-        }.get(type_of(known[option]), (True, ""))
+        }.get(type_of(declared[option]), (True, ""))
         if not fits:
             raise InputError(
                 f"{option} of {what} {name}: expected {expected}, got {value!r:.80}"
@@ -145,39 +167,41 @@ def check_options(
 
 
 def type_of(option: Field[Any]) -> str:
+    """Return the name of the type of an option."""
     return str(getattr(option.type, "__name__", option.type))
 
 
 def default_of(option: Field[Any]) -> Any:
-    """Return what an option is by default; None where it has to be given."""
+    """Return the default of an option; None if it has none."""
     if option.default is not MISSING:
         return option.default
     return None if option.default_factory is MISSING else option.default_factory()
 
 
 def _as_json(value: object) -> JsonValue:
+    """Return a value as a JSON value; None if it, or a part of it, is none."""
     if isinstance(value, Mapping):
         mapping = {
             name: _as_json(inner)
             for name, inner in value.items()
             if isinstance(name, str)
         }
-        return (
-            mapping
-            if len(mapping) == len(value) and None not in mapping.values()
-            else None
-        )
+        is_complete = len(mapping) == len(value) and None not in mapping.values()
+        return mapping if is_complete else None
     if isinstance(value, (list, tuple)):
-        listed = [_as_json(inner) for inner in value]
-        return None if None in listed else listed
-    finite = isinstance(value, float) and math.isfinite(value)
-    return value if finite or isinstance(value, (bool, int, str)) else None  # type: ignore[return-value]
+        items = [_as_json(inner) for inner in value]
+        return None if None in items else items
+    is_finite = isinstance(value, float) and math.isfinite(value)
+    if is_finite or isinstance(value, (bool, int, str)):
+        return value  # type: ignore[return-value]
+    return None
 
 
 def as_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return what a file says of a policy or a task: its name, with the options that
-    differ from their defaults; but for those that are no finite number, truth value,
-    text, or list or mapping of these.
+    """Return a policy or a task as a setting in a file: its name, with the options that differ
+    from their defaults.
+
+    Options that are no JSON values are left out.
     """
     name = str(entry.name)
     options = {}
@@ -188,20 +212,25 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
     return {"name": name, **options} if options else name
 
 
-def told(given: object) -> str:
-    """Return in words what was given in the place of an instance; of a class, what
-    makes one of it.
+def told(value: object) -> str:
+    """Describe a value that is not the expected instance; for a class, how to create
+    one.
     """
-    return (
-        f"the class {given.__name__}; write {given.__name__}()"
-        if isinstance(given, type)
-        else f"{given!r:.80}"
-    )
+    if isinstance(value, type):
+        return f"the class {value.__name__}; write {value.__name__}()"
+    return f"{value!r:.80}"
 
 
 def check_takes(what: str, function: Callable[..., object], *names: str) -> None:
-    """Check, by an InputError, that a user's function ("metrics: f") takes arguments of
-    these names by position.
+    """Check that a user's function takes arguments of these names by position.
+
+    Args:
+        what: of the function, for messages ("metrics: f").
+        function: to check.
+        *names: of the arguments.
+
+    Raises:
+        InputError: it does not.
     """
     try:
         inspect.signature(function).bind(*names)
@@ -224,12 +253,11 @@ class Value(TypedDict):
     unit: str
 
 
-# what an output of a model is called that has NaN or infinity in it: it has said
-# nothing
+# Label of an output with NaN or infinity: it is no prediction.
 NOT_A_NUMBER = "not a number"
 OUT_OF_VIEW = "out of view"
-"""What a prediction is called where nothing of what is judged is in the picture. It is
-not a success of a search, and no share of right predictions counts it.
+"""Label of a prediction about an image without the evaluated thing. It is no success of
+a search, and accuracies do not count it.
 """
 
 
@@ -255,9 +283,7 @@ OUTCOME = "outcome"  # under which a payload has the value of one
 
 
 def get_outcome(payload: object) -> Outcome | None:
-    """Return the outcome that the payload of a prediction states; None where it states
-    none.
-    """
+    """Return the outcome that the payload of a prediction states; None if it states none."""
     value = payload.get(OUTCOME) if isinstance(payload, Mapping) else None
     try:
         return Outcome(value)
@@ -266,8 +292,8 @@ def get_outcome(payload: object) -> Outcome | None:
 
 
 def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
-    """Count the outcomes of predictions that are not right, by value; None where no
-    payload states one.
+    """Count the outcomes of predictions that are not right, by value; None if no payload states
+    one.
     """
     counts = Counter(get_outcome(payload) for payload in payloads)
     named = {outcome.value: counts[outcome] for outcome in Outcome if counts[outcome]}
@@ -275,7 +301,5 @@ def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
 
 
 def rounded(number: float) -> str:
-    """Return a number that was worked out as sentences have it: with three significant
-    digits.
-    """
+    """Format a computed number for sentences: with three significant digits."""
     return f"{float(f'{number:.3g}'):g}"

@@ -1,5 +1,4 @@
-"""Registries: things of one kind by their word on the command line, our own and those
-of other packages.
+"""Registries: built-in and installed parts of one kind by their name on the command line.
 
 A package adds to a registry through an entry point of the registry's group, as
 `docs/extending.md` shows.
@@ -26,50 +25,54 @@ Entry = TypeVar("Entry")
 
 @dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
-    """Entries by name: our own first, in the order given, then those of installed
-    packages; ours win. An entry is imported when it is asked for, so that a package
-    which can't be imported disturbs no other.
+    """Entries by name: the built-in ones first, in their order, then those of installed
+    packages; built-in names win.
+
+    An entry is imported on access, so that a package that cannot be imported affects no
+    other.
     """
 
     group: str  # of entry points: "advsearch.policies"
-    # our entries; one of the catalog is imported when it is asked for
+    # The built-in entries; those of the catalog are imported on access.
     own: Mapping[str, Entry | BuiltIn]
-    # what an entry is, for messages: "a subclass of Policy whose name is that of the
-    # entry point"
+    # Description of an entry for messages: "a subclass of Policy whose name is that of
+    # the entry point".
     expected: str
-    fits: Callable[[str, Any], bool]  # whether an object under a name is one
-    # whether the name "package.module:Class", of something that nobody has registered,
-    # is one too: a class with a capital letter, from the Python path or the current
-    # directory
+    fits: Callable[[str, Any], bool]  # whether an object under a name is an entry
+    # Whether "package.module:Class" names an entry too without registration: a class
+    # with a capital letter, from the Python path or the current directory.
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
-        """Return an entry. Raises InputError where the class that a name is cannot be
-        imported, is something else, or must not be imported (`check_import`).
+        """Return an entry.
+
+        Raises:
+            InputError: the class that a name is cannot be imported, is something else, or must
+                not be imported (`check_import`).
         """
         if not self.names_class(name):
             if name not in self.own:
                 return self._load(name)
-            own = self.own[name]
-            entry: Entry = imported(own.target) if isinstance(own, BuiltIn) else own
-            return entry
+            built_in = self.own[name]
+            if not isinstance(built_in, BuiltIn):
+                return built_in
+            target: Entry = imported(built_in.target)
+            return target
         check_import(name)
         try:
             with current_directory_importable():
-                entry = imported(name)
+                entry: Entry = imported(name)
         except Exception as error:  # the user's code may raise anything
-            mend = f"a module is looked for on the Python path and in {os.getcwd()}"
             raise InputError(
-                f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}"
+                f"{name}: cannot be imported ({type(error).__name__}: {error}); "
+                f"a module is looked for on the Python path and in {os.getcwd()}"
             ) from error
         if not self.fits(getattr(entry, "kind", ""), entry):
             raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is an entry, which is imported only where the name is
-        that of a class.
-        """
+        """Whether there is an entry. It is imported only if its name is that of a class."""
         if not isinstance(name, str):
             return False
         if self.names_class(name):
@@ -77,27 +80,26 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return name in self.own or name in self._installed
 
     def __iter__(self) -> Iterator[str]:
-        return iter(
-            [*self.own, *(name for name in self._installed if name not in self.own)]
-        )
+        added = [name for name in self._installed if name not in self.own]
+        return iter([*self.own, *added])
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
     def get_help(self, name: str) -> str:
-        """Return what an entry is, in a sentence: of the catalog, or of another one the
-        docstring's first line; of one that can't be imported, why.
+        """Return a sentence about an entry: of the catalog, or the first line of its docstring; if
+        it cannot be imported, why.
         """
-        own = self.own.get(name)
-        if isinstance(own, BuiltIn):
-            return f"{own.help[0].upper()}{own.help[1:]}."
+        entry = self.own.get(name)
+        if isinstance(entry, BuiltIn):
+            return f"{entry.help[0].upper()}{entry.help[1:]}."
         try:
             return get_first_doc_line(self[name])
         except InputError as error:
             return f"{error}."
 
     def list_usable(self) -> dict[str, Entry]:
-        """Return all entries but those of packages that can't be imported."""
+        """Return all entries except those of packages that cannot be imported."""
         usable = dict[str, Entry]()
         for name in self:
             with suppress(InputError):
@@ -108,18 +110,13 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Whether a name is that of a class to import, and not of an instance of a
         registered entry ("light:Key").
         """
-        module, colon, attribute = name.partition(":")
-        if not (
-            self.imports
-            and colon
-            and attribute[:1].isupper()
-            and attribute.isidentifier()
-        ):
+        module, _, attribute = name.partition(":")
+        is_class_name = attribute[:1].isupper() and attribute.isidentifier()
+        if not self.imports or not is_class_name:
             return False
-        parts = module.split(".")
-        return all(part.isidentifier() for part in parts) and not (
-            parts[0] in self.own or parts[0] in self._installed
-        )
+        packages = module.split(".")
+        is_entry = packages[0] in self.own or packages[0] in self._installed
+        return not is_entry and all(package.isidentifier() for package in packages)
 
     @cached_property
     def _installed(self) -> dict[str, EntryPoint]:
@@ -131,37 +128,38 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """
         point = self._installed[name]
         where = f"entry point {name} = {point.value} of group {self.group}"
-        mend = "repair or uninstall the package that declares it"
+        advice = "repair or uninstall the package that declares it"
         try:
             entry: Entry = point.load()
         except Exception as error:  # another package's code may raise anything
-            raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
+            raise InputError(
+                f"{where}: cannot be imported ({error}); {advice}"
+            ) from None
         if not self.fits(name, entry):
-            raise InputError(f"{where}: expected {self.expected}; {mend}")
+            raise InputError(f"{where}: expected {self.expected}; {advice}")
         return entry
 
 
 def get_first_doc_line(entry: Any) -> str:
-    """Return the first line of what an object says of itself; empty for plain
-    values.
-    """
-    documented = (
-        entry if inspect.isroutine(entry) or inspect.isclass(entry) else type(entry)
-    )
+    """Return the first line of the docstring of an object; empty for plain values."""
+    is_documented = inspect.isroutine(entry) or inspect.isclass(entry)
+    documented = entry if is_documented else type(entry)
     if documented.__module__ == "builtins":
         return str(entry) if isinstance(entry, str) else ""
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
 def imported(place: str) -> Any:
-    """Return what "module:attribute" names."""
+    """Import what "module:attribute" names."""
     module, _, attribute = place.partition(":")
     return getattr(import_module(module), attribute)
 
 
 def get_class(kind: str, name: str) -> Any:
-    """Return the class of a built-in part by its own name, which is imported. Raises
-    AttributeError: there is none.
+    """Import the class of a built-in part by its own name.
+
+    Raises:
+        AttributeError: there is none.
     """
     for part in list_built_ins(kind).values():
         if part.target.endswith(f":{name}"):
@@ -181,8 +179,10 @@ EXPERIMENTS: Registry[Any] = Registry(
 
 
 def get_experiment(name: str) -> Any:
-    """Return an experiment by the name of its command. Raises UnknownNameError: there
-    is none.
+    """Return an experiment by the name of its command.
+
+    Raises:
+        UnknownNameError: there is none.
     """
     if name not in EXPERIMENTS:
         raise UnknownNameError("command", name, EXPERIMENTS)
@@ -190,15 +190,12 @@ def get_experiment(name: str) -> Any:
 
 
 def get_experiment_help(name: str) -> str:
-    """Return what an experiment does, in a line: of the catalog, or of an installed one
-    the docstring's first line.
+    """Return a line about an experiment: of the catalog, or the first line of the
+    docstring of an installed one.
     """
     built_in = EXPERIMENTS.own.get(name)
     if isinstance(built_in, BuiltIn):
         return built_in.help
-    summary = (
-        (inspect.getdoc(get_experiment(name).function) or "")
-        .partition("\n")[0]
-        .rstrip(".")
-    )
+    docstring = inspect.getdoc(get_experiment(name).function) or ""
+    summary = docstring.partition("\n")[0].rstrip(".")
     return summary[:1].lower() + summary[1:]

@@ -121,8 +121,7 @@ def assert_no_worse(
 
 
 def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
-    """Assert that all claims of a suite are held, or are what was expected when it was
-    last updated.
+    """Assert that all claims of a suite hold, or are as expected when it was last updated.
 
     Args:
         suite: a YAML file.
@@ -158,72 +157,96 @@ def _asserted(
     seed: int,
     run: str | Path | None,
 ) -> SuiteResult:
+    """Run a suite with one claim, and assert that it holds.
+
+    Args:
+        claim: as in a suite, without models.
+        object: of the scene, or the scene.
+        models: by the settings that name them.
+        settings: of the suite.
+        confidence: of the test.
+        seed: of the images.
+        run: where the run is stored.
+
+    Raises:
+        AssertionError: the claim is shown to be wrong, or undecided.
+    """
     __tracebackhide__ = True
-    # late: torch takes long to import
+    # torch takes long to import
     from advsearch.extend import workbench
 
-    loading = workbench.loading
     experiment = workbench.get_experiment("test")
-    name = str(claim["claim"]).replace("_", "-")
-    objects: dict[tuple[str, str], Any] = {}
+    claim_name = str(claim["claim"]).replace("_", "-")
+    title = f"assert_{claim['claim']}"
     with workbench.in_turn():
-        for named in (settings, *({"model": one} for one in models.values())):
-            workbench.allow_named(named)
-        given = dict(settings)
-        said = dict(claim)
-        if isinstance(object, loading.Scene):
-            given |= {
-                key: value
-                for key, value in loading.scene_as_settings(object).items()
-                if value is not None
-            }
-            objects["scene", given["object"]] = object
-        else:
-            given["object"] = str(object)
+        workbench.allow_named(settings)
+        for model in models.values():
+            workbench.allow_named({"model": model})
+        suite_settings, objects = _name_objects(object, settings)
+        claim_settings = dict(claim)
+        python_only = [workbench.PythonOnly("call", f"of {title}")]
         for key, model in models.items():
-            (given if key == "model" else said)[key] = workbench.model_name(model)
+            model_name = workbench.model_name(model)
+            target = suite_settings if key == "model" else claim_settings
+            target[key] = model_name
             if not isinstance(model, (str, Path)):
-                objects["model", workbench.model_name(model)] = model
-        if instances := loading.instances_in(given.get("controls", ())):
-            objects |= {("control", control.name): control for control in instances}
-            given["controls"] = loading.settings_of(given["controls"])
-        title = f"assert_{claim['claim']}"
-        values = {
+                objects["model", model_name] = model
+            if workbench.exists_here(model):
+                python_only.append(workbench.PythonOnly("model", model_name))
+        suite = {
             "title": title,
-            "settings": given,
+            "settings": suite_settings,
             "seed": seed,
             "confidence": confidence,
-            "claims": {name: said},
+            "claims": {claim_name: claim_settings},
         }
-        only_here = [workbench.PythonOnly("call", f"of {title}")]
-        only_here += [
-            workbench.PythonOnly("model", workbench.model_name(model))
-            for model in models.values()
-            if workbench.exists_here(model)
-        ]
-        config = experiment.settings(
-            suite=title, run=None if run is None else str(run)
-        ).with_only_here(only_here)
-        result: SuiteResult = experiment.run(
-            config.with_python_objects(objects), suite=values
-        )
-    (claimed,) = result.claims
-    if claimed.answer != "held":
+        config = experiment.settings(suite=title, run=None if run is None else str(run))
+        config = config.with_only_here(python_only).with_python_objects(objects)
+        result: SuiteResult = experiment.run(config, suite=suite)
+    (claim_result,) = result.claims
+    if claim_result.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
-        again = (
-            f"pytest {shlex.quote(test)}"
-            if test
-            else ("call the same function with the same arguments")
-        )
-        raise AssertionError(_report(result, claimed, again))
+        repeat = "call the same function with the same arguments"
+        if test:
+            repeat = f"pytest {shlex.quote(test)}"
+        raise AssertionError(_report(result, claim_result, repeat))
     return result
 
 
-def _report(result: SuiteResult, claim: ClaimResult, again: str) -> str:
+def _name_objects(
+    object: str | Path | workbench.Scene, settings: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
+    """Return settings in which names stand for the scene and for controls, and these
+    objects by role and name.
+    """
+    from advsearch.extend import workbench
+
+    loading = workbench.loading
+    named = dict(settings)
+    objects: dict[tuple[str, str], Any] = {}
+    if isinstance(object, loading.Scene):
+        scene_settings = loading.scene_as_settings(object)
+        named |= {
+            name: value for name, value in scene_settings.items() if value is not None
+        }
+        objects["scene", named["object"]] = object
+    else:
+        named["object"] = str(object)
+    controls = loading.instances_in(named.get("controls", ()))
+    if controls:
+        objects |= {("control", control.name): control for control in controls}
+        named["controls"] = loading.settings_of(named["controls"])
+    return named, objects
+
+
+def _report(result: SuiteResult, claim: ClaimResult, repeat: str) -> str:
+    """Return the message of a failed claim; `repeat` is what runs it again."""
     run = Path(result.run or "")
     lines = [
         f"{claim.name}: {claim.answer}: {claim.reason}",
         f"  claimed: {claim.statement}",
     ]
-    lines += [f"  picture: {(run / claim.picture).resolve()}"] if claim.picture else []
-    return "\n".join([*lines, f"  run: {run}", f"  again: {again}"])
+    if claim.picture:
+        lines.append(f"  picture: {(run / claim.picture).resolve()}")
+    lines += [f"  run: {run}", f"  again: {repeat}"]
+    return "\n".join(lines)

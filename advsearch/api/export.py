@@ -1,6 +1,6 @@
-"""The adversarial scene of a run for other programs and for print.
+"""Export the adversarial scene of a run to other programs and to print.
 
-Other programs get the adversarial scene. Printed are patches, and textures unwrapped
+Other programs get the adversarial scene. Patches are printed, and textures unwrapped
 into pieces, in true millimetres.
 """
 
@@ -18,7 +18,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.controls.base import file_name
+from advsearch.controls.base import Control, file_name
 from advsearch.controls.support.images import enlarged
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
@@ -27,7 +27,7 @@ from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import attack_of
+from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import read_png, to_8bit
@@ -40,9 +40,13 @@ from advsearch.scene.raster import doubled_areas, rasterised
 
 @dataclass(frozen=True, eq=False)
 class AdversarialRun:
-    """A run's folder, its problem as it had it, and its adversarial configuration: u
-    (d,), the configuration of the whole space; what varies by chance is as in the clean
-    scene.
+    """A run with its problem and its adversarial configuration.
+
+    Attributes:
+        folder: of the run.
+        problem: as the run had it.
+        u: (d,), the configuration in the full space; what varies by chance is as in the
+            clean scene.
     """
 
     folder: Path
@@ -51,11 +55,11 @@ class AdversarialRun:
 
     @classmethod
     def load(cls, run: str | Path) -> AdversarialRun:
-        """Load the scene of a run of `attack` that has ended, by its name or folder,
-        and its adversarial configuration.
+        """Load the adversarial scene of a finished run of `attack`, by its name or folder.
 
-        Raises InputError where it has none, or its scene is another one now, and
-        FileFormatError where it did not end, or is of another command.
+        Raises:
+            InputError: it has none, or its scene has changed.
+            FileFormatError: it has not finished, or is of another command.
         """
         folder = find_run(run)
         summary = attack_of(folder)
@@ -77,16 +81,14 @@ class AdversarialRun:
         )
 
     def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return the inputs of the scene inside Mitsuba, and those that are applied to
-        its image.
-        """
+        """Return the inputs of the scene inside Mitsuba, and those applied to its image."""
         inputs = self.inputs
         on_image = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
         return inputs, on_image
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
-        """Return the object as the scene describes it, and as it is there: displaced,
-        in its pose, with its texture.
+        """Return the object as the scene describes it, and as it is in the scene: displaced, in its
+        pose, with its texture.
         """
         description = self.problem.space.scene
         assert description is not None
@@ -94,9 +96,7 @@ class AdversarialRun:
         return part, posed(part, self.inputs)
 
     def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render the scene with some inputs, as the run does it: an image (H, W, 3)
-        sRGB in [0, 1].
-        """
+        """Render the scene with some inputs as the run does: an image (H, W, 3), sRGB in [0, 1]."""
         renderer = self.problem.renderer
         traced = {
             name: value for name, value in inputs.items() if name not in ON_PICTURE
@@ -107,7 +107,7 @@ class AdversarialRun:
 
     @property
     def on_picture(self) -> list[str]:
-        """The controls that change the finished picture there."""
+        """The names of the controls that change the rendered image."""
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
         slices = self.problem.space.slices(self.u)
         return [
@@ -118,25 +118,25 @@ class AdversarialRun:
 
     @property
     def inputs(self) -> dict[str, Tensor]:
-        """Those of the scene inside Mitsuba, and what is applied to its picture."""
+        """The inputs of the scene inside Mitsuba, and those applied to its image."""
         renderer = self.problem.renderer
         with torch.no_grad():
             return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
-BLEED = 3.0  # millimetres of colour beyond the line to cut
+BLEED = 3.0  # color beyond the line to cut, in millimetres
 FINEST = 0.2
-"""Millimetres of a pixel that is fine enough: texels are divided until they are no
-larger, and are interpolated between as the renderer does it.
+"""Maximum size of a printed pixel in millimetres: larger texels are subdivided, with the
+renderer's interpolation.
 """
-# parts of a texel along each side, odd: the middle one has the texel's own colour
+# Maximum subdivisions of a texel per axis; odd, so that the center has its own color.
 MOST_PARTS = 9
-LONGEST = 100_000.0  # longest side of a printed object, in millimetres
+LONGEST = 100_000.0  # maximum size of a printed object in millimetres
 
 
 def real_size(run: str | Path) -> float | None:
-    """Return the longest side of the object of a run of `attack`, in millimetres; None
-    where its size is not known.
+    """Return the size of the object of a run of `attack`, its longest side in millimetres; None
+    if it is unknown.
     """
     folder = find_run(run)
     attack_of(folder)  # refuses others
@@ -145,6 +145,7 @@ def real_size(run: str | Path) -> float | None:
 
 
 def _alone(config: AttackConfig) -> Scene:
+    """Load the scene of an attack with the object alone, without an environment."""
     return load_scene(
         config.object,
         NO_MAP,
@@ -156,13 +157,19 @@ def _alone(config: AttackConfig) -> Scene:
 
 
 def printable(run: str | Path, size: float) -> list[Piece]:
-    """Return what of the adversarial scene of a run of `attack` can be printed, by the
-    longest side of the real object in millimetres. A patch is one piece. A texture has
-    one for each connected part of the unwrapped surface, stretched along both sides to
-    the mean size that its texels have on the object; what is left of distortion within
-    a piece is in its name. Raises InputError where nothing can be printed, or the size
-    is out of range, and FileFormatError where the run is of another kind, has not
-    ended, or lacks its files.
+    """Return the printable pieces of the adversarial scene of a run of `attack`.
+
+    A patch is one piece. A texture has a piece for each connected part of the unwrapped
+    surface, stretched along both axes to the mean size of its texels on the object; the
+    distortion that remains within a piece is in its name.
+
+    Args:
+        run: its name or folder.
+        size: longest side of the real object in millimetres.
+
+    Raises:
+        InputError: nothing can be printed, or the size is out of range.
+        FileFormatError: the run is of another kind, has not finished, or lacks files.
     """
     if not 1.0 <= size <= LONGEST:
         raise InputError(
@@ -175,41 +182,23 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     scene = _alone(config)
     pieces = list[Piece]()
     for control in as_controls(config.controls):
-        picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"
+        texture_file = folder / ARTIFACTS / f"{file_name(control.name)}.png"
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
-            searched = (summary.configuration or {}).get(f"{control.name}.size")
-            fixed: Any = (
-                config.controls.get(control.name, {}).get("size")
-                if searched is None
-                else searched.value
-            )
-            default = next(
-                parameter.default
-                for parameter in control.parameters
-                if parameter.name == "size"
-            )
-            side = size * float(fixed if isinstance(fixed, (int, float)) else default)
-            pieces.append(
-                _piece(
-                    f"{control.name}, {side:.1f} mm a side",
-                    pixels,
-                    (side / len(pixels),) * 2,
-                    None,
-                )
-            )
-        elif isinstance(control, TextureControl) and picture.is_file():
+            patch_size = size * _relative_patch_size(control, config, summary)
+            pixel_size = patch_size / len(pixels)
+            name = f"{control.name}, {patch_size:.1f} mm a side"
+            pieces.append(_piece(name, pixels, (pixel_size, pixel_size), None))
+        elif isinstance(control, TextureControl) and texture_file.is_file():
             mesh = control.mesh_in(scene.description).mesh
-            named = control.materials_in(scene.description)
-            faces = (
-                None
-                if named is None
-                else np.concatenate([mesh.materials[one] for one in named])
-            )
-            extent = float(np.ptp(scene.description.object.mesh.vertices, axis=0).max())
-            pieces.extend(
-                _charts(control.name, read_png(picture), mesh, faces, size / extent)
-            )
+            materials = control.materials_in(scene.description)
+            faces = None
+            if materials is not None:
+                faces = np.concatenate([mesh.materials[name] for name in materials])
+            vertices = scene.description.object.mesh.vertices
+            scale = size / float(np.ptp(vertices, axis=0).max())
+            texture = read_png(texture_file)
+            pieces.extend(_charts(control.name, texture, mesh, faces, scale))
     if not pieces:
         raise InputError(
             f"{folder}: it has neither a texture nor a patch, so that "
@@ -218,78 +207,137 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     return pieces
 
 
+def _relative_patch_size(
+    control: Control, config: AttackConfig, summary: AttackSummary
+) -> float:
+    """Return the size of a patch relative to the object: as found, fixed or default."""
+    found = (summary.configuration or {}).get(f"{control.name}.size")
+    size: Any
+    if found is not None:
+        size = found.value
+    else:
+        size = config.controls.get(control.name, {}).get("size")
+    if not isinstance(size, (int, float)):
+        size = next(
+            parameter.default
+            for parameter in control.parameters
+            if parameter.name == "size"
+        )
+    return float(size)
+
+
 def _charts(
     name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float
 ) -> Iterator[Piece]:
-    """Yield the connected parts of a texture as they are seen from outside, the largest
-    first; with `faces` those of these faces. Neighbouring texels of one part lie a
-    distance apart on the surface; the mean over the part, along columns and rows, is
-    the size that they get. `scale` is in millimetres a mesh unit.
+    """Yield the connected parts of a texture as seen from outside, the largest first.
+
+    Args:
+        name: of the texture.
+        texture: (h, w, 3).
+        mesh: with the texture coordinates.
+        faces: indices of the faces whose parts are printed; None for all.
+        scale: millimetres per mesh unit.
     """
-    areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
-    charts = rasterised(mesh, (texture.shape[0], texture.shape[1]))
-    places = charts.positions().astype(np.float64)
-    labels, count = ndimage.label(
-        charts.covered & (True if faces is None else np.isin(charts.face, faces))
-    )
-    boxes = ndimage.find_objects(labels)
-    order = sorted(
-        range(count), key=lambda index: -int((labels[boxes[index]] == index + 1).sum())
-    )
-    for number, index in enumerate(order, 1):
-        rows, columns = boxes[index]
-        inside = labels[rows, columns] == index + 1
-        # distances on the surface between texels that are neighbours along an axis
-        steps = []
-        for axis in (1, 0):
-            lengths = np.linalg.norm(
-                np.diff(places[rows, columns] * scale, axis=axis), axis=-1
-            )
-            within = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
-            steps.append(lengths[within])
-        if not all(len(step) for step in steps):
-            continue  # a line of texels has no area to print
-        pixel = float(np.mean(steps[0])), float(np.mean(steps[1]))
-        if min(pixel) <= 0.0:
+    uv_areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
+    raster = rasterised(mesh, (texture.shape[0], texture.shape[1]))
+    positions = raster.positions().astype(np.float64)
+    is_printed = raster.covered
+    if faces is not None:
+        is_printed = is_printed & np.isin(raster.face, faces)
+    charts = _label_charts(is_printed)
+    for number, (box, inside) in enumerate(charts, 1):
+        measured = _texel_size(positions[box] * scale, inside)
+        if measured is None:
             continue
-        stretch = max(float(np.std(step) / np.mean(step)) for step in steps)
-        nearest = ndimage.distance_transform_edt(
-            ~inside, return_distances=False, return_indices=True
-        )
-        picture = texture[rows, columns][tuple(nearest)]
-        if areas[np.unique(charts.face[rows, columns][inside])].sum() < 0.0:
-            picture = picture[:, ::-1]
+        texel_size, distortion = measured
+        image = _extend_inside(texture[box], inside)
+        is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
+        if is_mirrored:
+            image = image[:, ::-1]
             inside = inside[:, ::-1]
-        title = name if count == 1 else f"{name}, piece {number}"
-        title += (
-            f" (sizes within it differ by {100 * stretch:.0f} %)"
-            if stretch >= 0.005
-            else ""
-        )
-        yield _piece(title, picture, pixel, inside)
+        title = name if len(charts) == 1 else f"{name}, piece {number}"
+        if distortion >= 0.005:
+            title += f" (sizes within it differ by {100 * distortion:.0f} %)"
+        yield _piece(title, image, texel_size, inside)
+
+
+def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
+    """Find the connected parts of a mask (h, w), the largest first.
+
+    Returns:
+        The bounding box of each part, and its mask inside the box.
+    """
+    labels, count = ndimage.label(is_printed)
+    boxes = ndimage.find_objects(labels)
+    charts = [(boxes[k], labels[boxes[k]] == k + 1) for k in range(count)]
+    return sorted(charts, key=lambda chart: -int(chart[1].sum()))
+
+
+def _extend_inside(image: Floats, inside: Mask) -> Floats:
+    """Replace the pixels outside a mask by the nearest ones inside."""
+    nearest_inside = ndimage.distance_transform_edt(
+        ~inside, return_distances=False, return_indices=True
+    )
+    extended: Floats = image[tuple(nearest_inside)]
+    return extended
+
+
+def _texel_size(
+    positions: Floats, inside: Mask
+) -> tuple[tuple[float, float], float] | None:
+    """Measure the texels of a part on the surface.
+
+    Args:
+        positions: (h, w, 3) of the texels, in millimetres.
+        inside: (h, w) bool, the texels of the part.
+
+    Returns:
+        The mean distance of neighbouring texels along columns and rows, and the larger
+        of the coefficients of variation of these distances; None if the part is a line
+        or a point of texels, which has no area to print.
+    """
+    distances_by_axis = []
+    for axis in (1, 0):
+        distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
+        both_inside = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
+        distances_by_axis.append(distances[both_inside])
+    if not all(len(distances) for distances in distances_by_axis):
+        return None
+    width, height = (float(np.mean(distances)) for distances in distances_by_axis)
+    if min(width, height) <= 0.0:
+        return None
+    distortion = max(
+        float(np.std(distances) / np.mean(distances)) for distances in distances_by_axis
+    )
+    return (width, height), distortion
 
 
 def _piece(
-    name: str, picture: Floats, pixel: tuple[float, float], inside: Mask | None
+    name: str, image: Floats, pixel_size: tuple[float, float], inside: Mask | None
 ) -> Piece:
-    parts = (
-        min(MOST_PARTS, 2 * math.ceil((max(pixel) / FINEST - 1.0) / 2.0) + 1)
-        if max(pixel) > FINEST
-        else 1
-    )
-    fine = (
-        enlarged(torch.from_numpy(np.ascontiguousarray(picture)), parts)
-        if parts > 1
-        else torch.from_numpy(picture)
-    )
-    size = pixel[0] / parts, pixel[1] / parts
-    columns, rows = (math.ceil(BLEED / side) for side in size)
-    levels = np.pad(
-        to_8bit(fine.numpy()), ((rows, rows), (columns, columns), (0, 0)), mode="edge"
-    )
+    """Return a piece to print, with fine enough pixels and a margin of bleed.
+
+    Args:
+        name: of the piece.
+        image: (h, w, 3), sRGB in [0, 1].
+        pixel_size: (width, height) of a pixel in millimetres.
+        inside: (h, w) bool, what is cut out; None for the full image.
+    """
+    subdivisions = 1
+    if max(pixel_size) > FINEST:
+        # The next odd number.
+        odd = 2 * math.ceil((max(pixel_size) / FINEST - 1.0) / 2.0) + 1
+        subdivisions = min(MOST_PARTS, odd)
+    if subdivisions > 1:
+        fine = enlarged(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
+    else:
+        fine = torch.from_numpy(image)
+    size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions
+    bleed_columns = math.ceil(BLEED / size[0])
+    bleed_rows = math.ceil(BLEED / size[1])
+    padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
+    levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
     mask = None
     if inside is not None and not inside.all():
-        mask = np.pad(
-            inside.repeat(parts, 0).repeat(parts, 1), ((rows, rows), (columns, columns))
-        )
-    return Piece(name, levels, size, (columns, rows), mask)
+        mask = np.pad(inside.repeat(subdivisions, 0).repeat(subdivisions, 1), padding)
+    return Piece(name, levels, size, (bleed_columns, bleed_rows), mask)

@@ -1,8 +1,8 @@
-"""The settings of each experiment as keywords: what Python callers may write for them.
+"""Turn the settings of each experiment into keywords for Python callers.
 
-A setting is declared once: its default, its range, what it is. In Python more may be
-written for it than the text of a file (`hint_of`). Signatures and docstrings are made
-from both (`asks`). Type checkers read the keywords of `attack` and `sweep` in code:
+A setting is declared once: its default, its range, its description. In Python it may
+take more than the text of a file (`hint_of`). Signatures and docstrings are made from
+both (`asks`). Type checkers see the keywords of `attack` and `sweep` in code:
 `SceneKeywords` and its subclasses.
 """
 
@@ -117,156 +117,191 @@ RAISED = "InputError: anything that the caller can put right; nothing is written
 errors.
 """
 Function = TypeVar("Function", bound=Callable[..., Any])
-Made = TypeVar("Made", bound=Config)
+ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 def asks(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` the signature and the
-    docstring that they come to. Every setting becomes a keyword with the default that
-    it is declared with, and a line among the arguments. One that the function has of
-    its own stays as it is there.
+    """Give a function that takes settings as `**settings` their signature and docstring.
+
+    Every setting becomes a keyword with its declared default, and a line among the
+    arguments. A setting that is a parameter of the function already stays as it is.
     """
 
     def decorate(function: Function) -> Function:
-        own = inspect.signature(function)
-        plain = [
-            one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD
+        own_signature = inspect.signature(function)
+        own_parameters = [
+            parameter
+            for parameter in own_signature.parameters.values()
+            if parameter.kind is not parameter.VAR_KEYWORD
         ]
-        added = []
+        added_parameters = []
         lines = []
-        for one in settings(config):
-            name = one.field.removesuffix("_")
-            if name in own.parameters or one.required:
+        for setting in settings(config):
+            name = setting.field.removesuffix("_")
+            if name in own_signature.parameters or setting.required:
                 continue
-            hint = hint_of(one.field, config.model_fields[one.field].annotation)
-            added.append(
+            hint = hint_of(setting.field, config.model_fields[setting.field].annotation)
+            added_parameters.append(
                 inspect.Parameter(
-                    name, ONLY_BY_NAME, default=one.default, annotation=hint
+                    name, ONLY_BY_NAME, default=setting.default, annotation=hint
                 )
             )
-            lines.append(
-                textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    ")
-            )
+            line = f"{name}: {setting.text}"
+            lines.append(textwrap.fill(line, 110, subsequent_indent="    "))
         signature = _Signature(
-            [*plain, *added], return_annotation=own.return_annotation
+            [*own_parameters, *added_parameters],
+            return_annotation=own_signature.return_annotation,
         )
-        signature.short = own
+        signature.short = own_signature
 
         @wraps(function)
-        def asked(*args: Any, **given: Any) -> Any:
-            if error := unexpected(
-                function.__name__, given, list(signature.parameters)
-            ):
-                raise error
-            check_types(
-                {**own.parameters, **RUN},
-                {**dict(zip(own.parameters, args, strict=False)), **given},
-            )
-            try:
-                bound = signature.bind(*args, **given)
-            except TypeError as error:
-                raise TypeError(f"{function.__name__}() {error}") from None
-            allow_named({**bound.arguments, **given})
-            kept = ("scene", "model", "beside", "progress", "metrics", "tracker")
-            plain = {
-                key: one if key in kept or not is_shallow(one) else as_python(one)
-                for key, one in given.items()
+        def wrapper(*args: Any, **keywords: Any) -> Any:
+            _check_call(function.__name__, signature, args, keywords)
+            plain_keywords = {
+                key: value
+                if key in PASSED_AS_GIVEN or not is_shallow(value)
+                else as_python(value)
+                for key, value in keywords.items()
             }
             with ExitStack() as stack:
                 stack.enter_context(in_turn())
-                if "progress" in own.parameters:
-                    plain["progress"] = stack.enter_context(
-                        watched(plain.get("progress"))
-                    )
-                for key in {
-                    "task",
-                    "objective",
-                    "policy",
-                } & plain.keys() - own.parameters.keys():
-                    if not isinstance(plain[key], (str, Mapping, type(None))):
-                        raise InputError(
-                            f"{key}: expected a name for {function.__name__}, got "
-                            f"{told(plain[key])}; `attack` "
-                            "takes your own, and `sweep` a task of your own"
-                        )
-                return function(*args, **plain)
+                if "progress" in own_signature.parameters:
+                    progress = watched(plain_keywords.get("progress"))
+                    plain_keywords["progress"] = stack.enter_context(progress)
+                for key in ("task", "objective", "policy"):
+                    if key in plain_keywords and key not in own_signature.parameters:
+                        _check_name(function.__name__, key, plain_keywords[key])
+                return function(*args, **plain_keywords)
 
-        asked.__doc__ = _docstring(
-            function.__doc__ or "", [one.name for one in plain], config.command, lines
+        wrapper.__doc__ = _docstring(
+            function.__doc__ or "",
+            [parameter.name for parameter in own_parameters],
+            config.command,
+            lines,
         )
-        asked.__signature__ = signature  # type: ignore[attr-defined]
-        return asked  # type: ignore[return-value]
+        wrapper.__signature__ = signature  # type: ignore[attr-defined]
+        return wrapper  # type: ignore[return-value]
 
     return decorate
 
 
+PASSED_AS_GIVEN = ("scene", "model", "beside", "progress", "metrics", "tracker")
+"""Arguments that are passed on unchanged; others become plain Python values."""
+
+
+def _check_call(
+    name: str,
+    signature: _Signature,
+    args: Sequence[Any],
+    keywords: Mapping[str, Any],
+) -> None:
+    """Check the arguments of a call, and allow the code that they name.
+
+    Raises:
+        TypeError: there is no such argument, or one is missing.
+        InputError: a value is of another type.
+    """
+    error = unexpected(name, keywords, list(signature.parameters))
+    if error:
+        raise error
+    own_parameters = signature.short.parameters
+    positional = dict(zip(own_parameters, args, strict=False))
+    check_types({**own_parameters, **RUN}, {**positional, **keywords})
+    try:
+        bound = signature.bind(*args, **keywords)
+    except TypeError as error:
+        raise TypeError(f"{name}() {error}") from None
+    allow_named({**bound.arguments, **keywords})
+
+
+def _check_name(function_name: str, key: str, value: object) -> None:
+    """Raise InputError if a setting is an object where only its name is accepted."""
+    if not isinstance(value, (str, Mapping, type(None))):
+        raise InputError(
+            f"{key}: expected a name for {function_name}, got "
+            f"{told(value)}; `attack` "
+            "takes your own, and `sweep` a task of your own"
+        )
+
+
 WRITTEN = {
-    "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | "
-                                                         "Names | None",
-    "resolution": "int | str | tuple[int, int] | None", "set_": "Mapping[str, float | str | Sequence[float]] | None",
-    "estimators": "str | Mapping[str, str]", "value_range": "str | Sequence[float] | "
-                                                            "None",
-}  # fmt: skip
-"""What may be written for some settings beside what they become."""
+    "controls": "Controls",
+    "over": "Controls",
+    "label": "int | np.integer[Any] | Names | None",
+    "resolution": "int | str | tuple[int, int] | None",
+    "set_": "Mapping[str, float | str | Sequence[float]] | None",
+    "estimators": "str | Mapping[str, str]",
+    "value_range": "str | Sequence[float] | None",
+}
+"""Annotations of settings that take other values in Python than they are stored as."""
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
 """Settings that may be a list of names."""
 
 
 def hint_of(field: str, kind: Any) -> str:
-    """Return what Python callers may write for a setting that is declared as `kind`:
-    for a text also a path, and for what may be several names a list.
+    """Return the annotation of a setting for Python callers.
+
+    Args:
+        field: the setting.
+        kind: its declared type. For a text a path is allowed too, and for several
+            names a list.
     """
-    text = (
-        inspect.formatannotation(kind)
-        .replace("typing.", "")
-        .replace("NoneType", "None")
-    )
-    # bounds are no part of a hint
+    text = inspect.formatannotation(kind)
+    text = text.replace("typing.", "").replace("NoneType", "None")
+    # Constraints are no part of a hint.
     text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
-    # a recipe's may be one of each object
+    # The label of a recipe may be a mapping from objects.
     if field in WRITTEN and not (field == "label" and "dict" in text):
         return WRITTEN[field]
-    match = re.fullmatch(r"Optional\[(.*)\]", text)
-    parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
-    wider = {"str": "Path | Names" if field in LISTED else "str | Path"}
-    return " | ".join(
-        re.sub(r"^dict\[.*", "Mapping[str, Any]", wider.get(one, one)) for one in parts
-    )
+    optional = re.fullmatch(r"Optional\[(.*)\]", text)
+    if optional:
+        types = [optional[1], "None"]
+    else:
+        types = re.split(r" \| (?![^\[]*\])", text)
+    string_hint = "Path | Names" if field in LISTED else "str | Path"
+    hints = []
+    for type_name in types:
+        hint = string_hint if type_name == "str" else type_name
+        hints.append(re.sub(r"^dict\[.*", "Mapping[str, Any]", hint))
+    return " | ".join(hints)
 
 
 def _docstring(
     text: str, names: Sequence[str], command: str, settings: Sequence[str]
 ) -> str:
-    """A question's own docstring (what it does, and arguments that `SAME` does not
-    describe) with what all of them say: where the run is kept, their arguments by
-    `names`, a line for each setting, and what is raised.
+    """Complete the docstring of an experiment's function.
+
+    Args:
+        text: its own docstring: what it does, and arguments that `SAME` does not have.
+        names: of its own arguments.
+        command: of the experiment.
+        settings: a line for each setting.
     """
-    said, _, own = inspect.cleandoc(text).partition("\n\nArgs:\n")
-    if "other arguments are the settings of" not in " ".join(said.split()):
-        said += (
+    summary, _, own_arguments = inspect.cleandoc(text).partition("\n\nArgs:\n")
+    if "other arguments are the settings of" not in " ".join(summary.split()):
+        summary += (
             f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"
         )
-    told = {
-        one.partition(":")[0]: one.rstrip()
-        for one in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own))
-        if one
+    described = {
+        entry.partition(":")[0]: entry.rstrip()
+        for entry in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own_arguments))
+        if entry
     }
-    listed = [told.get(name, f"{name}: {SAME.get(name)}") for name in names] + [
-        *settings
-    ]
-    return f"{said}\n\nArgs:\n{textwrap.indent(chr(10).join(listed), '    ')}\n\nRaises:\n    {RAISED}"
+    lines = [described.get(name, f"{name}: {SAME.get(name)}") for name in names]
+    arguments = textwrap.indent("\n".join([*lines, *settings]), "    ")
+    return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {RAISED}"
 
 
-def configured(config: type[Made], **given: Any) -> Made:
-    """Return a configuration of settings as Python has them; None is one that was not
-    given.
+def configured(config: type[ConfigType], **keywords: Any) -> ConfigType:
+    """Create a configuration from settings as Python callers pass them; None counts as
+    not passed.
 
     A scene, a model and controls may be objects: the settings name them, hold them
     (`Config.python_object`), and know which of them exist only in this session.
     """
-    settings = {name: value for name, value in given.items() if value is not None}
+    settings = {name: value for name, value in keywords.items() if value is not None}
     objects: dict[tuple[str, str], Any] = {}
-    only_here: list[PythonOnly] = []
+    python_only: list[PythonOnly] = []
 
     scene = settings.get("object")
     model = settings.get("model")
@@ -275,19 +310,19 @@ def configured(config: type[Made], **given: Any) -> Made:
     if isinstance(model, (Model, nn.Module)):
         settings["model"] = model_name(model)
         objects[MODEL, settings["model"]] = model
-        only_here += (
-            [PythonOnly("model", settings["model"])] if exists_here(model) else []
-        )
+        if exists_here(model):
+            python_only.append(PythonOnly("model", settings["model"]))
     if isinstance(scene, loading.Scene):
         check_not_of_scene(
             {name: value for name, value in settings.items() if name != "object"}
         )
-        described = loading.scene_as_settings(scene)
+        scene_settings = loading.scene_as_settings(scene)
         settings |= {
-            name: value for name, value in described.items() if value is not None
+            name: value for name, value in scene_settings.items() if value is not None
         }
         objects[SCENE, settings["object"]] = scene
-        only_here += [PythonOnly("scene")] if scene.only_here else []
+        if scene.only_here:
+            python_only.append(PythonOnly("scene"))
     for name in ("controls", "over"):
         controls: Any = settings.get(name)
         instances = loading.instances_in(controls)
@@ -295,8 +330,8 @@ def configured(config: type[Made], **given: Any) -> Made:
             if loading.only_here(controls):
                 check_not_spread(settings)
             objects |= {(CONTROL, control.name): control for control in instances}
-            only_here += [
+            python_only += [
                 PythonOnly("control", kind) for kind in loading.only_here(instances)
             ]
             settings[name] = loading.settings_of(controls)
-    return config(**settings).with_python_objects(objects).with_only_here(only_here)
+    return config(**settings).with_python_objects(objects).with_only_here(python_only)

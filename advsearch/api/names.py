@@ -1,6 +1,7 @@
-"""Names in settings that are looked up before PyTorch and Mitsuba are imported, which
-takes seconds: a slip is told at once. What this module lets through is looked up again
-by whoever loads it.
+"""Look up names in settings before PyTorch and Mitsuba are imported, which takes seconds.
+
+So a typing error is reported at once. Names that pass are looked up again by what loads
+them.
 """
 
 from __future__ import annotations
@@ -22,80 +23,49 @@ from advsearch.scene.library import (
 )
 from advsearch.settings import Config, split_names
 
-# what can only be the name of something bundled: no path, no file, no code
+# What can only be the name of something bundled: no path, no file, no code.
 WORD = re.compile(r"[^\W\d][\w-]{0,59}")
 LABEL_SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
-"""`advsearch.models.labels.SETS`, which a test holds this to."""
+"""Equal to `advsearch.models.labels.SETS`, as a test checks."""
 PARAMETERS = frozenset(
     "aberration aperture exposure heading height lumens phase pitch power pushes shot "
     "texels water weight x y z".split()
 )
-"""Names of controls' parameters that are like the name of a control, which a test holds
-this to.
+"""Names of controls' parameters that resemble the name of a control; a test checks that
+they are complete.
 """
 
 
 def check_names(config: Config) -> None:
-    """Refuse, by an UnknownNameError or an InputError, names in settings that nothing
-    is called by.
+    """Check that names in settings exist.
+
+    Raises:
+        UnknownNameError, InputError: nothing has such a name.
     """
     if config.only_here:
-        return  # what exists in a Python session alone may be called anything
-    said: dict[str, Any] = {
+        return  # objects of a Python session may have any name
+    values: dict[str, Any] = {
         name: getattr(config, name) for name in type(config).model_fields
     }
-    things = [
-        part.strip()
-        for part in str(said.get("things") or "").split(";")
-        if part.strip()
-    ]
-    whats = [part.partition("@")[0].strip() for part in things]
-    objects = [
-        *split_names(said.get("object") or ""),
-        *split_names(said.get("held_out") or ""),
-        *whats,
-    ]
-    environments = [
-        *split_names(said.get("environment") or ""),
-        *split_names(said.get("held_out_environment") or ""),
-    ]
-    _check(
-        "object", [one for one in objects if one != "all"], list_objects(), OBJECT_HINT
-    )
-    _check(
-        "environment",
-        [one for one in environments if one != "none"],
-        list_environments(),
-        MAP_HINT,
-    )
-    controls = {**(said.get("controls") or {}), **(said.get("over") or {})}
-    kinds = [str((own or {}).get("kind") or name) for name, own in controls.items()]
-    names = [
-        re.split(r"[:.]", kind)[0] for kind in kinds if not re.search(r":[A-Z]", kind)
-    ]
-    built_in_controls = list_built_ins("control")
-    # of a parameter the registry says whose it is
-    slips = [
-        name
-        for name in names
-        if name not in PARAMETERS and resembling(name, built_in_controls)
-    ]
-    _check("control", slips, "controls")
+    _check_scene(values)
+    _check_controls(values)
     for setting, group in (("policy", "policies"), ("task", "tasks")):
-        given = said.get(setting)
-        name = (
-            str(given.get("name", ""))
-            if isinstance(given, Mapping)
-            else str(given or "")
-        )
-        _check(setting, name.split("+") if setting == "task" else [name], group)
-    slips = [
-        one
-        for one in split_names(said.get("model") or "")
-        if resembling(one, ["reference"])
+        value = values.get(setting) or ""
+        name = str(value.get("name", "") if isinstance(value, Mapping) else value)
+        names = name.split("+") if setting == "task" else [name]
+        _check(setting, names, group)
+    like_reference = [
+        name
+        for name in split_names(values.get("model") or "")
+        if resembling(name, ["reference"])
     ]
-    _check("model", slips, ["reference"], "A model of yours is a file or Python code.")
-    labels = said.get("labels")
+    _check(
+        "model",
+        like_reference,
+        ["reference"],
+        "A model of yours is a file or Python code.",
+    )
+    labels = values.get("labels")
     if labels and WORD.fullmatch(labels) and not Path(labels).exists():
         _check(
             "set of labels",
@@ -103,53 +73,118 @@ def check_names(config: Config) -> None:
             LABEL_SETS,
             "Or give a file, or the names with commas between them.",
         )
-    judge = said.get("judge")
-    if things and judge and objects[0] in list_objects():
-        of_things = [re.search(r"name=([^,]+)", part) for part in things]
-        names = [
-            named[1].strip() if named else what
-            for named, what in zip(of_things, whats, strict=True)
-        ]
-        if re.sub(r"-\d+$", "", judge) not in (*names, "object", "all"):
-            raise UnknownNameError(
-                "thing to judge:",
-                judge,
-                ("object", "all", *names),
-                "It stands in `judge`.",
-            )
     for setting in ("sweeps", "compared"):
-        # which is shown to models, that are compared then
-        if said.get(setting) and not said.get("object"):
-            for run in split_names(said[setting]):
+        # With an object, these settings name models to compare.
+        if values.get(setting) and not values.get("object"):
+            for run in split_names(values[setting]):
                 find_run(run)
-    suite = said.get("suite")
-    if suite and not Path(suite).exists():
-        there = [
-            str(file)
-            for folder in {Path(suite).parent, Path("suites")}
-            for file in sorted(folder.glob("*.y*ml"))
-        ]
-        near = resembling(Path(suite).stem, [Path(file).stem for file in there])[:1]
-        like = [file for file in there if Path(file).stem in near]
-        raise InputError(
-            "suite: there is no file "
-            f"{suite}{f'; did you mean {like[0]}?' if like else ''}"
+    if values.get("suite"):
+        _check_suite(values["suite"])
+
+
+def _check_scene(values: Mapping[str, Any]) -> None:
+    """Check the names of objects, environments, and the thing to judge."""
+    things = [
+        part.strip()
+        for part in str(values.get("things") or "").split(";")
+        if part.strip()
+    ]
+    thing_objects = [thing.partition("@")[0].strip() for thing in things]
+    objects = [
+        *split_names(values.get("object") or ""),
+        *split_names(values.get("held_out") or ""),
+        *thing_objects,
+    ]
+    environments = [
+        *split_names(values.get("environment") or ""),
+        *split_names(values.get("held_out_environment") or ""),
+    ]
+    _check(
+        "object",
+        [name for name in objects if name != "all"],
+        list_objects(),
+        OBJECT_HINT,
+    )
+    _check(
+        "environment",
+        [name for name in environments if name != "none"],
+        list_environments(),
+        MAP_HINT,
+    )
+    judge = values.get("judge")
+    if things and judge and objects[0] in list_objects():
+        _check_judge(judge, things, thing_objects)
+
+
+def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> None:
+    """Check that the thing to judge is one of the things in the scene.
+
+    Args:
+        judge: its name.
+        things: as in the setting, ``car@12,3.5,name=taxi``.
+        objects: of these things.
+    """
+    names = []
+    for thing, object_name in zip(things, objects, strict=True):
+        match = re.search(r"name=([^,]+)", thing)
+        names.append(match[1].strip() if match else object_name)
+    if re.sub(r"-\d+$", "", judge) not in (*names, "object", "all"):
+        raise UnknownNameError(
+            "thing to judge:",
+            judge,
+            ("object", "all", *names),
+            "It stands in `judge`.",
         )
+
+
+def _check_controls(values: Mapping[str, Any]) -> None:
+    """Check names that resemble the name of a control."""
+    controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
+    names = []
+    for name, options in controls.items():
+        kind = str((options or {}).get("kind") or name)
+        is_class = re.search(r":[A-Z]", kind)
+        if not is_class:
+            names.append(re.split(r"[:.]", kind)[0])
+    built_in_controls = list_built_ins("control")
+    # The registry reports a parameter with the control that it belongs to.
+    like_controls = [
+        name
+        for name in names
+        if name not in PARAMETERS and resembling(name, built_in_controls)
+    ]
+    _check("control", like_controls, "controls")
+
+
+def _check_suite(suite: str) -> None:
+    """Raise InputError if a suite's file does not exist, with a name like it."""
+    if Path(suite).exists():
+        return
+    files = [
+        file
+        for folder in {Path(suite).parent, Path("suites")}
+        for file in sorted(folder.glob("*.y*ml"))
+    ]
+    similar = resembling(Path(suite).stem, [file.stem for file in files])[:1]
+    matches = [file for file in files if file.stem in similar]
+    hint = f"; did you mean {matches[0]}?" if matches else ""
+    raise InputError(f"suite: there is no file {suite}{hint}")
 
 
 def _check(
     kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
 ) -> None:
-    """Refuse a word that is none of those known; `known` may be the end of a group of
-    entry points, whose names other packages add to.
+    """Raise UnknownNameError if a word is none of the known names.
+
+    `known` may be the suffix of a group of entry points instead, to whose names other
+    packages add.
     """
     for name in names:
         if not WORD.fullmatch(name) or Path(name).exists():
             continue
         if isinstance(known, str):
-            known = [
-                *list_built_ins(kind),
-                *(point.name for point in entry_points(group=f"advsearch.{known}")),
-            ]
-        if name not in (known := list(known)):
+            installed = entry_points(group=f"advsearch.{known}")
+            known = [*list_built_ins(kind), *(point.name for point in installed)]
+        known = list(known)
+        if name not in known:
             raise UnknownNameError(kind, name, known, hint)

@@ -1,5 +1,5 @@
-"""The images of a run's rows, rendered again at the size that the model sees, with what
-is true of them.
+"""Render the images of a run's rows again, at the size that the model sees, with their
+ground truth.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from advsearch.questions.attack.carry_out import (
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.job import KIND, OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
 from advsearch.runs.store import NAME, Row, Store
@@ -35,7 +35,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.settings import read_yaml
 from advsearch.tasks import Facts, Task
 
-# kinds of rows of an attack that look at the clean scene
+# Kinds of rows of an attack with the clean scene.
 CLEAN = ("first control", "control")
 
 
@@ -44,15 +44,15 @@ class RenderedRow:
     """An image of a run, rendered again.
 
     Attributes:
-        name: of its file without ending.
-        picture: (H, W, 3) sRGB in [0, 1], rounded to 8 bits as the model sees it.
+        name: of its file without a suffix.
+        picture: (H, W, 3), sRGB in [0, 1], rounded to 8 bits as the model sees it.
         task: of the first model.
-        facts: what is true of the object.
+        facts: the ground truth of the object.
         renderer: of the scene.
-        u: (d,) the configuration.
-        rows: what the models of the run say of it.
+        u: (d,), the configuration.
+        rows: of the run's models.
         values: the configuration by parameter.
-        same: whether the first model is right, or wrong, as its row says.
+        same: whether the first model is right, or wrong, as in its row.
     """
 
     name: str
@@ -66,30 +66,37 @@ class RenderedRow:
     same: bool
 
     def list_things(self) -> Sequence[SeenThing]:
-        """Return the things that the image shows: the object, and those beside it."""
+        """Return the visible things in the image: the object, and the others."""
         return seen_things(self.renderer, self.u)
 
     def label_of(self, thing: SeenThing) -> str:
-        """Return what the mesh of a thing is called, or else its name."""
+        """Return the label of a thing's mesh, or else its name."""
         return self.renderer.scene.made[0].meshes[thing.name].label or thing.name
 
 
 def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """Render the images of a run of `sweep` or `attack`, or of one with such parts (a
-    suite, a study).
+    """Render the images of a run of `sweep` or `attack`, or of one with such parts (a suite, a
+    study).
 
-    With `every` all, else those that not all models are right about. Raises InputError
-    where the scene of the run is not to be had any more, and FileFormatError where the
-    run is of another command, or has not ended.
+    Args:
+        run: its name or folder.
+        every: render all images; otherwise only those about which a model is wrong.
+        progress: reports the number of images.
+
+    Raises:
+        InputError: the scene of the run does not exist any more.
+        FileFormatError: the run is of another command, or has not finished.
     """
     yield from _render_run(find_run(run), every, progress)
 
 
 def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    if parts := [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]:
+    """Render the images of the run in a folder, or of its parts; see `render_rows`."""
+    parts = [path for path in sorted((folder / PARTS).glob("*")) if is_run(path)]
+    if parts:
         for part in parts:
-            for shown in _render_run(part, every, progress):
-                yield replace(shown, name=f"{part.name}-{shown.name}")
+            for rendered in _render_run(part, every, progress):
+                yield replace(rendered, name=f"{part.name}-{rendered.name}")
         return
     command = str(read_yaml(folder / CONFIG).get("command"))
     if command not in READ:
@@ -97,96 +104,119 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
             f"{folder}: expected a run of {' or '.join(READ)}, or one with such parts, "
             f"got one of {command}"
         )
-    if needed := [
+    missing = [
         part.text
         for part in read_python_only(folder)
         if part.role not in ROLES_IN_SEARCH
-    ]:
+    ]
+    if missing:
         raise InputError(
-            f"{folder}: {', '.join(needed)}: only the Python session that "
+            f"{folder}: {', '.join(missing)}: only the Python session that "
             "asked has what renders it"
         )
     yield from READ[command](folder, every, progress)
 
 
-def _swept(folder: Path, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    scenes = scenes_of(
-        SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}})
-    )
+def _render_sweep(
+    folder: Path, every: bool, progress: Progress
+) -> Iterator[RenderedRow]:
+    """Render the images of a sweep."""
+    config = SweepConfig.from_yaml(folder / CONFIG)
+    scenes = scenes_of(config.model_copy(update={"metrics": {}}))
     job = scenes.job
-    rows = defaultdict[int, list[Row]](list)
-    with Store(folder / NAME, read_only=True) as store:
-        for row in store.rows(KIND):
-            rows[row.step // len(job.models)].append(row)
-    chosen = sorted(
-        number
-        for number, some in rows.items()
-        if every or not all(row.correct for row in some)
+    rows_of_image = _read_sweep_rows(folder, len(job.models))
+    images = sorted(
+        image
+        for image, rows in rows_of_image.items()
+        if every or not all(row.correct for row in rows)
     )
     count = job.per_scene * len(job.places)
-    if chosen and not 0 <= chosen[0] <= chosen[-1] < count:
+    if images and not 0 <= images[0] <= images[-1] < count:
         raise FileFormatError(
             f"{folder / NAME}: expected rows of its {count} "
             "pictures, got one of another"
         )
-    progress.stage("rendering pictures", len(chosen))
-    for number in chosen:
-        view, (query, *_) = scenes.asked(number)
-        place = job.places[view.number]
-        some = sorted(rows[number], key=lambda row: row.step)
-        facts = object_facts(place.scene, place.object, job.config)
-        size = job.sizes[0]
-        picture = view.picture(query)
-        first = next(
-            (row.correct for row in some if row.step % len(job.models) == 0), None
-        )
-        same = first in (None, view.problems[0].judge(picture, query.u).right)
-        scene = job.tasks[0], facts, view.renderers[size], query.u
-        yield RenderedRow(f"{number:06d}", picture, *scene, some, some[0].values, same)
+    progress.stage("rendering pictures", len(images))
+    for image in images:
+        rows = sorted(rows_of_image[image], key=lambda row: row.step)
+        yield _render_sweep_image(scenes, image, rows)
         progress.advance(1)
 
 
-def _attacked(folder: Path, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """The trials of an attack's adversarial scene, and of the clean one; where nothing
-    varies, the first of each.
+def _render_sweep_image(
+    scenes: OpenScenes, image: int, rows: Sequence[Row]
+) -> RenderedRow:
+    """Render one image of a sweep by its index."""
+    job = scenes.job
+    view, (query, *_) = scenes.asked(image)
+    scene = job.places[view.number]
+    picture = view.picture(query)
+    first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
+    stored = first_model[0] if first_model else None
+    return RenderedRow(
+        name=f"{image:06d}",
+        picture=picture,
+        task=job.tasks[0],
+        facts=object_facts(scene.scene, scene.object, job.config),
+        renderer=view.renderers[job.sizes[0]],
+        u=query.u,
+        rows=rows,
+        values=rows[0].values,
+        same=stored in (None, view.problems[0].judge(picture, query.u).right),
+    )
+
+
+def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:
+    """Return the rows of a sweep by the index of their image."""
+    rows_of_image = defaultdict[int, list[Row]](list)
+    with Store(folder / NAME, read_only=True) as store:
+        for row in store.rows(KIND):
+            rows_of_image[row.step // n_models].append(row)
+    return rows_of_image
+
+
+def _render_attack(
+    folder: Path, every: bool, progress: Progress
+) -> Iterator[RenderedRow]:
+    """Render the trials of an attack's adversarial scene and of the clean one; the first
+    of each if no condition varies.
     """
     summary = attack_of(folder)
     parts = parts_in(folder)
     problem, _ = problem_of_parts(parts)
-    kinds = dict.fromkeys(CLEAN, problem.domain.start)
+    configuration_of_kind = dict.fromkeys(CLEAN, problem.domain.start)
     if summary.adversarial is not None:
-        kinds["baseline verification" if summary.answer_from else "verification"] = (
-            kept_configuration(folder, problem)
-        )
+        kind = "baseline verification" if summary.answer_from else "verification"
+        configuration_of_kind[kind] = kept_configuration(folder, problem)
+    rows = list[Row]()
     with Store(folder / NAME, read_only=True) as store:
-        tried = {
-            kind: [row for row in store.rows(kind) if every or not row.correct]
-            for kind in kinds
-        }
-    chosen = [
-        row
-        for rows in tried.values()
-        for row in (rows if problem.conditions else rows[:1])
-    ]
-    progress.stage("rendering pictures", len(chosen))
-    for row in chosen:
-        u = kinds[row.kind]
+        for kind in configuration_of_kind:
+            trials = [row for row in store.rows(kind) if every or not row.correct]
+            rows += trials if problem.conditions else trials[:1]
+    progress.stage("rendering pictures", len(rows))
+    for row in rows:
+        u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)
-        spp = row.spp or problem.spp
-        picture = problem.picture(u, seed, spp)
-        whole = problem.whole(u, seed)
-        facts = object_facts(parts.scene, parts.config.object, parts.config)
-        same = row.correct in (None, problem.judge(picture, whole).right)
-        values = {**problem.describe(u, seed), **row.values}
-        scene = (problem.task, facts, problem.renderer, whole)
-        name = f"{row.kind.replace(' ', '-')}-{row.step:02d}"
-        yield RenderedRow(name, picture, *scene, [row], values, same)
+        picture = problem.picture(u, seed, row.spp or problem.spp)
+        full_u = problem.whole(u, seed)
+        yield RenderedRow(
+            name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
+            picture=picture,
+            task=problem.task,
+            facts=object_facts(parts.scene, parts.config.object, parts.config),
+            renderer=problem.renderer,
+            u=full_u,
+            rows=[row],
+            values={**problem.describe(u, seed), **row.values},
+            same=row.correct in (None, problem.judge(picture, full_u).right),
+        )
         progress.advance(1)
 
 
 def object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
-    """What is known of the object, whatever the run judges: a label that was given is
-    that of the judged thing.
+    """Return the facts about the object, whatever thing the run judges.
+
+    A label in the settings is that of the judged thing.
     """
     judges_object = config.judge not in scene.description.things
     return facts_about(
@@ -194,4 +224,5 @@ def object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
     )
 
 
-READ = {SweepConfig.command: _swept, AttackConfig.command: _attacked}
+READ = {SweepConfig.command: _render_sweep, AttackConfig.command: _render_attack}
+"""The renderers of runs by command."""

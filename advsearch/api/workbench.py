@@ -3,9 +3,12 @@ attacks, and workers.
 
     from advsearch.extend import workbench
 
-    parts = workbench.parts_of(config)  # what the settings of an attack name, found and loaded
-    problem = workbench.problem_on(parts, differentiated=False)  # renders and judges a configuration
-    journal = workbench.Journal(run, workbench.Shared(problem))  # stores each evaluation, and reads it back
+    # Load what the settings of an attack name.
+    parts = workbench.parts_of(config)
+    # Renders and judges a configuration.
+    problem = workbench.problem_on(parts, differentiated=False)
+    # Stores each evaluation, and reads it back.
+    journal = workbench.Journal(run, workbench.Shared(problem))
     query = workbench.Query(u, seed, "trial", 0, spp=16)
     (evaluation,) = journal.evaluate_all([query])
 

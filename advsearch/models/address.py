@@ -1,11 +1,10 @@
-"""Models that only answer: ``http://...`` and ``https://...``, each asked with a
-picture over the network.
+"""Ask models behind addresses, ``http://...`` and ``https://...``, that only answer.
 
-One that speaks the plain protocol is sent ``{"image": PNG in base64, "prompt": text}``
-and says ``{"scores": {name: share}}`` or ``{"text": words}``. One whose path ends in
-``/chat/completions`` is asked as OpenAI's chat is. What is sent beside that is a key
-from the environment, to this address alone: redirects are not followed, and no message,
-row or file has the key.
+A model of the plain protocol gets ``{"image": PNG in base64, "prompt": text}`` and
+returns ``{"scores": {name: fraction}}`` or ``{"text": answer}``. One whose path ends in
+``/chat/completions`` gets requests of OpenAI's chat. A key from the environment is sent
+along, to this address alone: redirects are not followed, and no message, row or file
+has the key.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import wait as futures_wait
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeAlias
 from urllib.parse import urlunsplit
 
@@ -39,53 +37,54 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Model, errors, models, stored_files
 
-# how the path of an address ends that is asked as OpenAI's chat is
+# Suffix of the path of an address with OpenAI's chat protocol.
 CHAT = "/chat/completions"
 
 LIMITS: dict[str, float] = {
     "calls": 2000, "at_once": 4, "tokens": float("inf"), "money": float("inf"),
     "per_call": 0.0, "per_million_in": 0.0, "per_million_out": 0.0, "seconds": 120.0,
 }  # fmt: skip
-"""What `ask` may say, with its defaults: the most calls of a run, and how many are
-under way at the same time; the most tokens and money; the price of a call and of a
-million tokens in and out, in the unit of `money`; how long an answer may take.
+"""Limits that `ask` may set, with their defaults: maximum number of calls of a run, and
+of concurrent ones; maximum of tokens and money; price of a call and of a million tokens
+in and out, in the unit of `money`; maximum duration of an answer in seconds.
 """
 
 TRIES = 5
 FIRST_WAIT = 1.0
 LONGEST_WAIT = 60.0
-"""How often a picture is sent to a server that is busy or fails, and the seconds
-between: twice as long each time.
+"""How often an image is sent to a server that is busy or fails, and the first and
+maximum delay in seconds, which doubles each time.
 """
 
 MOST_AT_ONCE = 64
-# statuses of a server that may answer later
+# HTTP statuses of a server that may answer later.
 BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
-LARGEST = 1 << 20  # bytes of an answer
-# bytes that are read of what comes with a status that is no success
+LARGEST = 1 << 20  # maximum size of an answer in bytes
+# Maximum number of bytes that are read of the body of an HTTP error.
 LONGEST_FAILURE = 2000
-LONGEST = 1000  # characters that are kept of an answer in words
-# the share of a name that an answer leaves out, or gives less: its logarithm is the
-# logit
+LONGEST = 1000  # maximum number of characters that are stored of an answer in words
+# Minimum score: its logarithm is the logit of a name that an answer leaves out.
 LEAST = 1e-6
-REFUSED = "(refused)"  # the words of a model that declines to answer
-Levels: TypeAlias = npt.NDArray[np.uint8]  # A picture (H, W, 3) as a file has it
+REFUSED = "(refused)"  # text of a model that declines to answer
+Levels: TypeAlias = npt.NDArray[np.uint8]  # An image (H, W, 3) with 8 bits per channel
 
 
 class KeepsAnswers(Protocol):
-    """What a run keeps notes in."""
+    """The store of a run, with its notes."""
 
     def noted(self, key: str) -> Any:
         """Return a JSON value, or None."""
 
     def set_note(self, key: str, value: str) -> None:
-        """Keep JSON text under a key."""
+        """Store JSON text under a key."""
 
 
 def load(spec: str, purpose: models.Purpose) -> Model:
-    """Return the model behind an address, which is asked for its names where nobody
-    says them. Raises InputError: only a file names it, or as `check_address`;
-    ModelError: it cannot do what it is to be asked, or nobody answers.
+    """Create the model behind an address; it is asked for its names if they are unknown.
+
+    Raises:
+        InputError: only a file names it, or as `check_address`.
+        ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
     if not models.may_fetch(spec):
@@ -107,7 +106,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"model {spec}: expected the name of the chat's model behind "
             f"a #: {spec}#NAME"
         )
-    asked = AskedModel(
+    module = AskedModel(
         url=urlunsplit(address._replace(fragment="")),
         name=name,
         spec=spec,
@@ -118,18 +117,17 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         times=purpose.times if free else 1,
     )
     if not free:
-        asked.names = purpose.names or tuple(
-            asked.scores([np.full((models.SIDE, models.SIDE, 3), 128, np.uint8)])[0]
-        )
-        if len(asked.names) < 2:
+        gray_image = np.full((models.SIDE, models.SIDE, 3), 128, np.uint8)
+        module.names = purpose.names or tuple(module.scores([gray_image])[0])
+        if len(module.names) < 2:
             raise errors.ModelError(
                 f"model {name}: expected scores of two names at "
-                f"least, got {len(asked.names)}"
+                f"least, got {len(module.names)}"
             )
     return Model(
-        module=asked,
+        module=module,
         name=name,
-        labels=asked.names,
+        labels=module.names,
         preprocessing=models.Preprocessing((models.SIDE, models.SIDE), resizes=False),
         batch_limits=(1, 8),
         differentiable=False,
@@ -137,8 +135,10 @@ def load(spec: str, purpose: models.Purpose) -> Model:
 
 
 def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
-    """Return every limit, as asked or by default. Raises InputError where a name is
-    unknown, or a number below 0.
+    """Return every limit, as set by `ask` or by default.
+
+    Raises:
+        InputError: a name is unknown, or a number is out of range.
     """
     for name, value in ask.items():
         if name not in LIMITS:
@@ -171,12 +171,25 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
     return limits
 
 
-class _Connection(http.client.HTTPConnection):
-    """A connection that ends at a time, and that another thread can break off, whatever
-    it waits for.
+@dataclass(frozen=True)
+class _Request:
+    """A request that is to be sent.
 
-    A socket's own limit begins anew with each byte that comes, so it alone is no limit
-    for an answer.
+    Attributes:
+        index: of its body.
+        tries: how many are left.
+        delay: before the next try, in seconds.
+    """
+
+    index: int
+    tries: int
+    delay: float
+
+
+class _Connection(http.client.HTTPConnection):
+    """A connection with a deadline, which another thread can break off at any time.
+
+    The timeout of a socket starts anew with each byte, so that it is no limit for an answer.
     """
 
     end = math.inf
@@ -203,9 +216,7 @@ class _SecureConnection(_Connection, http.client.HTTPSConnection):
 
 
 class _NotesConnections(urllib.request.AbstractHTTPHandler):
-    """Opens connections that end at a time, and notes them where another thread can
-    break them off.
-    """
+    """Opens connections with a deadline, and lists them for another thread to break off."""
 
     def __init__(self, end: float, connections: list[_Connection]) -> None:
         super().__init__()
@@ -236,55 +247,66 @@ class _SecureHandler(_NotesConnections, urllib.request.HTTPSHandler):
 
 @dataclass(eq=False)
 class AskedModel(models.RemoteNetwork):
-    """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or
-    without names what is said of each picture (`advsearch.tasks.answers.Texts`). The
-    same picture is not sent twice in a run, also if it goes on.
+    """A model behind an address, as a network.
+
+    It answers images (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or
+    without names the texts about each image (`advsearch.tasks.answers.Texts`). The same
+    image is not sent twice in a run, also if the run is resumed.
+
+    Attributes:
+        url: of requests.
+        name: in messages.
+        spec: what the user wrote.
+        limits: of a run, see `LIMITS`.
+        chat: the name of a chat's model; empty for the plain protocol.
+        question: about the image; may be empty.
+        tokens: maximum length of an answer in words.
+        times: number of requests per image.
+        names: with scores in answers.
+        spent: calls, and tokens in and out, of a run including what it was resumed from.
+        store: the run that stores answers and what is spent.
+        known: answers, if no run stores them.
     """
 
     url: str
     name: str
-    spec: str  # what its user wrote
-    limits: Mapping[str, float]  # of a run, see `LIMITS`
-    chat: str  # the name of a chat's model; empty for the plain protocol
-    question: str  # what is asked of the picture; may be empty
-    tokens: int  # the most of an answer in words
-    times: int  # how often each picture is asked
-    names: tuple[str, ...] = ()  # of which it gives scores
-    # calls, and tokens in and out, of a run's earlier lives too
+    spec: str
+    limits: Mapping[str, float]
+    chat: str
+    question: str
+    tokens: int
+    times: int
+    names: tuple[str, ...] = ()
     spent: Counter[str] = field(default_factory=Counter)
-    store: KeepsAnswers | None = None  # the run that keeps answers and what is spent
-    # answers, where no run keeps them
+    store: KeepsAnswers | None = None
     known: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        levels = (
-            (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0)
-            .round()
-            .to(torch.uint8)
-            .permute(0, 2, 3, 1)
-        )
-        images = list(levels.cpu().contiguous().numpy())
+        """Return logits (N, names) for images, or the texts about each; see the class."""
+        levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
+        images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if self.names:
-            rows = self.scores(images)
-            return torch.tensor(
-                [
-                    [max(row.get(name, 0.0), LEAST) for name in self.names]
-                    for row in rows
-                ]
-            ).log()
-        answers = self._answers(
-            [(image, turn) for image in images for turn in range(self.times)]
-        )
-        shares: list[dict[str, float]] = [
-            answer.get("scores") or {answer["text"]: 1.0} for answer in answers
+            rows = [
+                [max(scores.get(name, 0.0), LEAST) for name in self.names]
+                for scores in self.scores(images)
+            ]
+            return torch.tensor(rows).log()
+        requests = [(image, turn) for image in images for turn in range(self.times)]
+        texts = []
+        for answer in self._answers(requests):
+            scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
+            # The likeliest name, if there are scores.
+            texts.append(max(scores, key=scores.__getitem__))
+        return [
+            {"texts": texts[start : start + self.times]}
+            for start in range(0, len(texts), self.times)
         ]
-        # the likeliest name where there are scores
-        texts = iter([max(each, key=each.__getitem__) for each in shares])
-        return [{"texts": list(islice(texts, self.times))} for _ in images]
 
     def scores(self, images: Sequence[Levels]) -> list[dict[str, float]]:
-        """Return the share of each name that the answer to each picture has, in its
-        order.
+        """Return the scores by name in the answer to each image.
+
+        Raises:
+            ModelError: an answer is in words, or has other names than the labels.
         """
         rows = []
         for answer in self._answers([(image, 0) for image in images]):
@@ -303,34 +325,38 @@ class AskedModel(models.RemoteNetwork):
         return rows
 
     def keep_in(self, store: KeepsAnswers) -> None:
-        """Keep answers and what is spent in a run from here on: answers that it has are
-        not asked for again, and counting goes on where it stopped.
+        """Store answers and what is spent in a run from now on.
+
+        Its stored answers are not requested again, and counts continue.
         """
         self.spent += Counter(store.noted(f"asked {self.spec}") or {})
         self.store = store
 
-    def _answers(self, asked: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
-        """The answer to each picture at each time: one that the run has, or a new one,
-        kept as it comes. Trials differ in their noise, and so in their pictures.
+    def _answers(self, requests: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
+        """Return the answer to each image and turn: a stored one, or a new one, which is
+        stored as it arrives.
+
+        Trials differ in their noise, and so in their images.
         """
         keys = list[str]()
         answers = dict[str, Any]()
-        new = dict[str, dict[str, Any]]()
-        for image, turn in asked:
+        new_bodies = dict[str, dict[str, Any]]()
+        for image, turn in requests:
             body = self._body(image)
-            digest = hashlib.blake2b(
-                json.dumps([body, turn, self.spec]).encode(), digest_size=16
-            ).hexdigest()
-            keys.append(key := f"answer {digest}")
-            answers[key] = (
-                self.known.get(key) if self.store is None else self.store.noted(key)
-            )
+            request = json.dumps([body, turn, self.spec]).encode()
+            key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
+            keys.append(key)
+            if self.store is None:
+                answers[key] = self.known.get(key)
+            else:
+                answers[key] = self.store.noted(key)
             if not isinstance(answers[key], dict):
-                new[key] = body
-        for place, sent in self._send(list(new.values())):
-            self._count_tokens(sent)
-            key = list(new)[place]
-            answer = self._read_chat(sent) if self.chat else self._read(sent)
+                new_bodies[key] = body
+        new_keys = list(new_bodies)
+        for index, response in self._send(list(new_bodies.values())):
+            self._count_tokens(response)
+            key = new_keys[index]
+            answer = self._read_chat(response) if self.chat else self._read(response)
             answers[key] = answer
             if self.store is None:
                 self.known[key] = answer
@@ -339,17 +365,18 @@ class AskedModel(models.RemoteNetwork):
         return [answers[key] for key in keys]
 
     def _body(self, image: Levels) -> dict[str, Any]:
-        picture = base64.b64encode(models.png_of(image)).decode()
+        """Return the JSON body of a request about an image."""
+        encoded = base64.b64encode(models.png_of(image)).decode()
         if not self.chat:
-            return {
-                "image": picture,
-                **({"prompt": self.question} if self.question else {}),
-            }
+            body: dict[str, Any] = {"image": encoded}
+            if self.question:
+                body["prompt"] = self.question
+            return body
         content = [
             {"type": "text", "text": self.question},
             {
                 "type": "image_url",
-                "image_url": {"url": f"data:image/png;base64,{picture}"},
+                "image_url": {"url": f"data:image/png;base64,{encoded}"},
             },
         ]
         return {
@@ -358,42 +385,44 @@ class AskedModel(models.RemoteNetwork):
             "max_tokens": self.tokens,
         }
 
-    def _read(self, answer: Mapping[str, Any]) -> dict[str, Any]:
-        scores = answer.get("scores")
-        text = answer.get("text")
+    def _read(self, response: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer in a response of the plain protocol, scores or a text."""
+        scores = response.get("scores")
+        text = response.get("text")
         if isinstance(scores, dict) and scores:
-            shares = list(scores.values())
-            bad = [
-                share
-                for share in shares
-                if isinstance(share, bool) or not isinstance(share, (int, float))
+            values = list(scores.values())
+            not_numbers = [
+                value
+                for value in values
+                if isinstance(value, bool) or not isinstance(value, (int, float))
             ]
-            if bad or not all(0.0 <= share <= 1.0 for share in shares):
-                raise self._wrong(
-                    "scores from 0 to 1", f"{bad or [min(shares), max(shares)]}"
-                )
+            if not_numbers or not all(0.0 <= value <= 1.0 for value in values):
+                got = not_numbers or [min(values), max(values)]
+                raise self._wrong("scores from 0 to 1", f"{got}")
             return {"scores": scores}
         if isinstance(text, str):
             return {"text": text[:LONGEST]}
-        raise self._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', answer)
+        raise self._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
 
-    def _read_chat(self, answer: Mapping[str, Any]) -> dict[str, Any]:
+    def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the text in a response of a chat."""
         try:
-            message = answer["choices"][0]["message"]
+            choice = response["choices"][0]
+            message = choice["message"]
             content = message.get("content")
             refusal = message.get("refusal")
         except (KeyError, IndexError, TypeError, AttributeError):
             raise self._wrong(
-                "choices with a message, as a chat answers", answer
+                "choices with a message, as a chat answers", response
             ) from None
         if isinstance(content, list):
             content = " ".join(
                 str(part.get("text", "")) for part in content if isinstance(part, dict)
             )
-        if not content and (
-            refusal or answer["choices"][0].get("finish_reason") == "content_filter"
-        ):
-            return {"text": REFUSED}
+        if not content:
+            is_filtered = choice.get("finish_reason") == "content_filter"
+            if refusal or is_filtered:
+                return {"text": REFUSED}
         if not isinstance(content, str):
             raise self._wrong("an answer in words", type(content).__name__)
         return {"text": content[:LONGEST]}
@@ -404,9 +433,7 @@ class AskedModel(models.RemoteNetwork):
 
     @property
     def _so_far(self) -> dict[str, float]:
-        """What has been spent, by the name of its limit; money in the unit of the
-        prices.
-        """
+        """What has been spent, by the name of its limit; money in the unit of the prices."""
         limits = self.limits
         spent = self.spent
         by_token = (
@@ -422,12 +449,14 @@ class AskedModel(models.RemoteNetwork):
 
     @property
     def sentence(self) -> str:
-        """What a run has spent, for its reader."""
+        """What a run has spent, as a sentence."""
         calls, tokens, money = self._so_far.values()
-        more = (f", {tokens:,} tokens" if tokens else "") + (
-            f", {money:.4g} of money" if money else ""
-        )
-        return f"The model {self.name} was asked {calls:,} times{more}."
+        text = f"The model {self.name} was asked {calls:,} times"
+        if tokens:
+            text += f", {tokens:,} tokens"
+        if money:
+            text += f", {money:.4g} of money"
+        return f"{text}."
 
     @property
     def _priced_by_token(self) -> bool:
@@ -436,61 +465,86 @@ class AskedModel(models.RemoteNetwork):
     def _send(
         self, bodies: Sequence[Mapping[str, Any]]
     ) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Yield the places of what is sent, each with the JSON object that the server
-        answers; several are sent at once, and again where it is busy. Raises
-        ModelError: limits are reached, nobody answers, or something else comes; what
-        has been answered by then is yielded before.
-        """
-        left = [(place, TRIES, FIRST_WAIT) for place in range(len(bodies))]
-        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
-        # only an answer tells whether another is allowed
-        waits = self.limits["tokens"] < LIMITS["tokens"] or by_token
-        at_once = 1 if waits else int(self.limits["at_once"])
-        while left:
-            models.INTERRUPTS.look()
-            wave = [left.pop(0) for _ in range(self._reserve(min(at_once, len(left))))]
-            sent = self._together(
-                [json.dumps(bodies[place]).encode() for place, _, _ in wave]
-            )
-            failed = list[str]()
-            again = list[tuple[int, int, float]]()
-            for (place, tries, wait), answer in zip(wave, sent, strict=True):
-                if isinstance(answer, dict):
-                    yield place, answer
-                    continue
-                if isinstance(answer, errors.ModelError):
-                    failed.append(str(answer))
-                    continue
-                why, later, asked_to = self._failure(
-                    answer, first=self.spent["calls"] <= len(wave)
-                )
-                if not later or tries == 1:
-                    failed.append(f"model {self.name}: {why} ({self.url})")
-                again.append((place, tries - 1, max(wait, asked_to)))
-            if failed:
-                raise errors.ModelError(failed[0])
-            if again:
-                time.sleep(min(max(wait for _, _, wait in again), LONGEST_WAIT))
-                left = [(place, tries, 2 * wait) for place, tries, wait in again] + left
+        """Send bodies, several at once, and again while the server is busy.
 
-    def _reserve(self, most: int) -> int:
-        """Count calls before they are made, as many as the limits allow, and return how
-        many these are. Raises ModelError: none is allowed.
+        Yields:
+            The index of each body, and the JSON object in the response to it.
+
+        Raises:
+            ModelError: a limit is reached, nobody answers, or a response is invalid; the
+                responses up to then are yielded before.
+        """
+        pending = [_Request(index, TRIES, FIRST_WAIT) for index in range(len(bodies))]
+        max_concurrent = self._max_concurrent()
+        while pending:
+            models.INTERRUPTS.look()
+            count = self._reserve(min(max_concurrent, len(pending)))
+            wave = pending[:count]
+            del pending[:count]
+            responses = self._send_together(
+                [json.dumps(bodies[request.index]).encode() for request in wave]
+            )
+            failures = list[str]()
+            retries = list[_Request]()
+            is_first = self.spent["calls"] <= len(wave)
+            for request, response in zip(wave, responses, strict=True):
+                if isinstance(response, dict):
+                    yield request.index, response
+                elif isinstance(response, errors.ModelError):
+                    failures.append(str(response))
+                else:
+                    reason, retry = self._plan_retry(request, response, first=is_first)
+                    if retry is None:
+                        failures.append(reason)
+                    else:
+                        retries.append(retry)
+            if failures:
+                raise errors.ModelError(failures[0])
+            if retries:
+                time.sleep(min(max(request.delay for request in retries), LONGEST_WAIT))
+                delayed = [
+                    replace(request, delay=2 * request.delay) for request in retries
+                ]
+                pending = delayed + pending
+
+    def _max_concurrent(self) -> int:
+        """Return how many requests may be sent at once."""
+        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
+        # Only a response shows whether another request is allowed.
+        is_sequential = self.limits["tokens"] < LIMITS["tokens"] or by_token
+        return 1 if is_sequential else int(self.limits["at_once"])
+
+    def _plan_retry(
+        self, request: _Request, error: Exception, *, first: bool
+    ) -> tuple[str, _Request | None]:
+        """Return why a request failed, and its next try; None if there is none."""
+        reason, may_retry, retry_after = self._failure(error, first=first)
+        text = f"model {self.name}: {reason} ({self.url})"
+        if not may_retry or request.tries == 1:
+            return text, None
+        delay = max(request.delay, retry_after)
+        return text, _Request(request.index, request.tries - 1, delay)
+
+    def _reserve(self, max_count: int) -> int:
+        """Count calls before they are made, as many as the limits allow.
+
+        Returns:
+            How many are allowed, at most `max_count`.
+
+        Raises:
+            ModelError: none is allowed.
         """
         count = 0
-        while count < most:
-            reached = [
-                name
-                for name, number in self._so_far.items()
-                if number >= self.limits[name]
-            ]
+        while count < max_count:
+            spent = self._so_far
+            reached = [name for name in spent if spent[name] >= self.limits[name]]
             if reached and count:
                 break
             if reached:
                 name = reached[0]
-                limit = self.limits[reached[0]]
+                limit = self.limits[name]
                 raise errors.ModelError(
-                    f"model {self.name}: {self._so_far[name]:,.10g} {name} are spent, "
+                    f"model {self.name}: {spent[name]:,.10g} {name} are spent, "
                     f"and `ask` allows {limit:,.10g}; "
                     f"`advsearch resume RUN ask.{name}={2 * limit or 1:.10g}` goes on "
                     "with more, and asks nothing twice"
@@ -500,37 +554,36 @@ class AskedModel(models.RemoteNetwork):
         self._keep_spent()
         return count
 
-    def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
-        """Send bodies at the same time, and return what is answered to each, or why
-        nothing is.
+    def _send_together(
+        self, bodies: Sequence[bytes]
+    ) -> list[dict[str, Any] | Exception]:
+        """Send bodies at the same time, and return the response to each, or its error.
 
-        All is over `seconds` later, whatever a server does meanwhile: what is still
-        under way is broken off.
+        It takes at most the limit of `seconds`, whatever a server does: connections that
+        are still open are broken off.
         """
         seconds = self.limits["seconds"]
-        end = time.monotonic() + seconds
+        deadline = time.monotonic() + seconds
         pool = ThreadPoolExecutor(len(bodies))
         connections: list[_Connection] = []
         try:
             futures = [
-                pool.submit(self._try_to_send, body, end, connections)
+                pool.submit(self._try_to_send, body, deadline, connections)
                 for body in bodies
             ]
-            waited_for = futures_wait(
-                futures, timeout=min(seconds, threading.TIMEOUT_MAX)
-            )
+            timeout = min(seconds, threading.TIMEOUT_MAX)
+            done = futures_wait(futures, timeout=timeout).done
         finally:
             pool.shutdown(wait=False)  # after Ctrl-C nobody waits for answers
             for connection in connections:
                 connection.break_off()
-        late = TimeoutError(f"timed out: no answer within {seconds:g} seconds")
-        return [
-            future.result() if future in waited_for.done else late for future in futures
-        ]
+        timed_out = TimeoutError(f"timed out: no answer within {seconds:g} seconds")
+        return [future.result() if future in done else timed_out for future in futures]
 
     def _try_to_send(
         self, body: bytes, end: float, connections: list[_Connection]
     ) -> dict[str, Any] | Exception:
+        """Return the response to a body, or the error that a later try may not have."""
         try:
             return self._sent(body, end, connections)
         except urllib.error.HTTPError as error:
@@ -548,49 +601,48 @@ class AskedModel(models.RemoteNetwork):
             return error
 
     def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
-        """Return why nothing was answered, whether it may be later, and after how many
-        seconds.
+        """Explain a failure of a request.
+
+        Args:
+            error: that was raised.
+            first: no request has succeeded yet.
+
+        Returns:
+            The reason, whether another try may succeed, and after how many seconds.
         """
         if not isinstance(error, urllib.error.HTTPError):
-            reason = getattr(error, "reason", error)
-            why = self._clean(
-                f"{type(reason).__name__}: {reason}"
-                if str(reason)
-                else type(reason).__name__
-            )
-            nobody_yet = first and isinstance(reason, ConnectionRefusedError)
-            return (
-                why,
-                not nobody_yet
-                and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError)),
-                0.0,
-            )
-        code = error.code
-        headers = error.headers
+            cause = getattr(error, "reason", error)
+            text = type(cause).__name__
+            if str(cause):
+                text += f": {cause}"
+            no_server = first and isinstance(cause, ConnectionRefusedError)
+            is_final = isinstance(cause, (ssl.SSLCertVerificationError, ValueError))
+            return self._clean(text), not no_server and not is_final, 0.0
+        status = error.code
         with error:
-            if 300 <= code < 400:
-                there = self._clean(headers.get("Location", "elsewhere"))
-                why = (
-                    f"sends on to {there}, and pictures and keys are not sent there; "
+            if 300 <= status < 400:
+                location = self._clean(error.headers.get("Location", "elsewhere"))
+                reason = (
+                    f"sends on to {location}, and pictures and keys are not sent there; "
                     "give that address if you trust it"
                 )
-            elif code in (401, 403):
-                why = (
-                    f"status {code}: the key in {models.KEY} "
-                    f"{'is not accepted' if models.read_key() else 'is missing'}"
-                )
+            elif status in (401, 403):
+                problem = "is not accepted" if models.read_key() else "is missing"
+                reason = f"status {status}: the key in {models.KEY} {problem}"
             else:
-                text = error.read(LONGEST_FAILURE).decode(errors="replace")
-                why = (
-                    f"status {code} {self._clean(str(error.reason))}: "
-                    f"{self._clean(text)[:300]}"
+                body = error.read(LONGEST_FAILURE).decode(errors="replace")
+                reason = (
+                    f"status {status} {self._clean(str(error.reason))}: "
+                    f"{self._clean(body)[:300]}"
                 )
-        asked_to = headers.get("Retry-After", "")
-        return why, code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
+        retry_after = error.headers.get("Retry-After", "")
+        seconds = float(retry_after) if retry_after.isdigit() else 0.0
+        return reason, status in BUSY, seconds
 
     def _sent(
-        self, body: bytes, end: float, connections: list[_Connection]
+        self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any]:
+        """Send one body, and return the JSON object in the response."""
         key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
@@ -598,68 +650,63 @@ class AskedModel(models.RemoteNetwork):
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
             models.NoRedirect,
-            _Handler(end, connections),
-            _SecureHandler(end, connections),
+            _Handler(deadline, connections),
+            _SecureHandler(deadline, connections),
         ]
         if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
-        parts = list[bytes]()
-        size = 0
-        with urllib.request.build_opener(*handlers).open(
-            request, timeout=self.limits["seconds"]
-        ) as response:
-            while part := response.read1(1 << 16):
-                parts.append(part)
-                size += len(part)
-                if size > stored_files.scaled(LARGEST):
+        opener = urllib.request.build_opener(*handlers)
+        max_size = stored_files.scaled(LARGEST)
+        content = bytearray()
+        with opener.open(request, timeout=self.limits["seconds"]) as response:
+            while chunk := response.read1(1 << 16):
+                content += chunk
+                if len(content) > max_size:
                     raise self._wrong(
-                        f"an answer of at most {stored_files.scaled(LARGEST):,} bytes",
-                        "a longer one",
+                        f"an answer of at most {max_size:,} bytes", "a longer one"
                     )
-        text = b"".join(parts)
         try:
-            answer = stored_files.parse_json(text.decode(), finite=True)
+            answer = stored_files.parse_json(content.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
-            raise self._wrong(
-                "JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})"
-            ) from None
+            excerpt = self._clean(content[:60].decode(errors="replace"))
+            raise self._wrong("JSON", f"{excerpt!r} ({error})") from None
         if not isinstance(answer, dict):
             raise self._wrong("a JSON object", type(answer).__name__)
         return answer
 
     def _clean(self, text: str) -> str:
-        """What a server says, in one line and without the key, which it may send
-        back.
-        """
-        text = text.replace(models.read_key(), "(key)") if models.read_key() else text
-        return " ".join(
-            "".join(sign if sign.isprintable() else " " for sign in text).split()
-        )
+        """Return a server's text on one line and without the key, which it may echo."""
+        key = models.read_key()
+        if key:
+            text = text.replace(key, "(key)")
+        printable = "".join(char if char.isprintable() else " " for char in text)
+        return " ".join(printable.split())
 
     def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> errors.ModelError:
-        """Return the error for an answer that is something else, or an object with
-        other keys.
-        """
+        """Return the error for an answer that is something else, or an object with other keys."""
         if isinstance(got, Mapping):
             got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
         return errors.ModelError(
             f"model {self.name}: expected {expected}, got {got} ({self.url})"
         )
 
-    def _count_tokens(self, answer: Mapping[str, Any]) -> None:
-        """Count the tokens that an answer says it took. Raises ModelError where a limit
-        needs them and it says none.
+    def _count_tokens(self, response: Mapping[str, Any]) -> None:
+        """Count the tokens that a response states.
+
+        Raises:
+            ModelError: it states none, and a limit needs them.
         """
-        usage = answer.get("usage")
-        usage = usage if isinstance(usage, Mapping) else {}
-        numbers = [usage.get(name) for name in ("prompt_tokens", "completion_tokens")]
-        tokens = [
-            n
-            for n in numbers
-            if isinstance(n, int) and not isinstance(n, bool) and n >= 0
-        ]
-        if len(tokens) == 2:
-            self.spent.update(tokens_in=tokens[0], tokens_out=tokens[1])
+        usage = response.get("usage")
+        if not isinstance(usage, Mapping):
+            usage = {}
+        counts = [usage.get(name) for name in ("prompt_tokens", "completion_tokens")]
+        is_stated = all(
+            isinstance(count, int) and not isinstance(count, bool) and count >= 0
+            for count in counts
+        )
+        if is_stated:
+            tokens_in, tokens_out = counts
+            self.spent.update(tokens_in=tokens_in, tokens_out=tokens_out)
             self._keep_spent()
         elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
             raise self._wrong(

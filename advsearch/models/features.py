@@ -43,9 +43,7 @@ Read = Callable[[Tensor], Tensor]
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model seen as a differentiable function from images to features. Made by
-    `features_of`.
-    """
+    """A model as a differentiable function from images to features; created by `features_of`."""
 
     model: Model
     read: Read = field(repr=False)
@@ -56,9 +54,12 @@ class Features:
     penultimate: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the features (N, F), float32, of images as `Model` takes them;
-        differentiable. One more run of the network: the logits are not computed along.
-        Raises InputError: not an image, or values that are clearly not in [0, 1].
+        """Compute the features (N, F), float32, of images as `Model` takes them; differentiable.
+
+        The network runs once more: the logits are not computed with them.
+
+        Raises:
+            InputError: not an image, or values that are clearly not in [0, 1].
         """
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
@@ -69,33 +70,34 @@ class Features:
 
 
 def features_of(model: Model) -> Features:
-    """Return the penultimate features of a model, found by showing it grey images; see
-    the module's docstring.
+    """Find the penultimate features of a model by running it on gray images; see the
+    module.
     """
-    grey = torch.full((min(2, model.batch_limits[1]), *model.input_size, 3), 0.5)
+    batch_size = min(2, model.batch_limits[1])
+    gray = torch.full((batch_size, *model.input_size, 3), 0.5)
     with torch.no_grad():
-        x = model.prepared(grey)
-        for calls in (_of_modules, _of_graph):
-            if (last := _last(calls, model, x)) is not None:
-                read, where = last
+        x = model.prepared(gray)
+        for trace_calls in (_of_modules, _of_graph):
+            last = _last(trace_calls, model, x)
+            if last is not None:
+                read, source = last
                 size = read(x).shape[1]
-                return Features(model, read, size, f"the {where}, {size} numbers")
-    why = (
+                return Features(model, read, size, f"the {source}, {size} numbers")
+    source = (
         f"the logits, {model.classes} numbers: no layer before them can be read in "
-        "a "
-        f"{type(model.module).__name__}"
+        f"a {type(model.module).__name__}"
     )
 
-    def centred(x: Tensor) -> Tensor:
+    def center_logits(x: Tensor) -> Tensor:
         logits: Tensor = model.ask(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
-    return Features(model, centred, model.classes, why, penultimate=False)
+    return Features(model, center_logits, model.classes, source, penultimate=False)
 
 
 class _Call(NamedTuple):
-    """A call of a layer: what it is of, what went in (None for weights) and came out,
-    and the axis of channels.
+    """A call of a layer: the layer, its input (None for weights) and output, and the axis of
+    channels.
     """
 
     layer: Any
@@ -112,35 +114,44 @@ their order.
 
 
 def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
-    """Return how to read features (N, F) of the last layer of a network, means over all
-    axes but the first and that of channels, and what that layer is; None where there is
-    none.
+    """Find the features (N, F) of the last layer of a network.
+
+    They are its input if it is the head, else its output, averaged over all axes but
+    the batch and the channels.
+
+    Args:
+        calls: traces the layers of a network.
+        model: with the network.
+        x: a batch for it.
+
+    Returns:
+        The function that computes them, and a description of the layer; None if there
+        is no such layer.
     """
     usable = [
         call for call in calls(model.module, x, None) if len(call.output) == len(x)
     ]
-    heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     if not usable:
         return None
+    heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
-    part = "input" if heads else "output"
-    if getattr(last, part) is None:
+    attribute = "input" if heads else "output"
+    if getattr(last, attribute) is None:
         return None
 
     def read(batch: Tensor) -> Tensor:
-        value: Tensor = getattr(calls(model.module, batch, last.layer)[-1], part)
+        call = calls(model.module, batch, last.layer)[-1]
+        value: Tensor = getattr(call, attribute)
         channels_last = value.movedim(last.axis, -1)
-        return (
-            channels_last.flatten(1, -2).mean(dim=1)
-            if value.dim() > 2
-            else channels_last
-        )
+        if value.dim() > 2:
+            return channels_last.flatten(1, -2).mean(dim=1)
+        return channels_last
 
-    return read, f"{part} of {last.name}"
+    return read, f"{attribute} of {last.name}"
 
 
 def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
-    """Those of a module that calls its layers."""
+    """Return the calls of the layers of a module, or of one layer."""
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(
         network, torch.jit.ScriptModule
@@ -179,7 +190,7 @@ def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
 
 
 def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
-    """Those of a graph of operators, such as a program of `torch.export`."""
+    """Return the calls of the layers of a graph of operators, such as a `torch.export` program."""
     calls: list[_Call] = []
 
     class Reader(fx.Interpreter):
@@ -211,10 +222,11 @@ PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has
-    one of `PARTS`; None where there are none. Maps (N, D, H, W) are averaged over their
-    positions. Of several tokens (N, T, D), the first stands for the picture if `token`,
-    otherwise their mean.
+    """Return the features (N, D) in an output of a network, a tensor or what has one of
+    `PARTS`; None if there are none.
+
+    Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the
+    first is taken with `token`, otherwise their mean.
     """
     for part in PARTS:
         value = (

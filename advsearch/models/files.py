@@ -1,9 +1,9 @@
-"""Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by
-content; and ONNX, by its suffix.
+"""Load models from files: `torch.export` archives (.pt2), TorchScript and ONNX.
 
-No Python object is ever unpickled: archives that need it are refused. A model file is a
-program all the same; open only files whose makers you trust. ONNX files are run by
-onnxruntime, which gives predictions and no gradients.
+Archives are recognized by content, ONNX by its suffix. No Python object is ever
+unpickled: archives that need it are rejected. A model file is a program all the same;
+open only files whose makers you trust. ONNX files are run by onnxruntime, which gives
+predictions and no gradients.
 """
 
 from __future__ import annotations
@@ -62,31 +62,23 @@ EXPORT_HINT = (
     "'package.module:callable@weights.safetensors'"
 )
 
-LARGEST_BATCH = 64  # that is sent to a program whose batch dimension is free
+LARGEST_BATCH = 64  # maximum batch size of a program whose batch dimension is free
 
 
 def load_file(path: Path) -> Source:
-    """Return the model in a file. Raises FileFormatError: missing, empty, truncated,
-    damaged, a pickle, or of another kind; the message names the file; ModelError: a
-    program that does not take one floating-point image.
+    """Load the model in a file.
+
+    Raises:
+        FileFormatError: missing, empty, truncated, corrupt, a pickle, or of another
+            kind; the message names the file.
+        ModelError: a program that does not take one floating-point image.
     """
     try:
         opened = open_regular(path, "a model file", LARGEST)
     except FileNotFoundError:
-        hint = f" The folder {path.parent} does not exist either"
-        if path.parent.is_dir():
-            near = difflib.get_close_matches(
-                path.name,
-                [item.name for item in path.parent.iterdir()],
-                n=3,
-                cutoff=0.6,
-            )
-            hint = (
-                f" Did you mean {' or '.join(repr(str(path.parent / name)) for name in near)}?"
-                if near
-                else ""
-            )
-        raise FileFormatError(f"model file {path}: no such file.{hint}") from None
+        raise FileFormatError(
+            f"model file {path}: no such file.{_hint_of_missing(path)}"
+        ) from None
     except OSError as error:
         raise FileFormatError(
             f"model file {path}: cannot be read ({error.strerror or error})"
@@ -103,24 +95,11 @@ def load_file(path: Path) -> Source:
             raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _kind(archive) == "torchscript":
-            checked, runs_while_loading = rewritten_torchscript(archive)
-            if runs_while_loading and (wrong := try_torchscript(checked)):
-                raise FileFormatError(f"model file {path}: {wrong}")
-            with warnings.catch_warnings(), _damaged(path, "TorchScript"):
-                # the second from torch 2.14 on
-                for kind in (DeprecationWarning, FutureWarning):
-                    warnings.filterwarnings(
-                        "ignore",
-                        message=r".*torch\.jit\.\w+.* is "
-                        r"deprecated",
-                        category=kind,
-                    )
-                module = torch.jit.load(checked, map_location="cpu")
-            return source_of(module, path.stem)
+            return _load_torchscript(archive)
         checked = exported_programs.rewritten(archive)
-        # prints a traceback of what is refused with a message anyway
         logger = logging.getLogger("torch.export")
         with _damaged(path, "torch.export"), without_unpickling(), ExitStack() as stack:
+            # torch logs a traceback of what is rejected with a message anyway.
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
             program = torch.export.load(checked)
@@ -128,8 +107,40 @@ def load_file(path: Path) -> Source:
         return _with_signature(source_of(module, path.stem), program)
 
 
+def _hint_of_missing(path: Path) -> str:
+    """Return a hint for a path that does not exist: names like it, if there are any."""
+    if not path.parent.is_dir():
+        return f" The folder {path.parent} does not exist either"
+    names = [entry.name for entry in path.parent.iterdir()]
+    similar = difflib.get_close_matches(path.name, names, n=3, cutoff=0.6)
+    if not similar:
+        return ""
+    paths = [repr(str(path.parent / name)) for name in similar]
+    return f" Did you mean {' or '.join(paths)}?"
+
+
+def _load_torchscript(archive: Archive) -> Source:
+    """Load the network in a TorchScript archive."""
+    path = archive.path
+    checked, runs_while_loading = rewritten_torchscript(archive)
+    if runs_while_loading:
+        problem = try_torchscript(checked)
+        if problem:
+            raise FileFormatError(f"model file {path}: {problem}")
+    with warnings.catch_warnings(), _damaged(path, "TorchScript"):
+        # torch 2.14 and later warn by the second category.
+        for category in (DeprecationWarning, FutureWarning):
+            warnings.filterwarnings(
+                "ignore",
+                message=r".*torch\.jit\.\w+.* is deprecated",
+                category=category,
+            )
+        module = torch.jit.load(checked, map_location="cpu")
+    return source_of(module, path.stem)
+
+
 def _kind(archive: Archive) -> str:
-    """Return ``"exported"`` or ``"torchscript"``; raise for everything else."""
+    """Return ``"exported"`` or ``"torchscript"``; raise FileFormatError for anything else."""
     path = archive.path
     names = archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
@@ -162,6 +173,7 @@ def _kind(archive: Archive) -> str:
 
 
 def _not_an_archive(path: Path, head: bytes) -> str:
+    """Describe a file that is no zip archive by its first bytes and its suffix."""
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
         return (
             "safetensors hold weights but no network; name what builds it: "
@@ -190,75 +202,104 @@ def _not_an_archive(path: Path, head: bytes) -> str:
 
 
 def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
-    """Return the source with what the program's signature tells: input size, layout,
-    batch limits, dtype. A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all
-    pictures of a rig at once.
+    """Return the source with what the program's signature shows: input size, layout,
+    batch limits, dtype.
+
+    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once.
+
+    Raises:
+        ModelError: it takes something other than images.
     """
     nodes = {
         node.name: node for node in program.graph.nodes if node.op == "placeholder"
     }
-    names = [key for key in program.graph_signature.user_inputs if key in nodes]
-    values = [nodes[key].meta.get("val") for key in names]
-    tensors = bool(values) and all(isinstance(value, Tensor) for value in values)
-    rig = (
-        tensors
-        and len(values) == 1
-        and values[0].dim() == 5
-        and isinstance(values[0].shape[1], int)
+    names = [name for name in program.graph_signature.user_inputs if name in nodes]
+    inputs = [nodes[name].meta.get("val") for name in names]
+    is_rig = _check_inputs(source, names, inputs)
+    images = inputs[0]
+    if len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2:
+        size_type = inputs[1].dtype
+        source = replace(source, size_type=size_type)
+    else:
+        source = replace(source, takes_more=len(inputs) > 1, size_type=None)
+    source = _with_image_input(source, images, is_rig=is_rig)
+    min_batch, max_batch = _batch_limits(program, images.shape[0])
+    if not is_rig:
+        return replace(source, batch_limits=(min_batch, max_batch))
+    cameras = int(images.shape[1])
+    layout = "NKHWC" if source.layout == "NHWC" else "NKCHW"
+    return replace(
+        source,
+        module=AllAtOnce(cast(nn.Module, source.module), cameras, layout),
+        layout=None,
+        batch_limits=(min_batch * cameras, max_batch * cameras),
     )
-    if not rig and (
-        not tensors
-        or values[0].dim() != 4
-        or any(value.dim() != 2 for value in values[1:])
-    ):
+
+
+def _with_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
+    """Return the source with input size, layout and dtype of an input of images.
+
+    Raises:
+        ModelError: it is of another dtype.
+    """
+    is_eight_bit = images.dtype == torch.uint8 and not is_rig
+    if not images.is_floating_point() and not is_eight_bit:
+        expected = "an image as input, floating-point or uint8, got"
+        if is_rig:
+            expected = "floating-point images as input, got"
+        raise ModelError(f"model {source.name}: expected {expected} {images.dtype}")
+    image_shape = images.shape[-3:]
+    is_channels_last = image_shape[2] == 3 and image_shape[0] != 3
+    height, width = image_shape[:2] if is_channels_last else image_shape[1:]
+    is_fixed_size = isinstance(height, int) and isinstance(width, int)
+    source = replace(
+        source,
+        input_size=(height, width) if is_fixed_size else None,
+        layout="NHWC" if is_channels_last else "NCHW",
+    )
+    return as_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
+
+
+def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
+    """Return whether a program takes the images of a rig, (N, K, ...).
+
+    Raises:
+        ModelError: it takes neither these nor images, with or without vectors.
+    """
+    are_tensors = bool(inputs) and all(isinstance(value, Tensor) for value in inputs)
+    is_rig = (
+        are_tensors
+        and len(inputs) == 1
+        and inputs[0].dim() == 5
+        and isinstance(inputs[0].shape[1], int)
+    )
+    is_image = (
+        are_tensors
+        and inputs[0].dim() == 4
+        and all(value.dim() == 2 for value in inputs[1:])
+    )
+    if not is_rig and not is_image:
         raise ModelError(
             f"model {source.name}: expected a program with one input, a batch of "
-            "images of 4 dimensions"
-            f"{_second_input(names)}"
+            f"images of 4 dimensions{_second_input(names)}"
         )
-    images = values[0]
-    eight_bit = images.dtype == torch.uint8 and not rig
-    if not images.is_floating_point() and not eight_bit:
-        what = (
-            "floating-point images as input, got"
-            if rig
-            else "an image as input, floating-point or uint8, got"
-        )
-        raise ModelError(f"model {source.name}: expected {what} {images.dtype}")
-    if len(names) == 2 and names[1] in SIZE_INPUTS and values[1].shape[1] == 2:
-        source = replace(source, size_type=values[1].dtype)
-    else:
-        source = replace(source, takes_more=len(values) > 1, size_type=None)
-    picture = images.shape[-3:]
-    last = picture[2] == 3 and picture[0] != 3
-    height, width = picture[:2] if last else picture[1:]
-    size = (
-        (height, width) if isinstance(height, int) and isinstance(width, int) else None
-    )
-    batch = images.shape[0]
-    low, high = (batch, batch) if isinstance(batch, int) else (1, LARGEST_BATCH)
-    if (
-        not isinstance(batch, int)
-        and (allowed := program.range_constraints.get(batch.node.expr)) is not None
-    ):
-        low = max(int(allowed.lower), 1)
-        high = max(low, int(min(allowed.upper, LARGEST_BATCH)))
-    source = replace(source, input_size=size)
-    source = as_eight_bit(source) if eight_bit else replace(source, dtype=images.dtype)
-    if not rig:
-        return replace(
-            source, batch_limits=(low, high), layout="NHWC" if last else "NCHW"
-        )
-    cameras = int(images.shape[1])
-    module = AllAtOnce(
-        cast(nn.Module, source.module), cameras, "NKHWC" if last else "NKCHW"
-    )
-    return replace(source, module=module, batch_limits=(low * cameras, high * cameras))
+    return is_rig
+
+
+def _batch_limits(program: torch.export.ExportedProgram, batch: Any) -> tuple[int, int]:
+    """Return the minimum and maximum of a batch dimension, fixed or symbolic."""
+    if isinstance(batch, int):
+        return batch, batch
+    allowed = program.range_constraints.get(batch.node.expr)
+    if allowed is None:
+        return 1, LARGEST_BATCH
+    min_batch = max(int(allowed.lower), 1)
+    return min_batch, max(min_batch, int(min(allowed.upper, LARGEST_BATCH)))
 
 
 def as_eight_bit(source: Source) -> Source:
-    """Return the source of a network that takes uint8, as one of floating-point
-    pictures from 0 to 255.
+    """Return the source of a network that takes uint8 as one that takes floating-point images
+    from 0 to 255.
     """
     return replace(
         source,
@@ -269,9 +310,7 @@ def as_eight_bit(source: Source) -> Source:
 
 
 def _second_input(names: list[str]) -> str:
-    """What to do with a network of two inputs, of which the second is not known; "" of
-    others.
-    """
+    """Return what to do about a network of two inputs whose second is unknown; "" for others."""
     if len(names) != 2:
         return ""
     return (
@@ -284,13 +323,12 @@ def _second_input(names: list[str]) -> str:
 
 
 def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
-    what = f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
-    more = (
-        "damaged, made by another version, or in need of unpickling, which is "
-        "never "
-        "done"
+    """Turn whatever torch raises while it reads a file into a FileFormatError."""
+    problem = (
+        f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
     )
-    return foreign(f"{what}; {more}", kind=FileFormatError)
+    causes = "damaged, made by another version, or in need of unpickling, which is never done"
+    return foreign(f"{problem}; {causes}", kind=FileFormatError)
 
 
 FLOATS = {
@@ -300,14 +338,15 @@ FLOATS = {
 }
 
 OLDEST = (1, 24)
-"""The first onnxruntime that reads no weights from outside the folder of a file; older
-ones follow `../` and links.
+"""The first onnxruntime that reads no weights from outside the directory of a file;
+older ones follow `../` and links.
 """
 
 
 class OnnxNetwork(nn.Module):
-    """A session of onnxruntime as a function from a batch of images to its outputs; no
-    gradient goes through it. `new_options` makes options of a run, by which it can be
+    """A session of onnxruntime as a function from a batch of images to its outputs.
+
+    No gradient goes through it. `new_options` creates options of a run, by which it can be
     ended.
     """
 
@@ -318,9 +357,7 @@ class OnnxNetwork(nn.Module):
         self.options = new_options()
 
     def forward(self, *tensors: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Return the only output, or all of them in their order, for its inputs in
-        their order.
-        """
+        """Return the only output, or all outputs in order, for the inputs in order."""
         self.options = self.new_options()
         names = [tensor.name for tensor in self.session.get_inputs()]
         named = {
@@ -334,16 +371,46 @@ class OnnxNetwork(nn.Module):
         return outputs[0] if len(outputs) == 1 else outputs
 
     def stop(self) -> None:
-        """End the run that is going on: a file's program may never end."""
+        """End the current run: the program in a file may never end."""
         self.options.terminate = True
 
 
 def load_onnx(path: Path) -> Source:
-    """Return the network in an ONNX file that is known to be an ordinary one;
-    onnxruntime holds its other files to its folder. Raises FileFormatError where it is
-    damaged, or refers to files that are elsewhere, and ModelError where onnxruntime is
-    missing or too old, or the network does not take one batch of images.
+    """Load the network in an ONNX file, which is known to be a regular file.
+
+    onnxruntime restricts its other files to its directory.
+
+    Raises:
+        FileFormatError: it is corrupt, or refers to files elsewhere.
+        ModelError: onnxruntime is missing or too old, or the network does not take one
+            batch of images.
     """
+    session, runtime = _open_session(path)
+    inputs = session.get_inputs()
+    _check_onnx_inputs(path, inputs)
+    images = inputs[0]
+    is_eight_bit = images.type == "tensor(uint8)"
+    batch = images.shape[0]
+    is_channels_last = images.shape[3] == 3 and images.shape[1] != 3
+    metadata = session.get_modelmeta().custom_metadata_map
+    input_size = images.shape[1:3] if is_channels_last else images.shape[2:4]
+    if not all(isinstance(size, int) for size in input_size):
+        input_size = _parse_image_size(metadata.get("imgsz", ""))
+    source = Source(
+        OnnxNetwork(session, runtime.RunOptions),
+        path.stem,
+        input_size=(input_size[0], input_size[1]) if input_size else None,
+        layout="NHWC" if is_channels_last else "NCHW",
+        labels=names_in(metadata.get("names", "")),
+        batch_limits=(batch, batch) if isinstance(batch, int) else (1, LARGEST_BATCH),
+        dtype=torch.float32 if is_eight_bit else FLOATS[images.type],
+        size_type=SIZE_TYPES[inputs[1].type] if len(inputs) > 1 else None,
+    )
+    return as_eight_bit(source) if is_eight_bit else source
+
+
+def _open_session(path: Path) -> tuple[Any, Any]:
+    """Return a session of onnxruntime with the network in a file, and onnxruntime."""
     runtime = library("onnxruntime", str(path), "onnx")
     release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
     if release is None or (int(release[1]), int(release[2])) < OLDEST:
@@ -355,14 +422,14 @@ def load_onnx(path: Path) -> Source:
         )
     options = runtime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 4  # what is wrong is raised as well
-    what = (
+    options.log_severity_level = 4  # errors are raised as well
+    problem = (
         f"model file {path}: cannot be read as ONNX with onnxruntime "
         f"{runtime.__version__}"
     )
-    with foreign(what, kind=FileFormatError):
-        # What is constant is computed in each call, which has a deadline: while a
-        # session is made, nothing ends it.
+    with foreign(problem, kind=FileFormatError):
+        # Constants are computed in each call, which has a deadline: nothing could end
+        # the creation of a session.
         session = runtime.InferenceSession(
             str(path),
             options,
@@ -370,50 +437,41 @@ def load_onnx(path: Path) -> Source:
             disabled_optimizers=["ConstantFolding"],
             enable_fallback=0,  # it would print, and try the same again
         )
-    inputs = session.get_inputs()
+    return session, runtime
+
+
+def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
+    """Raise ModelError unless the inputs are images (N, ...), and at most their sizes
+    (N, 2).
+    """
     shape = inputs[0].shape if inputs else []
-    fixed = [side for side in shape if isinstance(side, int)]
-    eight_bit = bool(inputs) and inputs[0].type == "tensor(uint8)"
     is_image = (
         len(shape) == 4
-        and (eight_bit or inputs[0].type in FLOATS)
-        and min(fixed, default=1) > 0
+        and (inputs[0].type == "tensor(uint8)" or inputs[0].type in FLOATS)
+        and min((size for size in shape if isinstance(size, int)), default=1) > 0
     )
-    more = inputs[1:]
+    rest = inputs[1:]
     is_size = (
-        len(more) == 1 and more[0].name in SIZE_INPUTS and more[0].type in SIZE_TYPES
+        len(rest) == 1
+        and rest[0].name in SIZE_INPUTS
+        and rest[0].type in SIZE_TYPES
+        and len(rest[0].shape) == 2
+        and rest[0].shape[1] in (2, None)
     )
-    is_size = is_size and len(more[0].shape) == 2 and more[0].shape[1] in (2, None)
-    if not is_image or (more and not is_size):
-        got = (
-            ", ".join(
-                f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs
-            )
-            or "none"
-        )
-        raise ModelError(
-            f"model file {path}: expected one input, a batch of floating-point images "
-            "of 4 dimensions (or of uint8), "
-            f"got {got}{_second_input([tensor.name for tensor in inputs])}"
-        )
-    layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
-    sides = shape[1:3] if layout == "NHWC" else shape[2:4]
-    metadata = session.get_modelmeta().custom_metadata_map
-    # YOLO's exporters write it, such as "[640, 640]"
-    if not all(isinstance(side, int) for side in sides):
-        written = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", metadata.get("imgsz", ""))
-        sides = [int(side) for side in written.groups()] if written else []
-        sides = sides if all(sides) else []
-    source = Source(
-        OnnxNetwork(session, runtime.RunOptions),
-        path.stem,
-        input_size=(sides[0], sides[1]) if sides else None,
-        layout=layout,
-        labels=names_in(metadata.get("names", "")),
-        batch_limits=(shape[0], shape[0])
-        if isinstance(shape[0], int)
-        else (1, LARGEST_BATCH),
-        dtype=torch.float32 if eight_bit else FLOATS[inputs[0].type],
-        size_type=SIZE_TYPES[more[0].type] if more else None,
+    if is_image and (not rest or is_size):
+        return
+    got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs)
+    raise ModelError(
+        f"model file {path}: expected one input, a batch of floating-point images "
+        "of 4 dimensions (or of uint8), "
+        f"got {got or 'none'}{_second_input([tensor.name for tensor in inputs])}"
     )
-    return as_eight_bit(source) if eight_bit else source
+
+
+def _parse_image_size(text: str) -> list[int]:
+    """Parse (height, width) as YOLO's exporters write it, such as "[640, 640]"; empty if
+    it is no such text.
+    """
+    match = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
+    size = [int(number) for number in match.groups()] if match else []
+    return size if all(size) else []

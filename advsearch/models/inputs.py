@@ -1,6 +1,4 @@
-"""Networks that want more than pictures, or these as whole numbers, as networks of
-pictures alone.
-"""
+"""Adapt networks with further inputs, or with integer images, to networks of images alone."""
 
 from __future__ import annotations
 
@@ -14,9 +12,9 @@ from torch import Tensor, nn
 SIZE_INPUTS = frozenset(
     ["orig_target_sizes", "orig_target_size", "orig_sizes", "orig_size"]
 )
-"""What exports of RT-DETR, D-FINE and DEIM call the size of a picture: (width, height),
-which they multiply boxes by (`RTDETRPostProcessor` of lyuwenyu/RT-DETR; `onnx_inf.py`
-of Peterande/D-FINE).
+"""Names of the image size (width, height) among the inputs of exported RT-DETR, D-FINE
+and DEIM, which multiply boxes by it (`RTDETRPostProcessor` of lyuwenyu/RT-DETR;
+`onnx_inf.py` of Peterande/D-FINE).
 """
 
 SIZE_TYPES = {
@@ -24,19 +22,18 @@ SIZE_TYPES = {
     "tensor(int32)": torch.int32,
     "tensor(float)": torch.float32,
 }
-"""The types in which onnxruntime may say that a network takes them."""
+"""The types of image sizes by their names in onnxruntime."""
 
 
 @final
 class WithImageSize(nn.Module):
-    """A network that also takes the size of its pictures; boxes are then in pixels of
-    these.
+    """A network that also takes the size of its images; its boxes are then in pixels.
 
     Args:
-        network: from pictures and their sizes (N, 2), (width, height) in pixels, to an
+        network: from images and their sizes (N, 2), (width, height) in pixels, to an
             output.
-        size_type: the type of these sizes.
-        layout: of the pictures, "NCHW" or "NHWC".
+        size_type: dtype of these sizes.
+        layout: of the images, "NCHW" or "NHWC".
     """
 
     def __init__(
@@ -61,11 +58,10 @@ class WithImageSize(nn.Module):
 
 @final
 class EightBitInput(nn.Module):
-    """A network that takes whole numbers from 0 to 255 (uint8); no gradient goes
-    through the rounding to these.
+    """A network that takes integers from 0 to 255 (uint8); the rounding has no gradient.
 
     Args:
-        network: from pictures in uint8, and what else it takes, to an output.
+        network: from images in uint8, and further inputs, to an output.
     """
 
     def __init__(self, network: Callable[..., Any]) -> None:
@@ -74,54 +70,51 @@ class EightBitInput(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor, *more: Tensor) -> Any:
-        """Return the network's output for floating-point pictures with values from 0 to
-        255.
-        """
+        """Return the network's output for floating-point images with values from 0 to 255."""
         return self.network(
             images.detach().round().clamp(0.0, 255.0).to(torch.uint8), *more
         )
 
 
 def names_of_inputs(network: nn.Module) -> list[str]:
-    """Return the names of what a network has to be called with; none where Python
-    cannot tell.
+    """Return the names of the required inputs of a network; empty if Python does not
+    know them.
     """
     if isinstance(network, torch.jit.ScriptModule):
-        taken = network.forward.schema.arguments[1:]  # type: ignore[attr-defined]
-        return [one.name for one in taken if not one.has_default_value()]
+        arguments = network.forward.schema.arguments[1:]  # type: ignore[attr-defined]
+        return [
+            argument.name for argument in arguments if not argument.has_default_value()
+        ]
     try:
         parameters = list(inspect.signature(network.forward).parameters.values())
     except (TypeError, ValueError):  # it is not written in Python
         return []
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return [
         parameter.name
         for parameter in parameters
-        if parameter.kind not in variable
+        if parameter.kind not in variadic
         and parameter.default is inspect.Parameter.empty
     ]
 
 
 def takes_image_size(network: nn.Module) -> bool:
-    """Whether a network is called with pictures and their sizes, by the names of what
-    it takes.
-    """
+    """Whether a network takes images and their sizes, by the names of its inputs."""
     names = names_of_inputs(network)
     return len(names) == 2 and names[1] in SIZE_INPUTS
 
 
-PICTURE = "observation.image"  # what a policy's `select_action` calls the picture
+PICTURE = "observation.image"  # the key of the image for a policy's `select_action`
 
 
 @final
 class WithState(nn.Module):
-    """A policy of pictures and a state that stays as it is.
+    """A policy of images and a constant state.
 
-    A policy with a method `select_action` is called as LeRobot's are: with one mapping
-    of the pictures, as `PICTURE`, and of the state (numbers by name), after `reset`
-    where it has one, since what it still holds belongs to an earlier picture. Others
-    are called with the pictures and the mapping, or with the pictures alone where the
-    state is empty.
+    A policy with a method `select_action` is called as LeRobot's are: with one mapping of the
+    images, as `PICTURE`, and of the state (numbers by name), after `reset` if it has one,
+    because it may still hold an earlier image. Others are called with the images and the
+    mapping, or with the images alone if the state is empty.
     """
 
     def __init__(
@@ -133,8 +126,8 @@ class WithState(nn.Module):
         self.training = False
 
     def forward(self, images: Tensor) -> Any:
-        """Return what the policy does for pictures (N, ...); it gets each part of the
-        state as (N, numbers).
+        """Return the policy's output for images (N, ...); each entry of the state is
+        (N, numbers).
         """
         state = {
             name: images.new_tensor(numbers).expand(len(images), -1)

@@ -38,17 +38,15 @@ NOTHING = frozenset(
 
 
 def names_nothing(name: str) -> bool:
-    """Whether a class of that name stands for no thing: background, "no object", a
-    number that nothing has.
+    """Whether the name of a class stands for no thing: background, "no object", an index
+    without a class.
     """
     return re.sub(r"[\s_<>()\[\]-]+", "", name.casefold()) in NOTHING
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """The classes that count as right for one object ("coffee mug" and "cup" may both
-    be).
-    """
+    """The classes that count as right for an object; both "coffee mug" and "cup" may be."""
 
     # the model's full label names, in the order in which they were asked for
     names: tuple[str, ...]
@@ -67,17 +65,16 @@ class LabelSet:
 def find_label_set(
     text: str | int | Sequence[str | int], labels: Sequence[str], *, named: bool = True
 ) -> LabelSet:
-    """Return the classes named by `text`.
+    """Find the classes that a text names.
 
-    Terms are separated by commas. A term matches a class, whatever its case, if it
-    equals the class's label name or one of the comma-separated synonyms in it ("tench,
-    Tinca tinca"). ``"#504"`` is always a class index; a bare ``"504"`` is one unless a
-    label is called that.
+    Terms are separated by commas. A term matches a class in any case if it equals the
+    class's label name or one of the comma-separated synonyms in it ("tench, Tinca tinca").
+    ``"#504"`` is always a class index; a bare ``"504"`` is one unless a label has that name.
 
     Args:
         text: the terms, e.g. ``"coffee mug,cup"``, or a sequence of terms and indices.
         labels: the model's label names in index order.
-        named: False if the names are placeholders, so that messages can say so.
+        named: False if the names are placeholders, for messages.
 
     Raises:
         InputError: no term, an unknown name (with near matches), a name of several
@@ -99,41 +96,56 @@ def find_label_set(
 
 
 def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
-    """Return index and name of the classes whose names are like `word`, best first, and
-    then those that mean the same. What is like a word says `resembling`; what means the
-    same ("cup" for "mug") is a table of everyday things. The name is the part of the
-    label that matched: "frying pan" of "frying pan, frypan, skillet".
+    """Find the classes whose names resemble a word, best first, then its synonyms.
+
+    Resemblance is that of `resembling`; synonyms ("cup" for "mug") come from a table of
+    everyday things.
+
+    Returns:
+        Index and name of each class; the name is the part of the label that matched:
+        "frying pan" of "frying pan, frypan, skillet".
     """
     table = {
         name: indices
         for name, indices in _name_table(labels).items()
         if "," not in name
     }
-    everyday = [
-        [_key(name) for name in names]
-        for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))
-    ]
+    synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
     key = _key(word)
-    same = [
-        name for names in everyday if key in names for name in names if name in table
-    ]
-    like = resembling(word, table)
-    if same and not any(key in name for name in like):  # nothing but other spellings
-        like = []
-    parts: dict[int, str] = {}
-    for name in (*like, *same):
+    synonyms = []
+    for group in synonym_groups:
+        names = [_key(name) for name in group]
+        if key in names:
+            synonyms += [name for name in names if name in table]
+    similar = resembling(word, table)
+    # If nothing contains the word, the similar names are only spelled like it.
+    if synonyms and not any(key in name for name in similar):
+        similar = []
+    name_of_index: dict[int, str] = {}
+    for name in (*similar, *synonyms):
         for index in table[name]:
-            parts.setdefault(index, name)
-    return list(parts.items())
+            name_of_index.setdefault(index, name)
+    return list(name_of_index.items())
 
 
 def _find(
     term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool
 ) -> int:
+    """Return the index of the class of a term.
+
+    Args:
+        term: a name, or an index such as "#504".
+        table: indices by name.
+        labels: of the model.
+        named: whether these are names, not placeholders.
+
+    Raises:
+        InputError: there is no such class, or several.
+    """
     indices = table.get(_key(term), [])
-    number = re.fullmatch(r"#\s*(-?\d+)", term) or (
-        None if indices else re.fullmatch(r"(-?\d+)", term)
-    )
+    number = re.fullmatch(r"#\s*(-?\d+)", term)
+    if not number and not indices:
+        number = re.fullmatch(r"(-?\d+)", term)
     if number:
         index = int(number[1])
         if not 0 <= index < len(labels):
@@ -145,23 +157,33 @@ def _find(
     if len(indices) == 1:
         return indices[0]
     if indices:
-        listed = ", ".join(f"#{index} ({labels[index]})" for index in indices)
+        classes = ", ".join(f"#{index} ({labels[index]})" for index in indices)
         raise InputError(
-            f"label {term!r} names {len(indices)} classes: {listed}. Give "
+            f"label {term!r} names {len(indices)} classes: {classes}. Give "
             f"the index, e.g. '#{indices[0]}'"
         )
-    shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
-    hint = f"Its {len(labels)} labels: {shown}"
-    if not named:
-        fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
-        instead = f"give a label file (`labels`){fitting}, or an index such as '#0'"
-        hint = f"Its {len(labels)} classes have no names: {instead}"
-    elif near := matching_labels(term, labels)[:MOST_SUGGESTIONS]:
-        hint = f"Did you mean {' or '.join(f'{name!r} (#{index})' for index, name in near)}?"
+    hint = _hint_of_labels(term, labels, named)
     raise InputError(f"the model has no label {term!r}. {hint}")
 
 
+def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
+    """Return a hint for an unknown label: names like it, or what labels there are."""
+    if not named:
+        fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
+        return (
+            f"Its {len(labels)} classes have no names: give a label file "
+            f"(`labels`){fitting}, or an index such as '#0'"
+        )
+    similar = matching_labels(term, labels)[:MOST_SUGGESTIONS]
+    if similar:
+        names = " or ".join(f"{name!r} (#{index})" for index, name in similar)
+        return f"Did you mean {names}?"
+    suffix = ", ..." if len(labels) > 20 else ""
+    return f"Its {len(labels)} labels: {', '.join(labels[:20])}{suffix}"
+
+
 def _key(name: str) -> str:  # what is compared
+    """Return a name in the form in which names are compared."""
     return " ".join(name.casefold().split())
 
 
@@ -177,8 +199,7 @@ def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
     return table
 
 
-# ---- label files
-# -----------------------------------------------------------------------------------------------------
+# ---- label files ----
 
 
 def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ...]:
@@ -209,9 +230,11 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
 
 
 def names_in(names: Any) -> tuple[str, ...] | None:
-    """Return the names that a network says its classes have, in order: as YOLO's do in
-    `names`, and their files in metadata. A stranger says them: a mapping from 0, 1, ...
-    to names, a list of names, or the text of one; None of anything else.
+    """Return the names of classes that a network states, in order, as YOLO's do in `names` and
+    in the metadata of their files.
+
+    They are untrusted: a mapping from 0, 1, ... to names, a list of names, or the text of
+    one; None for anything else.
     """
     if isinstance(names, str):
         if len(names) > LONGEST_NAMES or not _FLAT.fullmatch(names):
@@ -238,8 +261,8 @@ _FLAT = re.compile(
 
 
 def _lists_names(source: str | os.PathLike[str]) -> bool:
-    """Whether a text is names with commas between them, not the path of a file, be it
-    there or not.
+    """Whether a text is names with commas between them, not the path of a file, which may be
+    missing.
     """
     text = str(source)
     return (
@@ -256,31 +279,28 @@ class LabelsOrigin(NamedTuple):
     is_file: bool = False
 
 
-def find_labels_origin(given: object) -> LabelsOrigin:
-    """Return where labels came from."""
-    if given is None:
+def find_labels_origin(labels: object) -> LabelsOrigin:
+    """Return where labels come from, see `read_labels`."""
+    if labels is None:
         return LabelsOrigin("labels of the model")
-    is_file = (
-        isinstance(given, (str, os.PathLike))
-        and str(given) not in SETS
-        and not _lists_names(given)
-    )
-    return (
-        LabelsOrigin(f"label file {given}", is_file=True) if is_file else LabelsOrigin()
-    )
+    is_path = isinstance(labels, (str, os.PathLike)) and str(labels) not in SETS
+    if is_path and not _lists_names(labels):  # type: ignore[arg-type]
+        return LabelsOrigin(f"label file {labels}", is_file=True)
+    return LabelsOrigin()
 
 
-def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Return the texts that a model is given beside a picture, from a list or a text
-    with | between them. Raises InputError where one is no text, or empty.
+def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    """Return the prompts of a model from a list, or a text with | between them.
+
+    Raises:
+        InputError: one is no text, or empty.
     """
-    if given is None:
+    if prompts is None:
         return None
-    texts = (
-        [part.strip() for part in given.split("|")]
-        if isinstance(given, str)
-        else list(given)
-    )
+    if isinstance(prompts, str):
+        texts = [part.strip() for part in prompts.split("|")]
+    else:
+        texts = list(prompts)
     for text in texts or [""]:
         if not isinstance(text, str) or not text:
             raise InputError(
@@ -290,8 +310,10 @@ def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
 
 
 def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the texts that a name is put into, ``{}`` in its place; one of our own for
-    None. Raises InputError where one has no ``{}``.
+    """Return the prompts that names are inserted into for ``{}``; the default for None.
+
+    Raises:
+        InputError: one has no ``{}``.
     """
     for text in prompts or ():
         if "{}" not in text:
@@ -308,6 +330,7 @@ def sets_of(classes: int) -> list[str]:
 
 
 def _label_sets() -> dict[str, tuple[str, ...]]:
+    """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
@@ -316,8 +339,11 @@ def _label_sets() -> dict[str, tuple[str, ...]]:
 def fitting_labels(
     classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str
 ) -> tuple[str, ...]:
-    """Return the labels, or placeholders for None; InputError (FileFormatError, for a
-    file) if their number is not that of a model's classes.
+    """Return the labels, or placeholders for None.
+
+    Raises:
+        InputError: their number is not that of the model's classes; FileFormatError if they
+            are from a file.
     """
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
@@ -333,6 +359,7 @@ def fitting_labels(
 
 
 def _read_file(path: Path) -> tuple[str, ...]:
+    """Read label names from a JSON or text file; see `read_labels`."""
     where = f"label file {path}"
     try:
         text = read_text(path, "a label file", LARGEST)
@@ -378,12 +405,16 @@ def _read_file(path: Path) -> tuple[str, ...]:
 def _checked(
     names: Sequence[Any], kind: type[InputError], where: str
 ) -> tuple[str, ...]:
+    """Return label names without surrounding spaces; raise an error of a kind if one is
+    invalid.
+    """
     if problem := _problem(names):
         raise kind(f"{where}: {problem}")
     return tuple(name.strip() for name in names)
 
 
 def _problem(names: Sequence[Any]) -> str:
+    """Return what is wrong with label names, "" if nothing is."""
     if not names:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):

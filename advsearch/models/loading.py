@@ -1,4 +1,4 @@
-"""`load_model`: from what a user names to a `Model`."""
+"""Load a `Model` from whatever names it: `load_model`."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from advsearch.errors import InputError, ModelError, UnknownNameError, resemblin
 from advsearch.models import files, reference
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import (
+    LabelsOrigin,
     find_labels_origin,
     fitting_labels,
     names_in,
@@ -36,7 +37,7 @@ from advsearch.models.source import (
 from advsearch.registry import Registry, imported
 from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
 
-DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
+DEFAULT_INPUT_SIZE = (224, 224)  # if neither the model nor the caller states one
 
 SOURCES: Registry[Callable[..., Source | Model]] = Registry(
     "advsearch.models",
@@ -44,9 +45,9 @@ SOURCES: Registry[Callable[..., Source | Model]] = Registry(
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
-"""What loads ``SOURCE:NAME``, by source."""
+"""Loaders of ``SOURCE:NAME`` by source."""
 
-# those of them that are told what the network is to be asked
+# Sources whose loader takes a `Purpose`.
 FOR_A_PURPOSE = ("timm", "hf", "http", "https")
 
 FORMS = (
@@ -74,11 +75,10 @@ def load_model(
     read: Read | None = None,
     ask: Mapping[str, float] | None = None,
 ) -> Model:
-    """Load a model, look at its outputs once, and return it as a function from images
-    to logits.
+    """Load a model and probe its outputs once.
 
-    Options left at None take what the model says of itself, else the defaults named
-    here.
+    The result is a function from images to logits. Options that are None take what the
+    model states of itself, else the defaults given here.
 
     Args:
         spec: ``"reference"`` (the bundled classifier); a path to a `torch.export`
@@ -93,19 +93,18 @@ def load_model(
         prompt: of such a network: the text that each name is put into, with ``{}`` in
             its place; several (a list, or with | between them) are averaged. Default
             `advsearch.models.labels.PROMPT`.
-        name: what to call it in messages and results.
+        name: its name in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
             `value_range`; default 0.
         std: likewise; default 1. A preset given for one of `mean` and `std` sets both.
-        value_range: (low, high) that black and white are sent to; default (0, 1).
+        value_range: (low, high), the values of black and white; default (0, 1).
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
-        max_batch: the most images at once; default 64, or what the program allows.
-        read: what finds the output in what the network returns for so many images,
-            where it is not logits: a tensor (N,
-            ...) or a list of N things.
-        task: as in `attack`. It says how outputs are read. Default: classification,
+        max_batch: maximum batch size; default 64, or what the program allows.
+        read: finds the output in what the network returns for a number of images, if
+            it is not logits: a tensor (N, ...) or a list of N elements.
+        task: as in `attack`. It defines how outputs are read. Default: classification,
             unless there is `read`.
         ask: ceilings and prices of a model behind an address (docs/addresses.md).
 
@@ -121,14 +120,16 @@ def load_model(
     Warns:
         ModelWarning: see `advsearch.models.probe.probe`.
     """
-    options = {
+    all_options = {
         "input_size": input_size,
         "mean": mean,
         "std": std,
         "value_range": value_range,
+        "layout": layout,
+        "channels": channels,
+        "max_batch": max_batch,
     }
-    options |= {"layout": layout, "channels": channels, "max_batch": max_batch}
-    given = {key: value for key, value in options.items() if value is not None}
+    options = {key: value for key, value in all_options.items() if value is not None}
     read = read or (task and task.reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
@@ -138,15 +139,20 @@ def load_model(
             f"{task.names_from}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    wanted = task.name if task else "classification"
-    lengths = (getattr(task, "tokens", 16), getattr(task, "times", 1))
-    source = _find(spec, Purpose(wanted, names, prompts, *lengths, ask or {}))
-    switches = turned_by_code()
-    reads_text = (
-        source.reads_text
-        if isinstance(source, Source)
-        else isinstance(source.module, RemoteNetwork)
+    purpose = Purpose(
+        task.name if task else "classification",
+        names,
+        prompts,
+        getattr(task, "tokens", 16),
+        getattr(task, "times", 1),
+        ask or {},
     )
+    source = _find_source(spec, purpose)
+    switches = turned_by_code()
+    if isinstance(source, Source):
+        reads_text = source.reads_text
+    else:
+        reads_text = isinstance(source.module, RemoteNetwork)
     if prompts is not None and (source is spec or not reads_text):
         raise InputError(
             f"prompt: model {source.name} has classes of its own and "
@@ -166,74 +172,93 @@ def load_model(
             "command the `state` that it takes"
         )
     if isinstance(source, Model):
-        if given:
+        if options:
             raise InputError(
                 f"model {source.name} brings its own preprocessing: leave out "
-                f"{', '.join(given)}, or load its network "
-                "anew"
+                f"{', '.join(options)}, or load its network anew"
             )
-        asked = source.asked if names is None and name is None else None
+        is_unchanged = names is None and name is None
         model = replace(
-            source, name=name or source.name, read=read or source.read, asked=asked
+            source,
+            name=name or source.name,
+            read=read or source.read,
+            asked=source.asked if is_unchanged else None,
         )
         if names is not None:
-            if model.read is None:  # the classes of others are counted by their task
+            if model.read is None:  # other tasks count the classes by themselves
                 names = fitting_labels(model.classes, names, origin, model.name)
             model = replace(model, labels=names, named=True)
     else:
-        # YOLO's have names, and `args` from training
         if read is not None and isinstance(source.module, nn.Module):
-            args = getattr(source.module, "args", None)
-            side = args.get("imgsz") if isinstance(args, Mapping) else None
-            size = (side, side) if isinstance(side, int) and side > 1 else None
-            its_names = names_in(getattr(source.module, "names", None))
-            source = replace(
-                source,
-                labels=source.labels or its_names,
-                input_size=source.input_size or size,
-            )
-        if max_batch is not None and (
-            isinstance(max_batch, bool)
-            or not isinstance(max_batch, int)
-            or max_batch < 1
-        ):
-            raise InputError(
-                f"max_batch: expected a whole number of at least 1, got {max_batch!r}"
-            )
-        low, high = source.batch_limits
-        preprocessing = _preprocessing(source, given)
-        bare = Model(
-            module=_of_images_alone(source, preprocessing),
-            name=name or source.name,
-            labels=(),
-            preprocessing=preprocessing,
-            batch_limits=(low, max(low, min(high, max_batch or high))),
-            dtype=source.dtype,
-            device=source.device,
-            read=read,
-        )
-        model = probe(bare, source.labels if names is None else names, origin)
-    alone = (
-        isinstance(spec, (str, os.PathLike))
-        and not given
-        and labels is None
-        and name is None
+            source = _with_training_arguments(source)
+        _check_max_batch(max_batch)
+        model = _probe_source(source, options, read, name, names, origin)
+    is_named_alone = not options and labels is None and name is None
+    if isinstance(spec, (str, os.PathLike)) and is_named_alone:
+        return replace(model, asked=os.fspath(spec))
+    return model
+
+
+def _with_training_arguments(source: Source) -> Source:
+    """Return a source with the names and the image size that YOLO networks store."""
+    arguments = getattr(source.module, "args", None)
+    size = arguments.get("imgsz") if isinstance(arguments, Mapping) else None
+    input_size = (size, size) if isinstance(size, int) and size > 1 else None
+    return replace(
+        source,
+        labels=source.labels or names_in(getattr(source.module, "names", None)),
+        input_size=source.input_size or input_size,
     )
-    return replace(model, asked=os.fspath(spec)) if alone else model  # type: ignore[arg-type]
 
 
-def _of_images_alone(
+def _check_max_batch(max_batch: object) -> None:
+    """Raise InputError if a value is neither None nor an integer of at least 1."""
+    if max_batch is None:
+        return
+    is_integer = isinstance(max_batch, int) and not isinstance(max_batch, bool)
+    if not is_integer or max_batch < 1:  # type: ignore[operator]
+        raise InputError(
+            f"max_batch: expected a whole number of at least 1, got {max_batch!r}"
+        )
+
+
+def _probe_source(
+    source: Source,
+    options: Mapping[str, Any],
+    read: Read | None,
+    name: str | None,
+    names: tuple[str, ...] | None,
+    origin: LabelsOrigin,
+) -> Model:
+    """Create a model from a source and the options of `load_model`, and probe it."""
+    min_batch, max_batch = source.batch_limits
+    max_batch = min(max_batch, options.get("max_batch") or max_batch)
+    preprocessing = _make_preprocessing(source, options)
+    model = Model(
+        module=_with_images_alone(source, preprocessing),
+        name=name or source.name,
+        labels=(),
+        preprocessing=preprocessing,
+        batch_limits=(min_batch, max(min_batch, max_batch)),
+        dtype=source.dtype,
+        device=source.device,
+        read=read,
+    )
+    return probe(model, source.labels if names is None else names, origin)
+
+
+def _with_images_alone(
     source: Source, preprocessing: Preprocessing
 ) -> Callable[[Tensor], Any]:
-    """Return the network of a source as one that is called with pictures alone."""
+    """Return the network of a source as one that is called with images alone."""
     if source.size_type is None or isinstance(source.module, WithState):
         return source.module
     return WithImageSize(source.module, source.size_type, preprocessing.layout)
 
 
 def named_code(spec: str) -> str | None:
-    """Return the "package.module:attribute" that a model's name imports; None of one
-    that imports none.
+    """Return the "package.module:attribute" that a model's name imports, None if it imports
+    nothing.
     """
     text = spec.strip()
     if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(
@@ -243,21 +268,19 @@ def named_code(spec: str) -> str | None:
     return split_weights(text)[0]
 
 
-def _find(spec: object, purpose: Purpose) -> Source | Model:
+def _find_source(spec: object, purpose: Purpose) -> Source | Model:
+    """Find the source of a model, or the model itself; see `load_model`."""
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return _find_library_source(spec, purpose) or source_of(
-            spec, type(spec).__name__
-        )
+        library_source = _find_library_source(spec, purpose)
+        return library_source or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
-        got = (
-            f"the class {spec.__name__} (pass an instance)"
-            if isinstance(spec, type)
-            else type(spec).__name__
-        )
+        got = type(spec).__name__
+        if isinstance(spec, type):
+            got = f"the class {spec.__name__} (pass an instance)"
         raise InputError(
             "model: expected a name, a path, an nn.Module or a Model, "
             f"got {got}. {FORMS}"
@@ -268,11 +291,8 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
         return reference.load(weights=weights)
     source = text.partition(":")[0].lower()
     if ":" in text and source in SOURCES:
-        return (
-            SOURCES[source](text, purpose)
-            if source in FOR_A_PURPOSE
-            else SOURCES[source](text)
-        )
+        load = SOURCES[source]
+        return load(text, purpose) if source in FOR_A_PURPOSE else load(text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
@@ -286,6 +306,11 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
         or os.path.exists(text)
     ):
         return files.load_file(Path(text))
+    raise _unknown_model(text)
+
+
+def _unknown_model(text: str) -> UnknownNameError:
+    """Return the error for a model's name that means nothing."""
     forms = {
         "hf": "hf:REPOSITORY",
         "http": "http://ADDRESS",
@@ -293,18 +318,17 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
     }
     names = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     hint = FORMS
-    # it may be a library's
-    if re.fullmatch(r"[\w.-]+", text) and not resembling(text, ["reference"]):
+    may_be_of_library = re.fullmatch(r"[\w.-]+", text)
+    if may_be_of_library and not resembling(text, ["reference"]):
         hint = (
             "A library's network is written with its library: "
-            f"'torchvision:{text}' "
-            f"or 'timm:{text}'. {FORMS}"
+            f"'torchvision:{text}' or 'timm:{text}'. {FORMS}"
         )
-    raise UnknownNameError("model", text, names, hint)
+    return UnknownNameError("model", text, names, hint)
 
 
 def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
-    """Return the source of a network of transformers or timm; None of any other."""
+    """Return the source of a network of transformers or timm; None for any other network."""
     for library, recognizer in list_built_ins("recognizer").items():
         if library in sys.modules:
             recognize: Callable[[nn.Module, Purpose], Source | None] = imported(
@@ -316,123 +340,130 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     return None
 
 
-def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing:
-    """What is done to pictures, by what a user writes (Python values, or strings from a
-    command line), or else by the source.
+def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preprocessing:
+    """Create the preprocessing from options, else from what the source states.
+
+    Args:
+        source: of the network.
+        options: of `load_model`, Python values or strings from a command line.
+
+    Raises:
+        InputError: an option is out of range, or the source's processor excludes it.
     """
-    instead = [
-        key
-        for key in ("mean", "std", "value_range", "channels")
-        if source.processor and key in given
-    ]
-    if instead:
-        raise InputError(
-            f"{instead[0]}: model {source.name} has a processor that does "
-            "all of this; leave it out"
-        )
+    if source.processor:
+        for key in ("mean", "std", "value_range", "channels"):
+            if key in options:
+                raise InputError(
+                    f"{key}: model {source.name} has a processor that does "
+                    "all of this; leave it out"
+                )
     fields: dict[str, Any] = {
-        key: getattr(source, key)
-        for key in ("mean", "std", "layout", "channels", "processor")
+        "mean": source.mean,
+        "std": source.std,
+        "layout": source.layout,
+        "channels": source.channels,
+        "processor": source.processor,
+        "input_size": source.input_size or DEFAULT_INPUT_SIZE,
     }
-    fields["input_size"] = source.input_size or DEFAULT_INPUT_SIZE
-    if "input_size" in given:
-        sides = _numbers(
-            "input_size",
-            given["input_size"],
-            (1, 2),
-            "one whole number or (height, width)",
-        )
-        if any(side != int(side) or side < 1 for side in sides):
-            raise InputError(
-                "input_size: expected whole numbers of at least 1, got "
-                f"{given['input_size']!r}"
-            )
-        fields["input_size"] = int(sides[0]), int(sides[-1])
+    if "input_size" in options:
+        fields["input_size"] = _parse_input_size(options["input_size"])
     if source.value_range is not None:
         fields["value_range"] = source.value_range
-    for key in ("mean", "std"):
-        value = given.get(key)
-        # it fills the other too, if that is not given
-        if isinstance(value, str) and value.strip().lower() in PRESETS:
-            preset = zip(("mean", "std"), PRESETS[value.strip().lower()], strict=True)
-            fields |= {
-                name: numbers
-                for name, numbers in preset
-                if name == key or name not in given
-            }
-        elif value is not None:
-            numbers = _numbers(
-                key,
-                value,
-                (1, 3),
-                f"one number, three numbers, or one of {', '.join(PRESETS)}",
-            )
-            fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
+    fields |= _parse_normalization(options)
     if any(number <= 0 for number in fields["std"] or ()):
         raise InputError(
             "std: expected numbers greater than 0, got "
-            f"{given.get('std', fields['std'])!r}"
+            f"{options.get('std', fields['std'])!r}"
         )
-    if "value_range" in given:
-        expected = "two numbers (low, high), such as (0, 255)"
-        low, high = _numbers("value_range", given["value_range"], (2,), expected)
-        if low >= high:
-            raise InputError(
-                f"value_range: expected low < high, got {given['value_range']!r}"
-            )
-        fields["value_range"] = (low, high)
+    if "value_range" in options:
+        fields["value_range"] = _parse_value_range(options["value_range"])
     if isinstance(source.module, EightBitInput):
-        _check_eight_bit(source.name, fields, given)
-    for key, choices in {
-        "layout": ("NCHW", "NHWC"),
-        "channels": ("RGB", "BGR"),
-    }.items():
-        if key in given:
-            fields[key] = str(given[key]).strip().upper()
+        _check_eight_bit(source.name, fields, options)
+    for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
+        if key in options:
+            fields[key] = str(options[key]).strip().upper()
             if fields[key] not in choices:
                 raise InputError(
-                    f"{key}: expected one of {', '.join(choices)}, got {given[key]!r}"
+                    f"{key}: expected one of {', '.join(choices)}, got {options[key]!r}"
                 )
     return Preprocessing(**{key: value for key, value in fields.items() if value})
 
 
-def _check_eight_bit(
-    name: str, fields: Mapping[str, Any], given: Mapping[str, object]
-) -> None:
-    """Raise InputError where pictures are not to be whole numbers from 0 to 255, of a
-    network that takes these.
+def _parse_input_size(value: Any) -> tuple[int, int]:
+    """Parse (height, width) in pixels from one number or two."""
+    expected = "one whole number or (height, width)"
+    numbers = _parse_numbers("input_size", value, (1, 2), expected)
+    if any(number != int(number) or number < 1 for number in numbers):
+        raise InputError(
+            f"input_size: expected whole numbers of at least 1, got {value!r}"
+        )
+    return int(numbers[0]), int(numbers[-1])
+
+
+def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Parse `mean` and `std` (3,) each; a preset for one fills the other too, unless
+    that is given.
     """
-    wrong = [key for key in ("mean", "std") if key in given]
+    fields: dict[str, Any] = {}
+    for key in ("mean", "std"):
+        value = options.get(key)
+        if isinstance(value, str) and value.strip().lower() in PRESETS:
+            preset_mean, preset_std = PRESETS[value.strip().lower()]
+            if key == "mean" or "mean" not in options:
+                fields["mean"] = preset_mean
+            if key == "std" or "std" not in options:
+                fields["std"] = preset_std
+        elif value is not None:
+            expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
+            numbers = _parse_numbers(key, value, (1, 3), expected)
+            # One number is repeated.
+            fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
+    return fields
+
+
+def _parse_value_range(value: Any) -> tuple[float, float]:
+    """Parse (low, high), the values of black and white."""
+    expected = "two numbers (low, high), such as (0, 255)"
+    low, high = _parse_numbers("value_range", value, (2,), expected)
+    if low >= high:
+        raise InputError(f"value_range: expected low < high, got {value!r}")
+    return low, high
+
+
+def _check_eight_bit(
+    name: str, fields: Mapping[str, Any], options: Mapping[str, object]
+) -> None:
+    """Raise InputError if options contradict a network that takes integers from 0 to
+    255.
+    """
+    wrong = [key for key in ("mean", "std") if key in options]
     if fields["value_range"] != (0.0, 255.0):
         wrong.append("value_range")
     if wrong:
         raise InputError(
             f"{wrong[0]}: model {name} takes whole numbers from 0 to 255 (uint8), got "
-            f"{given[wrong[0]]!r}; leave it out"
+            f"{options[wrong[0]]!r}; leave it out"
         )
 
 
-def _numbers(
+def _parse_numbers(
     key: str, value: Any, counts: tuple[int, ...], expected: str
 ) -> tuple[float, ...]:
-    """Return finite numbers from a number, a sequence, or comma-separated text; their
-    count is one of `counts`.
+    """Parse finite numbers from a number, a sequence, or a string with commas.
+
+    Raises:
+        InputError: they are no numbers, or their count is none of `counts`.
     """
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
-    value = (
-        value.split(",")
-        if isinstance(value, str)
-        else value.tolist()
-        if hasattr(value, "tolist")
-        else value
-    )
-    parts = list(value) if isinstance(value, Sequence) else [value]
+    if isinstance(value, str):
+        value = value.split(",")
+    elif hasattr(value, "tolist"):
+        value = value.tolist()
+    items = list(value) if isinstance(value, Sequence) else [value]
     try:
-        numbers = tuple(float(part) for part in parts)
+        numbers = tuple(float(item) for item in items)
     except (TypeError, ValueError):
         raise problem from None
-    if len(numbers) not in counts or not all(
-        math.isfinite(number) for number in numbers
-    ):
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise problem
     return numbers

@@ -1,10 +1,11 @@
-"""The model: any network, seen as a differentiable function from display-referred
-images to its output.
+"""Define the model: a network as a differentiable function from display-referred images to
+its output.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -24,54 +25,62 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.labels import LabelSet, find_label_set
 
-# ---------------------------------------------------------------------------------------------------------------------
-# A part of a network's work that is done again for its gradient, so that nothing is
-# kept of it meanwhile.
+# ---- recomputation of a batch for its gradient, which saves memory ----
 
 
 class _Recomputed(torch.autograd.Function):
-    """`torch.utils.checkpoint` does the same, but not under `autograd.grad`, or not
-    with `mend_batch_norms`.
+    """Compute a function of images without storing activations; its gradient computes again.
+
+    `torch.utils.checkpoint` does the same, but not under `autograd.grad`, and not with
+    `mend_batch_norms`.
     """
 
     @staticmethod
     def forward(
         ctx: Any, ask: Callable[[Tensor], Any], structure: list[Any], images: Tensor
     ) -> tuple[Tensor, ...]:
-        tensors, form = tree_flatten(ask(images))  # autograd is off in here
-        structure.append(form)
+        tensors, tree = tree_flatten(ask(images))  # autograd is off in here
+        structure.append(tree)
         ctx.ask = ask
         ctx.save_for_backward(images)
         ctx.mark_non_differentiable(
-            *(one for one in tensors if not one.is_floating_point())
+            *(tensor for tensor in tensors if not tensor.is_floating_point())
         )
         return tuple(tensors)
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor | None) -> tuple[None, None, Tensor]:
-        (images,) = ctx.saved_tensors  # again: it is to be differentiated once more
-        again = torch.is_grad_enabled()
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, Tensor]:
+        (images,) = ctx.saved_tensors
+        # Gradients are on if this gradient is to be differentiated once more.
+        create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
-            images = images if again else images.detach().requires_grad_()
+            images = images if create_graph else images.detach().requires_grad_()
             tensors, _ = tree_flatten(ctx.ask(images))
-        pairs = [
-            pair
-            for pair in zip(tensors, slopes, strict=True)
-            if pair[0].requires_grad and pair[1] is not None
-        ]
-        if not pairs:
+        outputs = []
+        output_gradients = []
+        for tensor, gradient in zip(tensors, gradients, strict=True):
+            if tensor.requires_grad and gradient is not None:
+                outputs.append(tensor)
+                output_gradients.append(gradient)
+        if not outputs:
             return None, None, torch.zeros_like(images)
-        outputs, given = zip(*pairs, strict=True)
-        (slope,) = torch.autograd.grad(
-            outputs, images, given, create_graph=again, allow_unused=True
+        (image_gradient,) = torch.autograd.grad(
+            outputs,
+            images,
+            output_gradients,
+            create_graph=create_graph,
+            allow_unused=True,
         )
-        return None, None, torch.zeros_like(images) if slope is None else slope
+        if image_gradient is None:
+            image_gradient = torch.zeros_like(images)
+        return None, None, image_gradient
 
 
 def recomputed(ask: Callable[[Tensor], Any], images: Tensor) -> Any:
-    """Return what `ask` returns of images: tensors, in lists and mappings. Its gradient
-    asks a second time, and takes the memory of one part instead of that of all (Chen et
-    al. 2016, *Training Deep Nets with Sublinear Memory Cost*, section 3).
+    """Return `ask(images)`: tensors, in lists and mappings, without storing activations.
+
+    Its gradient computes it a second time, and takes the memory of one batch instead of that
+    of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory Cost*, section 3).
     """
     structure: list[Any] = []
     tensors = _Recomputed.apply(ask, structure, images)  # type: ignore[no-untyped-call]
@@ -80,9 +89,7 @@ def recomputed(ask: Callable[[Tensor], Any], images: Tensor) -> Any:
 
 CPU = torch.device("cpu")
 PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
-"""What exported and scripted networks are, which are run as they are: they are not
-copied, and not trained.
-"""
+"""Types of exported and scripted networks, which can be neither copied nor trained."""
 
 Triple = tuple[float, float, float]
 
@@ -94,17 +101,17 @@ PRESETS: dict[str, tuple[Triple, Triple]] = {
 }
 
 Read = Callable[[Any, int], Any]
-"""From what a network returned to so many images, to its output; ValueError says what
-was expected.
+"""Reads the output from what a network returned for a number of images. Raises
+ValueError with what was expected.
 """
 
-# others count as this before the logarithm is taken: its derivative is finite in
-# float32
+# Smaller probabilities are clamped to this before the logarithm: its derivative is
+# finite in float32.
 SMALLEST_PROBABILITY = 1e-30
-# how far outside [0, 1] a pixel may lie: finite differences overshoot a little
+# How far outside [0, 1] a pixel may lie: finite differences overshoot a little.
 RANGE_TOLERANCE = 0.01
-# pictures of a rig of which all is kept that the network has computed; of more, it
-# computes it again
+# Maximum number of images of a rig whose activations are stored; for more, the network
+# recomputes them.
 KEPT = 4
 
 GIVEN_BY = {
@@ -115,26 +122,24 @@ GIVEN_BY = {
     "similarity": "features are what a network without a head gives",
     "command": "actions are what a policy gives",
 }
-"""What networks of a task return, by task, for messages."""
+"""What networks return, by the task that reads it, for messages."""
 
 
 class RemoteNetwork:
-    """A network elsewhere that only answers. A run keeps its answers, and states what
-    they cost.
-    """
+    """A network elsewhere that only answers; a run stores its answers and states their cost."""
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return what the network says of pictures (N, 3, H, W) in [0, 1]."""
+        """Return the network's output for images (N, 3, H, W) in [0, 1]."""
         raise NotImplementedError
 
     @property
     def sentence(self) -> str:
-        """What a run has spent, for its reader."""
+        """What a run has spent, as a sentence."""
         raise NotImplementedError
 
     def keep_in(self, store: Any) -> None:
-        """Keep answers and what is spent in a run from here on: an
-        `advsearch.runs.store.Store`.
+        """Store answers and what is spent in an `advsearch.runs.store.Store` from now
+        on.
         """
         raise NotImplementedError
 
@@ -192,57 +197,58 @@ class Preprocessing:
         if self.processor:
             x = self.processor(x.clone())  # which may write into it
         else:
-            low, high = self.value_range  # steps 2 and 4 are a factor and a summand
-            gain = [(high - low) / std for std in self.std]
-            offset = [
-                (low - mean) / std
-                for mean, std in zip(self.mean, self.std, strict=True)
-            ]
-            x = x.flip(1) if self.channels == "BGR" else x
-            if gain != [1.0] * 3 or offset != [0.0] * 3:
-                x = torch.addcmul(
-                    x.new_tensor(offset).view(3, 1, 1),
-                    x,
-                    x.new_tensor(gain).view(3, 1, 1),
-                )
-        return (
-            x.contiguous()
-            if self.layout == "NCHW"
-            else x.permute(0, 2, 3, 1).contiguous()
+            x = self._normalize(x)
+        if self.layout == "NCHW":
+            return x.contiguous()
+        return x.permute(0, 2, 3, 1).contiguous()
+
+    def _normalize(self, x: Tensor) -> Tensor:
+        """Apply steps 2 to 4 to images (N, 3, H, W), as one gain and one offset."""
+        low, high = self.value_range
+        gain = [(high - low) / std for std in self.std]
+        offset = [
+            (low - mean) / std for mean, std in zip(self.mean, self.std, strict=True)
+        ]
+        if self.channels == "BGR":
+            x = x.flip(1)
+        if gain == [1.0] * 3 and offset == [0.0] * 3:
+            return x
+        return torch.addcmul(
+            x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1)
         )
 
 
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
-    """A network with everything that is needed to show it an image and read its output.
-    Made by `load_model`.
+    """A network with all that is needed to run it on an image and to read its output. Created
+    by `load_model`.
 
     Args:
         module: the network. It takes what `preprocessing` returns and returns what
             `logits_of` describes.
-        name: what to call it in messages and results.
+        name: its name in messages and results.
         labels: one name per class, in index order.
-        preprocessing: what happens to an image first.
-        batch_limits: (fewest, most) images that the network takes at once. Larger
-            batches are cut, smaller ones padded.
+        preprocessing: of an image.
+        batch_limits: (minimum, maximum) batch size of the network. Larger batches are
+            split, smaller ones padded.
         probabilities: the network returns probabilities; their logarithm is returned:
             differences are log-odds.
         differentiable: a gradient of the logits reaches the image.
-        attached: its gradient is that of its outputs only where `detach` does nothing,
-            see `Detaching`.
+        attached: its gradient is that of its outputs only if `detach` is ignored, see
+            `Detaching`.
         named: False if `labels` are placeholders.
-        dtype: the type of the network's floating-point input.
-        device: where the network lives. Images go there, the output comes back.
-        read: from what the network returns for so many images, to its output: a tensor
-            (N, ...), or a list with one thing for each; None for logits.
-        asked: what `load_model` was given, where that says all of it; None for what
-            exists in this session only.
-        cameras: how many pictures are side by side in each image, which the network is
-            shown one by one; the output is then a list with a tuple of theirs for each
+        dtype: of the network's floating-point input.
+        device: of the network. Images go there, the output comes back.
+        read: reads the output from what the network returns for a number of images: a
+            tensor (N, ...), or a list with one element for each; None for logits.
+        asked: the argument of `load_model`, if that is all that defines the model; None
+            for what exists in this session only.
+        cameras: how many images of a rig are side by side in each image. The network sees
+            them one by one; the output is then a list with a tuple of theirs for each
             image.
         make_trainable: returns a new network with the same weights that can be trained
-            further, where `module` is one made for inference alone; None for a copy of
+            further, if `module` is one made for inference alone; None for a copy of
             `module`.
     """
 
@@ -269,9 +275,7 @@ class Model:
 
     @property
     def input_size(self) -> tuple[int, int]:
-        """(height, width) in pixels of the images that the network takes; others are
-        resized.
-        """
+        """(height, width) in pixels of the images that the network takes; others are resized."""
         return self.preprocessing.input_size
 
     @property
@@ -289,8 +293,8 @@ class Model:
 
         Returns:
             Logits (N, classes), float32, on the device of the images; N is 1 for a
-            single image. Of a network that returns probabilities p, log p. Where there
-            is `read`, what that returns.
+            single image. If the network returns probabilities p, log p. With `read`,
+            what that returns.
 
         Raises:
             InputError: not an image, or values that are clearly not in [0, 1].
@@ -298,41 +302,42 @@ class Model:
                 output in it.
         """
         images = checked_images(images)
-        most = self.batch_limits[1]
-        again = False
+        max_batch = self.batch_limits[1]
+        recomputes = False
         if self.cameras > 1:
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
-            most = max(most - most % self.cameras, min(most, self.cameras))
-            alone = not isinstance(self.module, AllAtOnce)
-            again = (
-                alone
+            full_rigs = max_batch - max_batch % self.cameras
+            max_batch = max(full_rigs, min(max_batch, self.cameras))
+            recomputes = (
+                not isinstance(self.module, AllAtOnce)
                 and len(images) > KEPT
                 and images.requires_grad
                 and torch.is_grad_enabled()
             )
-            most = min(most, KEPT) if again else most
+            if recomputes:
+                max_batch = min(max_batch, KEPT)
 
-        def kept(output: Tensor) -> Tensor:
-            # a copy, for a network may write into the same memory again
-            moved = output.to(images.device)
-            return (
-                moved.clone() if moved is output and not output.requires_grad else moved
-            )
+        def return_to_device(output: Tensor) -> Tensor:
+            # A copy, because a network may write into the same memory again.
+            returned = output.to(images.device)
+            is_same_memory = returned is output and not output.requires_grad
+            return returned.clone() if is_same_memory else returned
 
-        def asked(part: Tensor) -> Any:
-            return each_tensor(self.ask(self.prepared(part))[: len(part)], kept)
+        def run_batch(batch: Tensor) -> Any:
+            output = self.ask(self.prepared(batch))[: len(batch)]
+            return each_tensor(output, return_to_device)
 
-        parts = [
-            recomputed(asked, part) if again else asked(part)
-            for part in images.split(most)
+        outputs = [
+            recomputed(run_batch, batch) if recomputes else run_batch(batch)
+            for batch in images.split(max_batch)
         ]
-        output = parts[0] if len(parts) == 1 else joined(parts)
+        output = outputs[0] if len(outputs) == 1 else joined(outputs)
         if self.cameras == 1:
             return output
-        each = [output[number : number + 1] for number in range(len(output))]
+        image_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
-            tuple(each[begin : begin + self.cameras])
-            for begin in range(0, len(each), self.cameras)
+            tuple(image_outputs[start : start + self.cameras])
+            for start in range(0, len(image_outputs), self.cameras)
         ]
 
     def copy_network(self) -> nn.Module:
@@ -353,11 +358,10 @@ class Model:
         return copy.deepcopy(self.module)
 
     def with_network(self, network: nn.Module) -> Model:
-        """Return the same model with a network of the same kind, whose weights it
-        shares, in evaluation mode.
+        """Return the same model with a network of the same kind in evaluation mode, whose weights
+        it shares.
 
-        It sees the weights as they are trained in place, and collects no gradients for
-        them.
+        It sees the weights as they are trained in place, and collects no gradients for them.
         """
         shared = sharing_copy(network).eval().requires_grad_(False)
         return replace(self, module=shared, make_trainable=None)
@@ -369,38 +373,30 @@ class Model:
         return find_label_set(text, self.labels, named=self.named)
 
     def prepared(self, images: Tensor) -> Tensor:
-        """Return what the network is given for images (N, H, W, 3), no more than it
-        takes at once.
+        """Preprocess images (N, H, W, 3), at most a batch of them, for the network.
 
-        They are preprocessed, and of the network's type and device. Where they are too
-        few, the last one is repeated. They are its own: it may write into them.
+        They get the network's dtype and device. Too small a batch is padded with the last
+        image. The result is a copy: the network may write into it.
         """
         missing = self.batch_limits[0] - len(images)
-        full = (
-            torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
-            if missing > 0
-            else images
-        )
-        x = self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(
-            self.dtype
-        )
-        return (
-            x.clone()
-            if x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
-            else x
-        )
+        batch = images
+        if missing > 0:
+            batch = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
+        batch = batch.to(device=self.device, dtype=torch.float32)
+        x = self.preprocessing(batch).to(self.dtype)
+        is_view = x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
+        return x.clone() if is_view else x
 
     def ask(self, x: Tensor, *, raw: bool = False) -> Any:
-        """Return the output for a batch as `prepared` returns it, or, if `raw`, what
-        the network itself gives.
+        """Run the network on a batch that `prepared` returned.
+
+        Returns:
+            The output; with `raw`, what the network itself returns.
         """
         INTERRUPTS.look()
-        mode = (
-            Detaching(ignored=True)
-            if self.attached and torch.is_grad_enabled()
-            else nullcontext()
-        )
-        # a network may switch gradients off as it runs
+        ignores_detach = self.attached and torch.is_grad_enabled()
+        mode = Detaching(ignored=True) if ignores_detach else nullcontext()
+        # The network may switch gradients off as it runs.
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):
             returned = self.module(x)
         if raw:
@@ -408,27 +404,27 @@ class Model:
         if self.read is not None:
             return read_by(self.read, returned, len(x), self.name)
         logits = logits_of(returned, len(x), len(self.labels), self.name)
-        return (
-            logits.clamp_min(SMALLEST_PROBABILITY).log()
-            if self.probabilities
-            else logits
-        )
+        if self.probabilities:
+            return logits.clamp_min(SMALLEST_PROBABILITY).log()
+        return logits
 
 
 def sharing_copy(module: nn.Module) -> nn.Module:
-    """Return a copy that has the same weights, but gradients of its own. Weights that
-    were made in `torch.inference_mode` are copied: nothing can be differentiated
-    through them.
+    """Return a copy that shares the weights, but has gradients of its own.
+
+    Weights that were created in `torch.inference_mode` are copied: nothing can be
+    differentiated through them.
     """
 
-    def usable(weights: torch.Tensor) -> torch.Tensor:
+    def without_inference(weights: torch.Tensor) -> torch.Tensor:
         return weights.clone() if weights.is_inference() else weights
 
-    memo: dict[int, Any] = {
-        id(p): nn.Parameter(usable(p.detach()), p.requires_grad)
-        for p in module.parameters()
-    }
-    memo.update({id(buffer): usable(buffer) for buffer in module.buffers()})
+    memo: dict[int, Any] = {}
+    for parameter in module.parameters():
+        weights = without_inference(parameter.detach())
+        memo[id(parameter)] = nn.Parameter(weights, parameter.requires_grad)
+    for buffer in module.buffers():
+        memo[id(buffer)] = without_inference(buffer)
     return copy.deepcopy(module, memo)
 
 
@@ -436,16 +432,14 @@ DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.deta
 
 
 class Detaching(TorchFunctionMode):
-    """Looks on as a network detaches something, which it may be kept from: then
-    gradients are those of its outputs.
+    """Observe whether a network detaches tensors, or ignore that it does.
 
-    RT-DETR and its like choose queries by the scores of their encoder, and cut these
-    off from their decoder, in evaluation too: that makes training stable (Zhu et al.
-    2020, arXiv 2010.04159, appendix A.4), and hides from a search how the picture moves
-    them.
+    RT-DETR and similar networks choose queries by the scores of their encoder, and detach
+    these from their decoder, in evaluation too: that makes training stable (Zhu et al.
+    2020, arXiv 2010.04159, appendix A.4), and hides from a search how the image moves them.
 
-    `detach` does nothing where it is `ignored`; `seen` says whether something with a
-    gradient was to be detached.
+    `detach` does nothing if it is `ignored`; `seen` states whether something with a gradient
+    was to be detached.
     """
 
     def __init__(self, *, ignored: bool = False) -> None:
@@ -479,10 +473,10 @@ def checked_images(images: Tensor) -> Tensor:
         )
     if not images.is_floating_point():
         raise InputError(f"{expected}, got {images.dtype}; divide 8-bit values by 255")
-    low, high = (float(end) for end in images.detach().aminmax())
-    if -float("inf") < low < -RANGE_TOLERANCE or 1 + RANGE_TOLERANCE < high < float(
-        "inf"
-    ):
+    low, high = (float(limit) for limit in images.detach().aminmax())
+    is_too_low = -math.inf < low < -RANGE_TOLERANCE
+    is_too_high = 1 + RANGE_TOLERANCE < high < math.inf
+    if is_too_low or is_too_high:
         raise InputError(
             f"{expected}, got values from {low:.4g} to {high:.4g}; `value_range` is "
             "for the network's side"
@@ -491,22 +485,23 @@ def checked_images(images: Tensor) -> Tensor:
 
 
 def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
-    """Return the output that a reader finds in what a network returned. Raises
-    ModelError where it finds none, or another number than `count`.
+    """Read the output from what a network returned for `count` images.
+
+    Raises:
+        ModelError: there is no output, or not one for each image.
     """
     try:
         output = read(returned, count)
     except ValueError as error:
-        meant = _task_of(returned)
-        task = getattr(getattr(read, "__self__", None), "name", None)
-        # actions look like rows of scores
-        known = meant and task not in (meant, "command")
-        other = (
-            _other_task(str(meant))
-            if known
-            else ("wrap the network, or ask for another task")
-        )
-        advice = _no_scores(returned) or other
+        advice = _no_scores(returned)
+        if not advice:
+            likely_task = _task_of(returned)
+            task = getattr(getattr(read, "__self__", None), "name", None)
+            # Actions look like rows of scores.
+            if likely_task and task not in (likely_task, "command"):
+                advice = _other_task(likely_task)
+            else:
+                advice = "wrap the network, or ask for another task"
         raise ModelError(
             f"model {name}: {error}, got {described(returned)}; {advice}"
         ) from None
@@ -520,29 +515,24 @@ def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
 
 
 def described(returned: Any) -> str:
-    """Return what an output of a network is: its type, and the shape of a tensor."""
-    return (
-        f"one of shape {tuple(returned.shape)}"
-        if isinstance(returned, Tensor)
-        else type(returned).__name__
-    )
+    """Describe an output of a network by its type, or the shape of a tensor."""
+    if isinstance(returned, Tensor):
+        return f"one of shape {tuple(returned.shape)}"
+    return type(returned).__name__
 
 
-def joined(parts: Sequence[Any]) -> Any:
-    """Return the outputs of several batches as one: tensors (N, ...) and lists are put
-    end to end.
-    """
-    return (
-        torch.cat(list(parts))
-        if isinstance(parts[0], Tensor)
-        else list(chain.from_iterable(parts))
-    )
+def joined(outputs: Sequence[Any]) -> Any:
+    """Concatenate the outputs of several batches: tensors (N, ...), or lists."""
+    if isinstance(outputs[0], Tensor):
+        return torch.cat(list(outputs))
+    return list(chain.from_iterable(outputs))
 
 
 def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """Return an output with a function of every tensor in it in that one's place, in
-    plain dicts and lists: torch's trees end at kinds of these that nobody has told it,
-    such as a library's outputs.
+    """Apply a function to every tensor in an output, in plain dicts and lists.
+
+    torch's trees do not know subclasses of these that are not registered, such as a
+    library's outputs.
     """
     if isinstance(output, Tensor):
         return function(output)
@@ -555,14 +545,14 @@ def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 def tensors_in(output: Any) -> list[Tensor]:
     """Return the tensors in an output, in their order."""
-    found: list[Tensor] = []
+    tensors: list[Tensor] = []
 
-    def keep(tensor: Tensor) -> Tensor:
-        found.append(tensor)
+    def collect(tensor: Tensor) -> Tensor:
+        tensors.append(tensor)
         return tensor
 
-    each_tensor(output, keep)
-    return found
+    each_tensor(output, collect)
+    return tensors
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
@@ -586,28 +576,30 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     expected = (
         f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
     )
-    if advice := _no_scores(output):
+    advice = _no_scores(output)
+    if advice:
+        got = described(output if tensor is None else tensor)
+        raise ModelError(f"{expected}, got {got}; {advice}")
+    likely_task = _task_of(output)
+    is_map = tensor is not None and tensor.dim() == 4
+    has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
+    if likely_task and has_other_task and not is_map:
         raise ModelError(
-            f"{expected}, got {described(tensor if tensor is not None else output)}; {advice}"
+            f"{expected}, got {described(output)}; {_other_task(likely_task)}"
         )
-    meant = _task_of(output)
-    if meant in ("detection", "segmentation", "depth", "similarity") and (
-        tensor is None or tensor.dim() != 4
-    ):
-        raise ModelError(f"{expected}, got {described(output)}; {_other_task(meant)}")
     if tensor is None:
         raise ModelError(
             f"{expected}, got {type(output).__name__}; wrap the network "
             "so that it returns one tensor"
         )
-    got = tuple(tensor.shape)
+    shape = tuple(tensor.shape)
     if (
-        len(got) != 2
-        or got[0] != count
-        or got[1] < 2
-        or (classes is not None and got[1] != classes)
+        len(shape) != 2
+        or shape[0] != count
+        or shape[1] < 2
+        or (classes is not None and shape[1] != classes)
     ):
-        raise ModelError(f"{expected}, got {got}; {_advice(got)}")
+        raise ModelError(f"{expected}, got {shape}; {_advice(shape)}")
     if not tensor.is_floating_point():
         raise ModelError(
             f"{expected} and floating type, got {tensor.dtype}; return "
@@ -618,43 +610,39 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
 
 
 def mend_batch_norms(output: Any) -> None:
-    """Make gradients of an output right that pass batch norms: each is laid out in
-    memory as its norm's input is.
+    """Give gradients that reach batch norms the memory layout of the norms' inputs.
 
-    Of a single picture torch 2.13 reads a gradient that comes from
+    For a single image torch 2.13 reads a gradient that comes from
     ``flatten(2).transpose(1, 2)``, as in networks whose convolutions end in a
-    transformer, in a wrong order on the CPU, without a word. Batches are right.
+    transformer, in a wrong order on the CPU, without a warning. Batches are right.
     """
 
-    def laid_out(
+    def with_strides(
         strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
     ) -> tuple[Tensor | None, ...]:
-        first, *others = gradients
-        if first is None or first.stride() == strides:
+        gradient, *rest = gradients
+        if gradient is None or gradient.stride() == strides:
             return gradients
-        laid = torch.empty_strided(
-            first.shape, strides, dtype=first.dtype, device=first.device
+        strided = torch.empty_strided(
+            gradient.shape, strides, dtype=gradient.dtype, device=gradient.device
         )
-        return laid.copy_(first), *others
+        return strided.copy_(gradient), *rest
 
-    waiting: list[Any] = [tensor.grad_fn for tensor in tensors_in(output)]
-    seen = {None}
-    while waiting:
-        node = waiting.pop()
-        if node in seen:
+    pending: list[Any] = [tensor.grad_fn for tensor in tensors_in(output)]
+    visited = {None}
+    while pending:
+        node = pending.pop()
+        if node in visited:
             continue
-        seen.add(node)
-        waiting.extend(before for before, _ in node.next_functions)
+        visited.add(node)
+        pending.extend(next_node for next_node, _ in node.next_functions)
         if node.name().startswith("NativeBatchNorm"):
-            node.register_prehook(
-                partial(
-                    laid_out,
-                    torch.empty_like(node._saved_input, device="meta").stride(),
-                )
-            )
+            strides = torch.empty_like(node._saved_input, device="meta").stride()
+            node.register_prehook(partial(with_strides, strides))
 
 
 def _tensor_in(output: Any) -> Tensor | None:
+    """Return the tensor of logits in an output; None if there is none."""
     if isinstance(output, Mapping):
         output = output.get("logits")
     elif not isinstance(output, Tensor) and hasattr(output, "logits"):
@@ -665,32 +653,27 @@ def _tensor_in(output: Any) -> Tensor | None:
 
 
 def _scores_in(returned: Any) -> Any:
-    return (
-        returned["out"]
-        if isinstance(returned, Mapping) and "out" in returned
-        else _tensor_in(returned)
-    )
+    """Return the scores in an output, of images or of pixels; None if there are none."""
+    if isinstance(returned, Mapping) and "out" in returned:
+        return returned["out"]
+    return _tensor_in(returned)
 
 
 def _no_scores(returned: Any) -> str:
-    """What to do with an output that has no scores: the classes that it chose, or
-    losses; "" of any other.
+    """Return what to do about an output that has losses or class indices instead of
+    scores; "" for any other output.
     """
-    parts = list(returned.values()) if isinstance(returned, Mapping) else [returned]
-    if parts and all(isinstance(part, Tensor) and part.ndim == 0 for part in parts):
+    values = list(returned.values()) if isinstance(returned, Mapping) else [returned]
+    if values and all(isinstance(x, Tensor) and x.ndim == 0 for x in values):
         return (
             "one number for all pictures is what a loss is: give the network as it "
             "is outside of training"
         )
+    # The first element of a list may be the labels of boxes.
+    if isinstance(returned, (list, tuple)):
+        return ""
     tensor = _scores_in(returned)
-    # whose first part may be the labels of boxes
-    listed = isinstance(returned, (list, tuple))
-    if (
-        tensor is None
-        or listed
-        or tensor.is_floating_point()
-        or tensor.ndim not in (1, 3)
-    ):
+    if tensor is None or tensor.is_floating_point() or tensor.ndim not in (1, 3):
         return ""
     return (
         f"these are the classes that it chose ({tensor.dtype}): return its scores, "
@@ -699,68 +682,54 @@ def _no_scores(returned: Any) -> str:
 
 
 def _task_of(returned: Any) -> str | None:
-    """Return the task whose networks return such a thing: boxes, features, numbers for
-    each pixel, or rows of scores; None where it is none of these.
-    """
-    listed = isinstance(returned, (tuple, list))
-    first = returned[0] if listed and returned else returned
+    """Return the task whose networks return such an output; None if there is none."""
+    is_sequence = isinstance(returned, (tuple, list))
+    first = returned[0] if is_sequence and returned else returned
     names = first if isinstance(first, Mapping) else dir(first)
     if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
         return "detection"
-    if (
-        listed
-        and len(returned) > 1
-        and isinstance(first, Tensor)
-        and first.dim() == 3
-        and first.shape[2] == 4
-    ):
-        return "detection"  # (boxes (N, K, 4), scores ...)
+    # (boxes (N, K, 4), scores ...)
+    is_boxes = isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
+    if is_sequence and len(returned) > 1 and is_boxes:
+        return "detection"
     if isinstance(returned, Mapping) and any(
         word in str(key) for key in returned for word in ("depth", "disparity")
     ):
         return "depth"
     if hasattr(returned, "last_hidden_state") and not hasattr(returned, "logits"):
         return "similarity"
-    if (
-        listed
-        and len(
-            {
-                part.shape[2:]
-                for part in returned
-                if isinstance(part, Tensor) and part.ndim == 4
-            }
-        )
-        > 1
-    ):
-        return None  # maps of several sizes
+    if is_sequence:
+        maps = [x for x in returned if isinstance(x, Tensor) and x.ndim == 4]
+        if len({feature_map.shape[2:] for feature_map in maps}) > 1:
+            return None  # feature maps of several sizes
     tensor = _scores_in(returned)
-    return (
-        {2: "classification", 4: "segmentation"}.get(tensor.dim())
-        if isinstance(tensor, Tensor)
-        else None
-    )
+    if not isinstance(tensor, Tensor):
+        return None
+    return {2: "classification", 4: "segmentation"}.get(tensor.dim())
 
 
 def _other_task(name: str) -> str:
+    """Return the advice to use another task."""
     return f"{GIVEN_BY[name]}: use `task={name}`"
 
 
-def _advice(got: tuple[int, ...]) -> str:
-    if len(got) == 4:
+def _advice(shape: tuple[int, ...]) -> str:
+    """Return what to do about an output whose shape is not that of logits."""
+    if len(shape) == 4:
         return (
             f"{_other_task('segmentation')}. If these are a classifier's feature "
             "maps, wrap the network to pool them"
         )
-    if len(got) > 2:
+    if len(shape) > 2:
         return (
             "pass a classifier, or wrap the network to pool its output; if it is a "
             "detector, use `task=detection`"
         )
-    if len(got) == 2 and got[1] == 1:
+    if len(shape) == 2 and shape[1] == 1:
         return (
             "one score is not enough: wrap the network to return a score for each "
             "of the two classes"
         )
-    if len(got) == 1:
+    if len(shape) == 1:
         return "the network dropped its batch dimension: wrap it to keep it"
     return "wrap the network so that it returns one row of scores per image"

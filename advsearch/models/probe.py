@@ -1,5 +1,5 @@
-"""Look at a network once, before anyone trusts its outputs: two images, a repetition, a
-pair, a gradient.
+"""Probe a network before its outputs are trusted: two images, a repetition, a batch, a
+gradient.
 """
 
 from __future__ import annotations
@@ -30,72 +30,66 @@ from advsearch.models.model import (
 from advsearch.trust.foreign_code import TookTooLong, first_line, within
 from advsearch.trust.stored_files import FACTOR, scaled
 
-# rows that are non-negative and sum to 1 within this are taken for probabilities
+# Non-negative rows that sum to 1 within this tolerance are probabilities.
 PROBABILITY_TOLERANCE = 1e-3
-# rows that are non-negative and sum to 100 within this share of it, for percentages
+# Non-negative rows that sum to 100 within this relative tolerance are percentages.
 PERCENT_TOLERANCE = 5e-3
-# how far from [0, 1] colours are that show whether scores stay in it whatever the
-# picture is
+# Magnitude of colors outside [0, 1] that show whether scores stay in [0, 1] whatever
+# the image is.
 FAR = 1000.0
-# share of the largest logit by which outputs differ that are the same; kernels' differ
-# by 1e-6
+# Relative difference of outputs that count as the same; kernels differ by 1e-6.
 REPEAT_TOLERANCE = 1e-3
 
 ROUNDING = 4.0
-"""Steps between neighbouring numbers of the network's type by which its pictures are
-changed at least, and outputs may differ: a network in bfloat16 tells 0.50 from 0.51 and
-no less.
+"""Minimum change of an image, and tolerance of outputs, in units of the machine epsilon
+of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 """
 
-# change of each value of an image, in [0, 1], along the gradient that is checked
+# Change of each value of an image, in [0, 1], along the gradient that is checked.
 STEP = 1e-3
 
 MASKED = 0.9
-"""Share of a change by which outputs may miss what the gradient foretells: a sign that
-is wrong is a miss of 2, a step function one of 1; kinks of ordinary networks stay under
-a half.
+"""Maximum relative error of what the gradient predicts: a wrong sign is an error of 2, a
+step function one of 1; kinks of ordinary networks stay below a half.
 """
 
 AGREES = 0.5
-"""Share of a change by which outputs may miss what a gradient foretells that takes the
-place of the network's own.
-"""
+"""Maximum relative error of what a gradient predicts that replaces the network's own."""
 
 HARDLY = 0.15
-"""Median share of their size by which an output's numbers differ between unlike
-pictures, below which they hardly follow these. Measured: 0.50 to 1.04 of five trained
-networks, and 0.006 to 0.10 with a 255th of their range.
+"""Median relative change of an output between unlike images below which it hardly
+follows them. Measured: 0.50 to 1.04 for five trained networks, and 0.006 to 0.10 for
+the same with a 255th of their range.
 """
 
 MOST_GROWTH = 2.0
-"""How many times larger outputs may be with the right range of colors: 0.98 to 1.22
-times of the same five networks. Networks that are not trained grow with their input.
+"""Maximum factor by which outputs may grow with the right range of colors: 0.98 to 1.22
+for the same five networks. Outputs of untrained networks grow with their input.
 """
 
-EIGHT_BIT = (0.0, 255.0)  # the other range of colours that networks are made for
+EIGHT_BIT = (0.0, 255.0)  # the other range of colors that networks are made for
 
-# smallest change that is looked at, as a share of the outputs: what is less may be
-# rounding
+# Minimum relative change of outputs that is evaluated: less may be rounding.
 SMALLEST = 1e-5
 
-"""What torch makes of a model file. Others that are made of one have a method `stop`,
-which ends what they run.
-"""
-
-# pixels of all the images that a network takes at once, at least: 800 MB of numbers
+# Maximum number of pixels in the smallest batch that a network takes: 800 MB.
 LARGEST = 1 << 26
 
 
 def probe(
     model: Model, labels: tuple[str, ...] | None, labels_origin: LabelsOrigin
 ) -> Model:
-    """Return the model with `labels`, `probabilities`, `differentiable` and
-    `batch_limits` set from what it does. There are labels for each class, or None for
-    placeholders ("class 0"); where they came from is for messages.
+    """Run a model on test images, and set what its outputs show.
 
-    It is shown a grey image and one of uniform noise. The idea of looking for
-    probabilities, randomness and missing gradients before an attack is AutoAttack's
-    (Croce and Hein 2020, the flags of its reference implementation).
+    That is `labels`, `probabilities`, `differentiable` and `batch_limits`. The images
+    are a gray one and one of uniform noise. The idea of looking for probabilities,
+    randomness and missing gradients before an attack is AutoAttack's (Croce and Hein
+    2020, the flags of its reference implementation).
+
+    Args:
+        model: without labels.
+        labels: one for each class; None for placeholders ("class 0").
+        labels_origin: where they come from, for messages.
 
     Raises:
         ModelError: it takes more than `LARGEST`, cannot be run on such an image,
@@ -106,74 +100,30 @@ def probe(
         ModelWarning: it returns probabilities (a segmenter's too), differently every
             time, differently in a batch, or no gradient reaches the image.
     """
-    (height, width) = model.input_size
-    count = max(model.batch_limits[0], 1)
-    if count * height * width > scaled(LARGEST):
-        raise ModelError(
-            f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
-            "pixels at once, expected at most "
-            f"{scaled(LARGEST):,} pixels; if you trust it, {FACTOR}=10 in the "
-            "environment allows ten times "
-            "as many"
-        )
-    grey = torch.full((1, height, width, 3), 0.5)
-    noise = torch.rand(grey.shape, generator=torch.Generator().manual_seed(0))
+    _check_batch_size(model)
+    height, width = model.input_size
+    gray = torch.full((1, height, width, 3), 0.5)
+    noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rows = torch.cat([_run(model, grey), _run(model, noise)])
-        again = _run(model, grey)
-    logits = model.read is None
-    if not bool(torch.isfinite(rows).all()):
-        which = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
-        what = "logits" if logits else "numbers"
-        raise ModelError(
-            f"model {model.name}: expected finite {what}, got NaN or infinity for a "
-            f"{which} image; "
-            "check its weights and the value range and normalisation that it expects"
-        )
-    names = (
-        fitting_labels(rows.shape[1], labels, labels_origin, model.name)
-        if logits
-        else labels or ()
-    )
-    percentages = logits and _probabilities(rows / 100.0, PERCENT_TOLERANCE)
-    probabilities = logits and (percentages or _probabilities(rows))
-    if probabilities:
-        kind = "percentages that sum to 100" if percentages else "probabilities"
-        warn(
-            f"model {model.name} returns {kind}. Their logarithm is used, so that "
-            "margins are log-odds, "
-            "but gradients vanish where a probability rounds to 0 or 1: remove the "
-            "final softmax if you can"
-        )
-    with torch.no_grad():
-        output: Any = None if logits else _read(model, noise)
-    # (N, classes, h, w)
-    maps = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1
-    if maps and _probabilities(output.movedim(1, -1).flatten(0, 2)):
-        warn(
-            f"model {model.name} returns probabilities for each pixel: margins are "
-            "differences of these and no "
-            "log-odds, and gradients vanish where one rounds to 0 or 1: remove the "
-            "final softmax if you can"
-        )
-    repeatable = _same(model, rows[:1], again)
-    if (
-        repeatable
-        and logits
-        and not probabilities
-        and (odd := _odd_scores(model, rows))
-    ):
-        warn(
-            f"model {model.name} returns {odd}. They are taken for logits: the "
-            "probabilities that are shown are none, "
-            "and margins are differences of such scores. Return what stands before the "
-            "last function"
-        )
+        rows = torch.cat([_run(model, gray), _run(model, noise)])
+        repeated_rows = _run(model, gray)
+    _check_finite(model, rows)
+    returns_logits = model.read is None
+    if returns_logits:
+        names = fitting_labels(rows.shape[1], labels, labels_origin, model.name)
+        probabilities = _find_probabilities(model, rows)
+    else:
+        names = labels or ()
+        probabilities = False
+        _warn_of_pixel_probabilities(model, noise)
+    repeatable = _same(model, rows[:1], repeated_rows)
+    if repeatable and returns_logits and not probabilities:
+        _warn_of_odd_scores(model, rows)
     if repeatable:
         _check_range(
-            model, torch.cat([torch.zeros_like(grey), torch.ones_like(grey), noise])
+            model, torch.cat([torch.zeros_like(gray), torch.ones_like(gray), noise])
         )
-    if not repeatable:
+    else:
         warn(
             f"model {model.name} differs each time on the same image: results hold "
             "for single draws only"
@@ -184,51 +134,109 @@ def probe(
         named=labels is not None,
         probabilities=probabilities,
         batch_limits=_batch_limits(
-            model, torch.cat([grey, noise]), rows if repeatable else None
+            model, torch.cat([gray, noise]), rows if repeatable else None
         ),
     )
 
 
+def _check_batch_size(model: Model) -> None:
+    """Raise ModelError if the smallest batch of a model has too many pixels."""
+    height, width = model.input_size
+    count = max(model.batch_limits[0], 1)
+    if count * height * width > scaled(LARGEST):
+        raise ModelError(
+            f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
+            "pixels at once, expected at most "
+            f"{scaled(LARGEST):,} pixels; if you trust it, {FACTOR}=10 in the "
+            "environment allows ten times "
+            "as many"
+        )
+
+
+def _check_finite(model: Model, rows: Tensor) -> None:
+    """Raise ModelError if the outputs for a gray image and noise are not finite."""
+    if bool(torch.isfinite(rows).all()):
+        return
+    image = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
+    expected = "logits" if model.read is None else "numbers"
+    raise ModelError(
+        f"model {model.name}: expected finite {expected}, got NaN or infinity for a "
+        f"{image} image; "
+        "check its weights and the value range and normalisation that it expects"
+    )
+
+
+def _find_probabilities(model: Model, rows: Tensor) -> bool:
+    """Return whether rows (N, classes) are probabilities or percentages, and warn."""
+    are_percentages = _probabilities(rows / 100.0, PERCENT_TOLERANCE)
+    if not are_percentages and not _probabilities(rows):
+        return False
+    kind = "percentages that sum to 100" if are_percentages else "probabilities"
+    warn(
+        f"model {model.name} returns {kind}. Their logarithm is used, so that "
+        "margins are log-odds, "
+        "but gradients vanish where a probability rounds to 0 or 1: remove the "
+        "final softmax if you can"
+    )
+    return True
+
+
+def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
+    """Warn if a segmenter returns probabilities for the pixels of images."""
+    with torch.no_grad():
+        output: Any = _read(model, images)
+    # (N, classes, h, w)
+    is_map = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1
+    if is_map and _probabilities(output.movedim(1, -1).flatten(0, 2)):
+        warn(
+            f"model {model.name} returns probabilities for each pixel: margins are "
+            "differences of these and no "
+            "log-odds, and gradients vanish where one rounds to 0 or 1: remove the "
+            "final softmax if you can"
+        )
+
+
+def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
+    """Warn if rows (N, classes) are scores that are neither logits nor probabilities."""
+    kind = _odd_scores(model, rows)
+    if kind:
+        warn(
+            f"model {model.name} returns {kind}. They are taken for logits: the "
+            "probabilities that are shown are none, "
+            "and margins are differences of such scores. Return what stands before the "
+            "last function"
+        )
+
+
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Return the raw output of the network for images (N, H, W, 3) as (N, classes)
-    float32 on the CPU. An output of another kind comes as three numbers of each image,
-    (N, 3): how many it has, their sum, and the sum of their sizes.
+    """Run a network on images (N, H, W, 3), and return rows of its raw output.
+
+    They are logits (N, classes), float32 on the CPU. An output of another kind is
+    summarized by three numbers of each image, (N, 3): how many numbers it has, their
+    sum, and the sum of their absolute values.
     """
     if model.read is None:
-        return logits_of(*_returned(model, images), None, model.name)[
-            : len(images)
-        ].cpu()
+        returned, count = _returned(model, images)
+        return logits_of(returned, count, None, model.name)[: len(images)].cpu()
     rows = []
     for output in _read(model, images):
-        values = torch.cat(
-            [
-                torch.zeros(0, device="cpu"),
-                *(tensor.float().flatten().cpu() for tensor in tensors_in(output)),
-            ]
-        )
-        rows.append(
-            torch.stack(
-                [
-                    torch.tensor(float(len(values))).to(values),
-                    values.sum(),
-                    values.abs().sum(),
-                ]
-            )
-        )
+        tensors = [torch.zeros(0, device="cpu")]
+        tensors += [tensor.float().flatten().cpu() for tensor in tensors_in(output)]
+        values = torch.cat(tensors)
+        size = torch.tensor(float(len(values))).to(values)
+        rows.append(torch.stack([size, values.sum(), values.abs().sum()]))
     return torch.stack(rows)
 
 
 def _read(model: Model, images: Tensor) -> Any:
-    """Return what is read for images (N, H, W, 3) of a network that returns something
-    other than logits.
-    """
+    """Run a network that does not return logits on images (N, H, W, 3), and read its output."""
     assert model.read is not None
     return read_by(model.read, *_returned(model, images), model.name)[: len(images)]
 
 
 def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
-    """Return what the network gives for images (N, H, W, 3), and for how many: no fewer
-    than it takes at once.
+    """Return what the network returns for images (N, H, W, 3), and the size of its batch, which
+    may be larger.
     """
     x = model.prepared(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
@@ -236,9 +244,10 @@ def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
 
 
 def _guarded(model: Model, call: Callable[[], Any]) -> Any:
-    """Return what the foreign network returns; whatever it raises becomes a ModelError
-    with advice. A program has to end, for nothing ends it; code of one's own that does
-    not is ended by Ctrl-C.
+    """Call a foreign network; whatever it raises becomes a ModelError with advice.
+
+    A program has a deadline, for nothing else ends it; the user's own code is ended by
+    Ctrl-C.
     """
     network = _inner(model.module)
     try:
@@ -273,39 +282,42 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
 
 
 def _inner(network: Any) -> Any:
-    """Return the network inside of what makes it one of single pictures alone."""
+    """Return the network inside the adapters that make it one of images alone."""
     while isinstance(network, (AllAtOnce, WithState, WithImageSize, EightBitInput)):
         network = network.network
     return network
 
 
 TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
-"""What a network in its form for training calls the right labels."""
+"""Names of the right labels among the arguments of a network in training form."""
 
 
 def _unlike_pictures(network: object, error: str) -> str:
-    """What a network that raised an error wants beside pictures or in place of them; ""
-    where that does not show.
+    """Describe what a network that raised an error needs other than images; "" if that
+    is not known.
     """
     if not isinstance(network, nn.Module):
         return ""
-    taken: list[inspect.Parameter] = []
+    parameters: list[inspect.Parameter] = []
     with suppress(TypeError, ValueError):  # it is not written in Python
-        taken = list(inspect.signature(network.forward).parameters.values())[1:]
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    needed = {
-        one.name
-        for one in taken
-        if one.kind not in variable and one.default is inspect.Parameter.empty
+        parameters = list(inspect.signature(network.forward).parameters.values())[1:]
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    required = {
+        parameter.name
+        for parameter in parameters
+        if parameter.kind not in variadic
+        and parameter.default is inspect.Parameter.empty
     }
-    missed = TRUTHS & set(re.findall(r"\w+", error))
-    if more := [
-        parameter.name for parameter in taken if parameter.name in needed | missed
-    ]:
+    named_in_error = TRUTHS & set(re.findall(r"\w+", error))
+    missing = [
+        parameter.name
+        for parameter in parameters
+        if parameter.name in required | named_in_error
+    ]
+    if missing:
         return (
-            f"wants {' and '.join(more)} beside pictures; wrap it in an nn.Module that "
-            "is called with pictures alone, "
-            "as it is used outside of training"
+            f"wants {' and '.join(missing)} beside pictures; wrap it in an nn.Module "
+            "that is called with pictures alone, as it is used outside of training"
         )
     if any(isinstance(layer, nn.Conv3d) for layer in network.modules()):
         return (
@@ -317,15 +329,17 @@ def _unlike_pictures(network: object, error: str) -> str:
 
 
 def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
+    """Whether rows (N, classes) are non-negative and sum to 1."""
     sums = rows.sum(dim=1)
     return bool((rows >= 0).all()) and bool(((sums - 1).abs() < tolerance).all())
 
 
 def _odd_scores(model: Model, rows: Tensor) -> str:
-    """What rows of scores (N, classes) are that are neither logits nor probabilities;
-    empty of others. A black picture tells a sigmoid from means of the picture, which
-    are 0 there; colours far outside of [0, 1] tell it from logits that are small, as
-    those of a network that is not trained.
+    """Describe rows of scores (N, classes) that are neither logits nor probabilities; "" for
+    others.
+
+    A black image distinguishes a sigmoid from means of the image, which are 0 there; colors
+    far outside [0, 1] distinguish it from small logits, as those of an untrained network.
     """
     least = float(rows.min())
     if least >= 0.0 and float(rows.max()) <= 1.0:
@@ -353,12 +367,11 @@ def _odd_scores(model: Model, rows: Tensor) -> str:
 
 
 def _check_range(model: Model, images: Tensor) -> None:
-    """Warn if outputs hardly follow pictures (3, H, W, 3) that are black, white and
-    noise, and do so, at no other size, with colours from 0 to 255: the network is made
-    for these.
+    """Warn if a network seems to be made for colors from 0 to 255.
 
-    A network in Python that gives no logits is left alone: where it is not trained, it
-    looks the same.
+    That is, if its outputs hardly follow images (3, H, W, 3) that are black, white and
+    noise, but do so, at the same size, with these colors. A network in Python that returns
+    no logits is not checked: if it is untrained, it looks the same.
     """
     preprocessing = model.preprocessing
     is_declared = preprocessing.processor is not None or any(
@@ -396,9 +409,10 @@ def _check_range(model: Model, images: Tensor) -> None:
 
 @torch.no_grad()
 def _numbers_of(model: Model, images: Tensor) -> Tensor | None:
-    """Return the numbers (K, n) that a network gives for images (K, H, W, 3), one after
-    the other; of scores in [0, 1] the logits, which do not saturate. None where they
-    are none, not finite, or not as many of each.
+    """Return the numbers (K, n) that a network returns for images (K, H, W, 3), one by one.
+
+    Scores in [0, 1] become logits, which do not saturate. None if there are no numbers, they
+    are not finite, or images have different counts of them.
     """
     rows = []
     for image in images:
@@ -422,110 +436,121 @@ def _numbers_of(model: Model, images: Tensor) -> Tensor | None:
 
 
 def _relative_change(outputs: Tensor) -> float:
-    """Return the median share of its size by which a number differs between outputs (K,
-    n).
-    """
+    """Return the median relative change of the numbers of outputs (K, n)."""
     change = outputs.amax(dim=0) - outputs.amin(dim=0)
     size = outputs.abs().amax(dim=0).clamp_min(torch.finfo(torch.float32).tiny)
     return float((change / size).median())
 
 
-def _same(model: Model, a: Tensor, b: Tensor) -> bool:
+def _same(model: Model, rows: Tensor, repeated_rows: Tensor) -> bool:
+    """Whether outputs are equal up to the tolerance of the network's dtype."""
     tolerance = max(REPEAT_TOLERANCE, ROUNDING * torch.finfo(model.dtype).eps)
-    return bool((a - b).abs().amax() <= tolerance * a.abs().amax().clamp_min(1e-6))
+    difference = (rows - repeated_rows).abs().amax()
+    return bool(difference <= tolerance * rows.abs().amax().clamp_min(1e-6))
 
 
 def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
-    low, high = model.batch_limits
-    # which takes the pictures of a rig together
+    """Return the minimum and maximum batch size, from a batch of two images.
+
+    Args:
+        model: that is probed.
+        pair: the two images.
+        rows: the outputs for each image by itself; None if they are not repeatable.
+    """
+    min_batch, max_batch = model.batch_limits
     if isinstance(model.module, AllAtOnce):
-        return max(low, model.module.cameras), max(
-            low, high - high % model.module.cameras
-        )
-    if high < 2:
-        return low, high
+        # The images of a rig stay together.
+        cameras = model.module.cameras
+        max_batch = max(min_batch, max_batch - max_batch % cameras)
+        return max(min_batch, cameras), max_batch
+    if max_batch < 2:
+        return min_batch, max_batch
     try:
         with torch.no_grad():
-            together = _run(model, pair)
+            batch_rows = _run(model, pair)
     except ModelError:
         return 1, 1
-    if rows is not None and not _same(model, rows, together):
+    if rows is not None and not _same(model, rows, batch_rows):
         warn(
             f"model {model.name} sees an image differently in a batch: was it exported "
             "in training mode? "
             "Call .eval() before exporting"
         )
-    return low, high
+    return min_batch, max_batch
 
 
 def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
-    """Set `differentiable` and `attached`; warn if no gradient reaches the image, or
-    outputs do not follow it.
+    """Return a model with `differentiable` and `attached` set.
+
+    Warns if no gradient reaches the image, or outputs do not follow it.
     """
+    reason = "it is zero everywhere"
     try:
-        why = "it is zero everywhere"
         with Detaching() as detaching:
             try:
                 rows, gradient = _slope(model, images)
-            except (
-                RuntimeError
-            ) as error:  # what it detaches may have been all of its gradient
+            except RuntimeError as error:
+                # What the network detaches may be all that has a gradient.
                 if not (repeatable and detaching.seen):
                     raise
-                why = first_line(error)
+                reason = first_line(error)
                 with torch.no_grad():
                     rows = _run(model, images)
                 gradient = torch.zeros_like(images)
         if model.read is not None and not bool(rows[:, 0].any()):
-            # it sees nothing in noise: its pictures will tell
+            # It detects nothing in noise: rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
         if repeatable and detaching.seen:
-            whole = dataclasses.replace(model, attached=True)
-            # it may detach what must have no gradient, such as for numpy
-            with suppress(RuntimeError, ModelError):
-                slope = _slope(whole, images)[1]
-                # Whether outputs change as this gradient says, and less so as the
-                # network's own does. Networks that round behind a `detach` keep their
-                # own: the other one is zero.
-                for size in (STEP, STEP / 8.0):
-                    step = (
-                        max(size, ROUNDING * torch.finfo(model.dtype).eps)
-                        * (slope - gradient).sign()
-                    )
-                    seen, (told, less), *_ = _moved(
-                        model, images, step, slope, gradient
-                    )
-                    if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
-                        model = whole
-                        gradient = slope
-                        break
-        reaches = bool((gradient != 0).any())
-        if reaches and repeatable:
-            _check_gradient(
-                model, images, gradient, detaching.seen and not model.attached
-            )
+            model, gradient = _try_attached(model, images, gradient)
+        has_gradient = bool((gradient != 0).any())
+        if has_gradient and repeatable:
+            is_detached = detaching.seen and not model.attached
+            _check_gradient(model, images, gradient, is_detached)
     except (RuntimeError, ModelError) as error:
-        reaches = False
-        why = first_line(error)
-        if EightBitInput in {
-            type(model.module),
-            type(getattr(model.module, "network", None)),
-        }:
-            why = (
+        has_gradient = False
+        reason = first_line(error)
+        networks = (model.module, getattr(model.module, "network", None))
+        if any(type(network) is EightBitInput for network in networks):
+            reason = (
                 "it takes whole numbers from 0 to 255, uint8, and rounding to these "
                 "has none"
             )
-    if not reaches:
+    if not has_gradient:
         warn(
-            f"no gradient of model {model.name} reaches its image ({why}): use `auto` "
-            "or a policy without gradients"
+            f"no gradient of model {model.name} reaches its image ({reason}): use "
+            "`auto` or a policy without gradients"
         )
-    return dataclasses.replace(model, differentiable=reaches)
+    return dataclasses.replace(model, differentiable=has_gradient)
+
+
+def _try_attached(
+    model: Model, images: Tensor, gradient: Tensor
+) -> tuple[Model, Tensor]:
+    """Return the model that ignores `detach`, with its gradient, if that predicts
+    changes of outputs better than the network's own gradient; else the model as it is.
+
+    A network that rounds behind a `detach` keeps its own: the other one is zero.
+    """
+    attached = dataclasses.replace(model, attached=True)
+    # It may detach what must have no gradient, such as for numpy.
+    with suppress(RuntimeError, ModelError):
+        attached_gradient = _slope(attached, images)[1]
+        for step_size in (STEP, STEP / 8.0):
+            step_size = max(step_size, ROUNDING * torch.finfo(model.dtype).eps)
+            step = step_size * (attached_gradient - gradient).sign()
+            change, (attached_change, own_change), *_ = _moved(
+                model, images, step, attached_gradient, gradient
+            )
+            max_error = min(abs(change - own_change), AGREES * abs(attached_change))
+            if abs(change - attached_change) < max_error:
+                return attached, attached_gradient
+    return model, gradient
 
 
 def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what `_run` does of images, and the gradient of `_told` of it; zero where
-    nothing is found.
+    """Return the rows of `_run` for images, and the gradient of their `_told` value.
+
+    The gradient is zero if nothing is detected.
     """
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():
@@ -536,89 +561,83 @@ def _slope(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _told(rows: Tensor) -> Tensor:
-    """Return one number of what `_run` returns, whose gradient is looked at."""
+    """Return a weighted sum of what `_run` returns, whose gradient is checked."""
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
 @torch.no_grad()
 def _moved(
-    model: Model, images: Tensor, step: Tensor, *slopes: Tensor
+    model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> tuple[float, list[float], list[Tensor], float]:
-    """Return by how much `_told` differs a step before and behind images, what each
-    slope foretells of that, both ends of the step, and the size of outputs.
+    """Measure how the `_told` value changes over a step to both sides of images.
+
+    Returns:
+        The change, what each gradient predicts of it, the images at both ends of the
+        step, and the sum of the outputs' absolute values.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
-    foretold = [float(((ends[0] - ends[1]) * slope).sum()) for slope in slopes]
-    return (
-        float(_told(outputs[0] - outputs[1])),
-        foretold,
-        ends,
-        float(outputs[0].abs().sum()),
-    )
+    change = float(_told(outputs[0] - outputs[1]))
+    predicted = [
+        float(((ends[0] - ends[1]) * gradient).sum()) for gradient in gradients
+    ]
+    return change, predicted, ends, float(outputs[0].abs().sum())
 
 
 def _check_gradient(
     model: Model, images: Tensor, gradient: Tensor, detached: bool
 ) -> None:
-    """Warn if a network's outputs do not move as its gradient says: it is masked, cut
-    off, or not of this network.
+    """Warn if a network's outputs do not change as its gradient predicts: it is masked,
+    cut off, or not of this network.
     """
-    # what suppression leaves may jump in the first only
-    sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
-    told_apart = ROUNDING * torch.finfo(model.dtype).eps
-    if told_apart > STEP:
-        # a network in half precision bends in the first, and rounds the second
-        sizes = (told_apart, told_apart / 8.0)
-    for size in sizes:
-        seen, (expected,), ends, total = _moved(
-            model, images, size * gradient.sign(), gradient
+    # Suppression of boxes may make outputs jump in the larger step only.
+    step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
+    min_step = ROUNDING * torch.finfo(model.dtype).eps
+    if min_step > STEP:
+        # A network in half precision is nonlinear in the first, and rounds the second.
+        step_sizes = (min_step, min_step / 8.0)
+    for step_size in step_sizes:
+        change, (predicted,), ends, total = _moved(
+            model, images, step_size * gradient.sign(), gradient
         )
-        if (
-            model.read is not None
-            and len({_choices(model, image) for image in (images, *ends)}) > 1
-        ):
-            return  # nothing can be said of what jumps
-        change = max(abs(seen), abs(expected))
-        if change <= SMALLEST * total or abs(seen - expected) <= MASKED * change:
+        if model.read is not None:
+            choices = {_choices(model, image) for image in (images, *ends)}
+            if len(choices) > 1:
+                return  # outputs that jump cannot be compared with a gradient
+        size = max(abs(change), abs(predicted))
+        if size <= SMALLEST * total or abs(change - predicted) <= MASKED * size:
             return
-    why = "Steps that round, or a defence that masks gradients?"
+    reason = "Steps that round, or a defence that masks gradients?"
     if detached:
-        why = (
+        reason = (
             "It detaches a part of what it computes, where it rounds or for another "
             "reason."
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{expected:.3g} expected, "
-        f"{seen:.3g} seen for a small step along it. {why} A search "
+        f"{predicted:.3g} expected, "
+        f"{change:.3g} seen for a small step along it. {reason} A search "
         "that follows them may find nothing: try a policy without gradients beside it"
     )
 
 
 @torch.no_grad()
 def _choices(model: Model, images: Tensor) -> str:
-    """What an output has that no gradient moves: how many numbers, which of them are
-    whole, and texts. A detector that has suppressed boxes finds more or fewer of them,
-    or others, after a small step, and what is returned in words goes on otherwise after
-    another word.
+    """Return the part of an output that no gradient changes, as a string to compare.
+
+    That is its shapes, its columns of integers, and its texts. A detector with
+    suppression finds other boxes after a small step, and a text continues differently
+    after another word.
     """
     outputs = _read(model, images)
-    choices = list[Any]()
     if isinstance(outputs, Tensor):
         return ""
+    choices = list[Any]()
     for tensor in tensors_in(outputs):
         columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
-        choices.append(
-            (tensor.shape, columns[(columns == columns.round()).all(dim=1)].tolist())
-        )
-    mappings = (output for output in outputs if isinstance(output, Mapping))
-    return str(
-        choices
-        + [
-            text
-            for mapping in mappings
-            for text in mapping.values()
-            if type(text) is str
-        ]
-    )
+        is_integer = (columns == columns.round()).all(dim=1)
+        choices.append((tensor.shape, columns[is_integer].tolist()))
+    for output in outputs:
+        if isinstance(output, Mapping):
+            choices += [value for value in output.values() if type(value) is str]
+    return str(choices)

@@ -1,7 +1,7 @@
-"""What a loader hands over: a network that is ready to be asked, and what its file or
-maker says about it.
+"""Define what a loader returns: a network ready to run, and what its file or author states
+about it.
 
-The maker may be Python code: ``package.module:callable``, with weights after an ``@``.
+The author may be Python code: ``package.module:callable``, with weights after an ``@``.
 """
 
 from __future__ import annotations
@@ -58,10 +58,15 @@ SIDE = 448
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a network is to be asked: the task's name, what its user gave as names of
-    classes and as texts (None if they did not), the most tokens of a free answer, and
-    how often each picture is asked for one. `ask` has limits for a model behind an
-    address (`advsearch.models.address.LIMITS`).
+    """What a network is needed for.
+
+    Attributes:
+        task: its name.
+        names: of classes, by the user; None without.
+        prompts: by the user; None without.
+        tokens: maximum length of a free answer.
+        times: number of answers per image.
+        ask: limits of a model behind an address (`advsearch.models.address.LIMITS`).
     """
 
     task: str = "classification"
@@ -72,9 +77,15 @@ class Purpose:
     ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Raise a ModelError where a network cannot do the task: `what` it does, such
-        as "compares a picture with texts", is good for `tasks`, and for a user's own,
-        which may read its output in any way.
+        """Check that a network can do the task.
+
+        Args:
+            model: its name.
+            what: the network does, such as "compares a picture with texts".
+            *tasks: that this is good for. A user's own task may read any output.
+
+        Raises:
+            ModelError: it cannot.
         """
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
@@ -83,9 +94,12 @@ class Purpose:
             )
 
     def in_words(self, model: str, what: str) -> tuple[bool, str | None]:
-        """Return whether a network that says words answers freely, and the question
-        that its user asks, None for a default. Raises ModelError as `check`, and
-        InputError where there are several questions, or names for a free answer.
+        """Return whether a network that returns texts answers freely, and the user's question, None
+        for the default.
+
+        Raises:
+            ModelError: as `check`.
+            InputError: there are several questions, or names for a free answer.
         """
         self.check(model, what, "classification", "answer")
         free = self.task == "answer"
@@ -102,8 +116,11 @@ class Purpose:
         return free, prompts[0] if prompts else None
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
-        """Return the names, for a network that does a task and has no classes of its
-        own. Raises ModelError as `check`, and InputError where there are no names.
+        """Return the names for a network without classes of its own.
+
+        Raises:
+            ModelError: as `check`.
+            InputError: there are no names.
         """
         self.check(model, what, task)
         if self.names is None:
@@ -117,8 +134,9 @@ class Purpose:
 
 @dataclass(frozen=True)
 class Source:
-    """A frozen network and its own defaults, which the caller's options override. They
-    are as in `load_model`, and None where the source does not say.
+    """A frozen network with its own defaults, which options of `load_model` override.
+
+    The defaults are as in `load_model`, and None if the source does not state them.
     """
 
     # in evaluation mode, its parameters without gradients

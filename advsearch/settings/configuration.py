@@ -1,8 +1,8 @@
-"""What is declared of a setting, for the help, the docs, errors and checks alike, and
-configurations made of settings.
+"""Declare settings once, for the help, the docs, errors and checks, and build
+configurations of them.
 
-A configuration is what a command needs to know, checked as a whole. Whatever it is made
-from, flags, YAML or Python, its class reads the values.
+A configuration is what a command needs to know, checked as a whole. Whether it is made
+from flags, YAML or Python, its class reads the values.
 """
 
 from __future__ import annotations
@@ -46,35 +46,35 @@ if TYPE_CHECKING:
 
 ReadTexts = Callable[[Sequence[str], str], Mapping[str, object]]
 """Reads texts into a mapping; the second argument is the name of the setting, for
-errors. Raises ValueError where they are something else.
+errors. Raises ValueError if they are something else.
 """
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is declared of a setting; `settings` works out what is empty."""
+    """The declaration of a setting; `settings` completes what is empty."""
 
-    # or a function that makes it; ... where it has to be given, which `settings` tells
-    # as None
+    # Or a function that creates it. `...` if the setting is required; `settings`
+    # replaces it by None.
     default: Any
     group: str  # heading in the help
     description: str  # what it is
-    # completes "expected ..." in errors, and names the range in the help; or type and
-    # constraints do
+    # Completes "expected ..." in errors, and names the range in the help; by default
+    # derived from type and constraints.
     expects: str = ""
     unit: str = ""  # of the value
-    otherwise: str = ""  # what a default of None comes to
-    flag: str = ""  # where that is not its name: "--control"
-    # what stands for the value in the help, where that is not the last word of its name
+    otherwise: str = ""  # what a default of None means
+    flag: str = ""  # if it is not its name: "--control"
+    # Placeholder of the value in the help, if it is not the last word of its name.
     metavar: str = ""
-    # whether its flag may be repeated; that of a mapping always may
+    # Whether its flag may be repeated; that of a mapping always may.
     repeats: bool = False
-    # reads the texts that a mapping may be written as
+    # Reads the texts that a mapping may be written as.
     read_texts: ReadTexts = written.parse_assignments
-    # what the flag does, where that is the opposite of the description
+    # What the flag does, if it is the opposite of the description.
     switched: str = ""
-    # says what a value does beyond the run, which only a person may ask for
-    # (`trust.powers`)
+    # Returns what a value does beyond the run, which only a person may request
+    # (`trust.powers`).
     power: Power = none
     field: str = ""  # its name in the configuration
     name: str = ""  # its name in YAML
@@ -84,16 +84,16 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """What it is, its values with range and unit, and its default."""
+        """The description, the values with range and unit, and the default."""
         unit = f", in {self.unit}" if self.unit else ""
-        default = self.otherwise if self.default is None else str(self.default)
         if isinstance(self.default, dict):
             default = ",".join(self.default)
         elif isinstance(self.default, float):
             default = f"{self.default:g}"
-        return f"{self.description}: {self.expects}{unit}" + (
-            f" (default: {default})" if default else ""
-        )
+        else:
+            default = self.otherwise if self.default is None else str(self.default)
+        suffix = f" (default: {default})" if default else ""
+        return f"{self.description}: {self.expects}{unit}{suffix}"
 
 
 def setting(
@@ -112,7 +112,7 @@ def setting(
     power: Power = none,
     **constraints: Any,
 ) -> Any:
-    """Return a pydantic field: of a `Setting`, with constraints of `pydantic.Field`."""
+    """Create a pydantic field from a `Setting`, with constraints of `pydantic.Field`."""
     declared = Setting(
         default,
         group,
@@ -134,14 +134,12 @@ def setting(
     )
 
 
-# of a `Setting`, by `settings`
+# Fields of a `Setting` that `settings` completes.
 WORKED_OUT = ("field", "name", "required", "is_switch", "is_mapping")
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
-    """Return a setting as another command declares it, but for some of the arguments of
-    `setting`.
-    """
+    """Return a setting as another command declares it, with changed arguments of `setting`."""
     extra: Any = config.model_fields[field].json_schema_extra
     declared = {
         name: value
@@ -152,9 +150,12 @@ def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
 
 
 class Clash(NamedTuple):
-    """A setting, by its field, that says nothing, or the opposite of another one,
-    `with_others` that are such. It counts as given where it differs from its default;
-    `why` completes "setting: ..." and says what to do.
+    """A setting that has no effect with others, or contradicts them.
+
+    Attributes:
+        setting: its field; it clashes if it differs from its default.
+        with_others: whether the others are set so.
+        why: completes "setting: ..." and states what to do.
     """
 
     setting: str
@@ -163,23 +164,24 @@ class Clash(NamedTuple):
 
 
 def settings(config: type[Config]) -> tuple[Setting, ...]:
-    """Return every setting of a configuration, in the order in which they are shown."""
-    complete = []
+    """Return every setting of a configuration, in the order of the help."""
+    completed = []
     for field, info in config.model_fields.items():
         if field in config.without:
             continue
         extra: Any = info.json_schema_extra
         declared: Setting = extra["declared"]
         is_mapping = get_origin(info.annotation) is dict
-        complete.append(
+        default = None
+        if not info.is_required():
+            default = info.get_default(call_default_factory=True)
+        completed.append(
             replace(
                 declared,
                 field=field,
                 name=info.alias or field,
                 required=info.is_required(),
-                default=None
-                if info.is_required()
-                else info.get_default(call_default_factory=True),
+                default=default,
                 flag=declared.flag or "--" + field.replace("_", "-"),
                 expects=declared.expects or _expected(info),
                 metavar=declared.metavar or field.rpartition("_")[2].upper(),
@@ -188,38 +190,45 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 is_mapping=is_mapping,
             )
         )
-    return tuple(complete)
+    return tuple(completed)
 
 
 def _expected(info: FieldInfo) -> str:
-    kinds = [
-        kind
-        for kind in get_args(info.annotation) or (info.annotation,)
-        if kind is not type(None)
+    """Describe the values of a field by its type and constraints."""
+    types = [
+        value_type
+        for value_type in get_args(info.annotation) or (info.annotation,)
+        if value_type is not type(None)
     ]
-    if kinds == [bool]:
+    if types == [bool]:
         return "true or false"
-    if get_origin(info.annotation) is Literal or get_origin(kinds[0]) is Literal:
-        *first, last = (
-            kinds if get_origin(info.annotation) is Literal else get_args(kinds[0])
-        )
-        return f"{', '.join(first)} or {last}"
+    if get_origin(info.annotation) is Literal:
+        return _join_choices(types)
+    if get_origin(types[0]) is Literal:
+        return _join_choices(get_args(types[0]))
     limits = {
-        name: getattr(part, name)
-        for part in info.metadata
+        name: getattr(constraint, name)
+        for constraint in info.metadata
         for name in ("ge", "gt", "le")
-        if hasattr(part, name)
+        if hasattr(constraint, name)
     }
-    number = "a whole number" if kinds == [int] else "a number"
-    most = limits["le"] if kinds == [int] else f"{limits['le']:g}".replace("e+0", "e")
+    is_integer = types == [int]
+    number = "a whole number" if is_integer else "a number"
+    upper = limits["le"] if is_integer else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
-        return f"{number} greater than {limits['gt']:g} and at most {most}"
-    return f"{number} from {limits['ge']:g} to {most}"
+        return f"{number} greater than {limits['gt']:g} and at most {upper}"
+    return f"{number} from {limits['ge']:g} to {upper}"
+
+
+def _join_choices(choices: Sequence[Any]) -> str:
+    """Return choices as "a, b or c"."""
+    *first, last = choices
+    return f"{', '.join(first)} or {last}"
 
 
 PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
-"""The settings that say where a run is kept, not what it does, as a repetition has
-them.
+"""Settings of where a run is stored, not of what it does, with the values that a
+repetition has.
 """
 
 FILES = (
@@ -230,8 +239,9 @@ FILES = (
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed: `problems` are pairs of a
-    name and what is wrong.
+    """One or more settings have values that are not allowed.
+
+    `problems` are pairs of a name and what is wrong.
     """
 
     def __init__(
@@ -243,13 +253,13 @@ class SettingsError(InputError):
 
 
 class PythonOnly(NamedTuple):
-    """A part of a run that exists only in the Python session that made it: no file and
-    no command can name it.
+    """A part of a run that exists only in one Python session: no file and no command can name
+    it.
 
     Attributes:
-        role: what the run has it for: "model", "scene", "objective", "policy",
-            "metric", "control", "task", ...
-        name: its name there; empty where it has none.
+        role: of the part in the run: "model", "scene", "objective", "policy", "metric",
+            "control", "task", ...
+        name: its name there; empty if it has none.
     """
 
     role: str
@@ -261,9 +271,10 @@ class PythonOnly(NamedTuple):
 
 
 class Config(BaseModel):
-    """What a command needs to know. Frozen; unknown names are refused. Each command's
-    configuration is a subclass. Raises InputError: a value is outside its range or an
-    unknown setting is named; the message lists every problem.
+    """The settings of a command, checked as a whole. Frozen; unknown names are rejected.
+
+    Each command's configuration is a subclass. Raises InputError if a value is out of range
+    or an unknown setting is named; the message lists every problem.
     """
 
     command: ClassVar[str]
@@ -310,21 +321,20 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        defaults = {setting.field: setting.default for setting in settings(type(self))}
+        """Check settings that the command does not have, and those that contradict others."""
         for name in self.without:
-            if getattr(self, name) != type(self).model_fields[name].get_default(
-                call_default_factory=True
-            ):
+            field = type(self).model_fields[name]
+            if getattr(self, name) != field.get_default(call_default_factory=True):
                 raise InputError(
                     f"{name}: `advsearch {self.command}` has no such "
                     "setting; leave it out"
                 )
+        defaults = {setting.field: setting.default for setting in settings(type(self))}
         for clash in self.clashes:
-            given = (
-                clash.setting not in self.without
-                and getattr(self, clash.setting) != defaults[clash.setting]
-            )
-            if given and clash.with_others(self):
+            if clash.setting in self.without:
+                continue
+            is_set = getattr(self, clash.setting) != defaults[clash.setting]
+            if is_set and clash.with_others(self):
                 raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
         return self
 
@@ -332,59 +342,61 @@ class Config(BaseModel):
     def from_yaml(
         cls, path: str | Path, overrides: Mapping[str, object] | None = None
     ) -> Self:
-        """Return the configuration that a YAML file describes, with `overrides` put
-        over it: settings which a person has asked for, by name; a dotted one reaches
-        inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+        """Load the configuration that a YAML file describes.
 
         The file has one mapping from settings to values; `schema`, `command` and `base`
-        may stand beside them (see `read_yaml`). What it alone asks for and has power
-        over more than the run is `left_out`, as if it did not stand there. Raises
-        FileFormatError, or InputError as for the class; the message names the file.
+        may stand next to them (see `read_yaml`). A setting of the file with power over
+        more than the run counts as not set, and is listed by `left_out`.
+
+        Args:
+            path: of the file.
+            overrides: settings by name that a person has requested. A dotted name reaches
+                inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+
+        Raises:
+            FileFormatError, InputError: as for the class; the message names the file.
         """
-        data = {
-            name: value
-            for name, value in written.read_yaml(path).items()
-            if name != "command"
-        }
+        data = dict(written.read_yaml(path))
+        data.pop("command", None)
         data.pop("schema", None)  # checked by `read_yaml`
-        for name, value in (overrides or {}).items():
+        overrides = overrides or {}
+        for name, value in overrides.items():
             written.put(data, name, value)
         try:
-            left = [
-                power
-                for power in cls(**data).powers
-                if power.name not in (overrides or {})
+            left_out = [
+                power for power in cls(**data).powers if power.name not in overrides
             ]
-            without = [name for power in left for name in (power.name, power.field)]
-            made = cls(
-                **{name: value for name, value in data.items() if name not in without}
-            )
+            for power in left_out:
+                data.pop(power.name, None)
+                data.pop(power.field, None)
+            config = cls(**data)
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
-        made._left_out = tuple(left)
-        return made
+        config._left_out = tuple(left_out)
+        return config
 
     @property
     def powers(self) -> tuple[LeftOut, ...]:
         """The settings that have power over more than the run."""
-        given = [
-            (setting, getattr(self, setting.field)) for setting in settings(type(self))
-        ]
-        return tuple(
-            LeftOut(setting.name, setting.field, value, does, setting.default)
-            for setting, value in given
-            if (does := setting.power(value))
-        )
+        powers = []
+        for setting in settings(type(self)):
+            value = getattr(self, setting.field)
+            effect = setting.power(value)
+            if effect:
+                powers.append(
+                    LeftOut(setting.name, setting.field, value, effect, setting.default)
+                )
+        return tuple(powers)
 
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
-        """What the file that it was read from asked for in vain."""
+        """The settings of the file with power over more than the run, which count as not set."""
         return self._left_out
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The settings that may have such power and decide no number: parts of a run
-        have them from this sitting.
+        """The settings of this session that may have such power and decide no number, which parts
+        of a run get too.
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -395,42 +407,44 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Refuse, by an InputError, settings with power over more than the run: `where`
-        is a file that has them.
+        """Raise InputError if a file, named `where`, has settings with power over more than
+        the run.
         """
-        for name, _, _, does, _ in self.powers:
+        for name, _, _, effect, _ in self.powers:
             raise InputError(
-                f"{where}: {name}: {does}, which such a file can't ask "
+                f"{where}: {name}: {effect}, which such a file can't ask "
                 "for; leave it out"
             )
 
     @classmethod
     def shared(cls, other: Config) -> dict[str, object]:
-        """Return the settings that this command and another's have from the same class,
-        but for the run's place. Who shares the work is part of that place.
+        """Return the settings of another configuration that this command shares with it.
+
+        They are those of the most specific common class, except for where the run is
+        stored and who shares its work.
         """
-        both = next(
+        common_class = next(
             base
             for base in cls.__mro__
             if issubclass(base, Config) and isinstance(other, base)
         )
-        apart = (*PLACE, "workers", "cluster", *cls.without, *other.without)
+        excluded = (*PLACE, "workers", "cluster", *cls.without, *other.without)
         return {
             name: getattr(other, name)
-            for name in both.model_fields
-            if name not in apart
+            for name in common_class.model_fields
+            if name not in excluded
         }
 
     @classmethod
     def of(cls, other: Config, **changes: object) -> Self:
-        """Return what another command's configuration describes as one of this, in a
-        place of its own: the settings that are `shared`, but for the changes.
+        """Create a configuration of this command from that of another: the settings that are
+        `shared`, and the changes.
         """
         return cls(**{**cls.shared(other), **changes}).with_python_parts_of(other)
 
     @property
     def only_here(self) -> tuple[PythonOnly, ...]:
-        """Its parts that exist only in this Python session."""
+        """The parts that exist only in this Python session."""
         return self._only_here
 
     def with_only_here(self, parts: Sequence[PythonOnly]) -> Self:
@@ -466,8 +480,9 @@ class Config(BaseModel):
         )
 
     def to_yaml(self) -> str:
-        """Return the YAML form; `from_yaml` of it gives an equal configuration, where
-        no `powers` are in it.
+        """Return the YAML form.
+
+        `from_yaml` of it gives an equal configuration, unless there are `powers` in it.
         """
         data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
         note = ""
@@ -481,35 +496,27 @@ class Config(BaseModel):
 
     @property
     def place(self) -> tuple[str | None, bool]:
-        """Where a run of this is kept, if that is said, and whether what is there is
-        replaced.
-        """
+        """Where the run is stored, None if that is not set, and whether a run there is replaced."""
         return getattr(self, "run", None), getattr(self, "overwrite", False)
 
     @property
     def title(self) -> tuple[str, ...]:
-        """What names a run of this whose place is not said."""
+        """The words from which a run without a stated place is named."""
         return (self.command,)
 
     def to_repeat(self) -> Self:
-        """Return what `run.yaml` holds: no place for the run (a repetition gets its
-        own) and files by absolute path.
+        """Return what `run.yaml` stores: files by absolute path, and no place of the run,
+        because a repetition gets its own.
         """
-        named = {
-            name: value
-            for name in FILES
-            if (value := getattr(self, name, None)) is not None
-        }
-        absolute = {
-            name: ",".join(map(_absolute, written.split_names(value)))
-            for name, value in named.items()
-        }
+        absolute = {}
+        for name in FILES:
+            value = getattr(self, name, None)
+            if value is not None:
+                absolute[name] = ",".join(map(_absolute, written.split_names(value)))
         return self.model_copy(update={**absolute, **PLACE})
 
     def command_line(self, run: str | Path | None) -> str | None:
-        """Return the shell command that repeats the run of this that is kept in a
-        folder; None where none does.
-        """
+        """Return the shell command that repeats the run in a directory; None if there is none."""
         if run is None or self._only_here:
             return None
         return shlex.join(["advsearch", "run", str(Path(run) / written.CONFIG)])
@@ -520,35 +527,37 @@ class Config(BaseModel):
         return [part.text for part in self._only_here]
 
     def deciding(self) -> JsonObject:
-        """Return the settings that decide a run's numbers, as JSON values: all that are
-        not `free`. Files have their names only, since they may have been moved.
+        """Return the settings that decide a run's numbers, as JSON values: all that are not
+        `free`.
+
+        Files have their names only, because they may have been moved.
         """
-        given = {
+        values = {
             name: value for name, value in self.plain().items() if name not in self.free
         }
         for name in FILES:
-            if isinstance(value := given.get(name), str):
-                given[name] = ",".join(
-                    "+".join(Path(path).name for path in split_paths(part))
-                    for part in written.split_names(value)
-                )
-        return given
+            value = values.get(name)
+            if isinstance(value, str):
+                names = [_file_names(entry) for entry in written.split_names(value)]
+                values[name] = ",".join(names)
+        return values
 
 
 def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
-    deep = {name: value for name, value in data.items() if not is_shallow(value)}
-    if deep:
-        raise _settings_error(
-            config, [{"loc": (name,), "input": deep[name], "type": ""} for name in deep]
-        )
+    """Raise SettingsError for values that are nested too deeply."""
+    problems = [
+        {"loc": (name,), "input": value, "type": ""}
+        for name, value in data.items()
+        if not is_shallow(value)
+    ]
+    if problems:
+        raise _settings_error(config, problems)
 
 
 def _mappings_from_texts(
     config: type[Config], data: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return values of settings; those of mappings that are written as a text, or as
-    several, are read.
-    """
+    """Return values of settings, with mappings read from a text or several texts."""
     values = dict(data)
     for setting in settings(config):
         if not setting.is_mapping:
@@ -556,54 +565,66 @@ def _mappings_from_texts(
         for name in {setting.name, setting.field} & values.keys():
             value = values[name]
             texts = [value] if isinstance(value, str) else value
-            if isinstance(texts, (list, tuple)) and all(
-                isinstance(text, str) for text in texts
-            ):
-                try:
-                    values[name] = setting.read_texts(texts, setting.name)
-                except ValueError:
-                    got = texts[0] if len(texts) == 1 else texts
-                    raise _settings_error(
-                        config, [{"loc": (name,), "input": got, "type": ""}]
-                    ) from None
+            if not isinstance(texts, (list, tuple)):
+                continue
+            if not all(isinstance(text, str) for text in texts):
+                continue
+            try:
+                values[name] = setting.read_texts(texts, setting.name)
+            except ValueError:
+                got = texts[0] if len(texts) == 1 else texts
+                problem = {"loc": (name,), "input": got, "type": ""}
+                raise _settings_error(config, [problem]) from None
     return values
 
 
 def python_only_text(parts: Sequence[str]) -> str:
-    """Return why no command repeats a run with parts that existed only in Python."""
+    """Return why no command repeats a run with parts that exist only in Python."""
     *first, last = map(written.shown, parts)
-    listed = f"{', '.join(first)} and {last}" if first else last
-    return (
-        f"{listed} {'exist' if first else 'exists'} only in the Python session "
-        "that "
-        "asked."
-    )
+    if first:
+        subject = f"{', '.join(first)} and {last} exist"
+    else:
+        subject = f"{last} exists"
+    return f"{subject} only in the Python session that asked."
 
 
 def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
+    """Return one error for pydantic's errors, in the words of the settings."""
     declared = settings(config)
-    known = {each.name: each for each in declared} | {
-        each.field: each for each in declared
-    }
+    known = {setting.name: setting for setting in declared}
+    known |= {setting.field: setting for setting in declared}
     problems: dict[str, str] = {}
     for error in errors:
         name = str(error["loc"][0])
         if name not in known:
-            return UnknownNameError("setting", name, {each.name for each in declared})
+            names = {setting.name for setting in declared}
+            return UnknownNameError("setting", name, names)
+        setting = known[name]
         got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
-        if known[name].is_mapping and len(error["loc"]) > 1:
+        if setting.is_mapping and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
-        problems.setdefault(
-            known[name].name, f"expected {known[name].expects}, got {got}"
-        )
+        problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
     return SettingsError(tuple(problems.items()))
 
 
 def _absolute(name: str) -> str:
-    # of two files as in camera.csv+object.csv, that of each; of what is no file, its
-    # name
-    if len(both := split_paths(name)) > 1:
-        return "+".join(map(_absolute, both))
-    path, mark, part = (name, "", "") if os.path.isfile(name) else name.partition("#")
-    is_path = ("/" in path or Path(path).suffix != "") and os.path.isfile(path)
-    return f"{Path(path).resolve()}{mark}{part}" if is_path else name
+    """Return the absolute path of a file; what is no file stays as it is.
+
+    Of two files as in camera.csv+object.csv, each gets its path.
+    """
+    paths = split_paths(name)
+    if len(paths) > 1:
+        return "+".join(map(_absolute, paths))
+    if os.path.isfile(name):
+        path, mark, part = name, "", ""
+    else:
+        path, mark, part = name.partition("#")
+    looks_like_path = "/" in path or Path(path).suffix != ""
+    if looks_like_path and os.path.isfile(path):
+        return f"{Path(path).resolve()}{mark}{part}"
+    return name
+
+
+def _file_names(entry: str) -> str:
+    """Return the names of files without their directories."""
+    return "+".join(Path(path).name for path in split_paths(entry))

@@ -1,6 +1,4 @@
-"""Tasks: what a model is asked to do, and how its output is judged against what is true
-of the scene.
-"""
+"""Tasks: what a model predicts, and how its output is judged against the ground truth."""
 
 from __future__ import annotations
 
@@ -56,48 +54,39 @@ from advsearch.tasks.together import (
     outcome_in,
 )
 
-MOST_NUMBERS = 4  # of an output that are said one by one
+MOST_NUMBERS = 4  # maximum size of an output whose label lists its numbers
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnTask(Task):
-    """A task by one function, see `own_task`; its truth are the scene's facts in each
-    configuration.
-    """
+    """A task defined by a function, see `own_task`; its truth is the scene's facts."""
 
     name = "own"
     varies = True
 
     function: Callable[[Any, Facts], Tensor]
-    # empty where the model has no names
+    # Empty if the model's classes have no names.
     labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> OwnTask:
-        asked = super().on(model, target=target, minimise=minimise)
-        return replace(asked, labels=tuple(model.labels) if model.named else ())
+        task = super().on(model, target=target, minimise=minimise)
+        return replace(task, labels=tuple(model.labels) if model.named else ())
 
     def truth(self, facts: Facts) -> Facts:
         return facts
 
     def loss(self, output: Any, truth: Facts) -> Tensor:
-        """Return what the function says, (N,). Raises InputError where it returns
-        something else.
-        """
-        found = self.function(copied(output), truth)
+        """Return the function's values, (N,). Raises InputError if they are not that."""
+        losses = self.function(copied(output), truth)
         count = len(output)
-        if (
-            isinstance(found, Tensor)
-            and found.is_floating_point()
-            and found.numel() == count
-        ):
-            return found.reshape(count)
-        got = (
-            f"{found.dtype} {tuple(found.shape)}"
-            if isinstance(found, Tensor)
-            else type(found).__name__
-        )
+        is_tensor = isinstance(losses, Tensor)
+        if is_tensor and losses.is_floating_point() and losses.numel() == count:
+            return losses.reshape(count)
+        got = type(losses).__name__
+        if is_tensor:
+            got = f"{losses.dtype} {tuple(losses.shape)}"
         raise InputError(
             f"task {self.name}: expected how wrong each output is, a tensor of {count} "
             "floating-point number"
@@ -107,40 +96,36 @@ class OwnTask(Task):
         )
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
-        """Return the largest class of each output where classes have names, else its
-        numbers.
+        """Return the class with the largest output if classes have names, else the
+        numbers of the output.
         """
-        found: list[tuple[Prediction, ...]] = []
-        for one in output.detach():
-            index = (
-                int(one.argmax())
-                if one.ndim == 1 and len(one) == len(self.labels)
-                else None
-            )
-            if index is not None:
-                label = self.labels[index]
-            elif one.numel() <= MOST_NUMBERS:
-                label = ", ".join(f"{value:.3g}" for value in one.flatten().tolist())
+        predictions_of_images: list[tuple[Prediction, ...]] = []
+        for values in output.detach():
+            if values.ndim == 1 and len(values) == len(self.labels):
+                index = int(values.argmax())
+                prediction = Prediction(self.labels[index], index)
+            elif values.numel() <= MOST_NUMBERS:
+                numbers = [f"{value:.3g}" for value in values.flatten().tolist()]
+                prediction = Prediction(", ".join(numbers))
             else:
-                label = (
-                    f"{' x '.join(map(str, one.shape))} numbers, mean "
-                    f"{float(one.double().mean()):.3g}"
-                )
-            found.append((Prediction(label, index),))
-        return found
+                shape = " x ".join(map(str, values.shape))
+                mean = float(values.double().mean())
+                prediction = Prediction(f"{shape} numbers, mean {mean:.3g}")
+            predictions_of_images.append((prediction,))
+        return predictions_of_images
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
         return (truth.label or truth.own_label or truth.object,)
 
 
 def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
-    """Return a task from a function, by whose name it is called.
+    """Create a task from a function, whose name becomes the task's.
 
     Args:
-        function: `judge(output, truth)`, with the outputs of the model for N pictures
-            (N, ...), and `Facts`: what is true of the scene in this configuration, such
-            as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
-            (N,), or a number for one picture: over 0 exactly where the output is wrong,
+        function: `judge(output, truth)`, with the outputs of the model for N images
+            (N, ...), and `Facts`: the ground truth of the scene in this configuration,
+            such as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
+            (N,), or a number for one image: over 0 exactly if the output is wrong,
             differentiable.
 
     Raises:
@@ -148,13 +133,13 @@ def own_task(function: Callable[[Any, Facts], Tensor]) -> OwnTask:
     """
     name = getattr(function, "__name__", type(function).__name__)
     check_takes(f"task {name}", function, "output", "truth")
-    kind: Any = type(name, (OwnTask,), {"name": name})
-    made: OwnTask = kind(function=function)
-    return made
+    task_class: Any = type(name, (OwnTask,), {"name": name})
+    task: OwnTask = task_class(function=function)
+    return task
 
 
 def function_of(task: Task) -> Callable[..., Tensor] | None:
-    """Return the function that a task was made from; None where it was not."""
+    """Return the function that a task was created from; None if there is none."""
     return task.function if isinstance(task, OwnTask) else None
 
 
@@ -170,18 +155,22 @@ TASKS: Registry[type[Task]] = Registry(
 
 
 AnyTask = str | Mapping[str, object] | Task | Callable[[Any, Facts], Tensor]
-"""A task: its name, a mapping with its `name` and options, the task itself, or a
-function `judge(output, truth)`.
+"""A task: its name, a mapping with its `name` and options, an instance, or a function
+`judge(output, truth)`.
 """
 
 
 def make_task(task: AnyTask) -> Task:
-    """Return the task of that name, of that `name` with these options, which are its
-    dataclass's fields, the task itself, or that of a function (`own_task`).
+    """Create a task from any form that names one.
 
-    Of several tasks at once, "detection+depth", the options of each stand under its
-    name. Raises UnknownNameError: no such task, or it has no such option; InputError:
-    an option's value is of another type, or outside its range.
+    Args:
+        task: a name; a mapping with a `name` and options, which are the fields of the
+            task's dataclass; a task, which is returned; or a function (`own_task`). For
+            a joint task, "detection+depth", the options of each stand under its name.
+
+    Raises:
+        UnknownNameError: there is no such task, or it has no such option.
+        InputError: an option's value is of another type, or out of range.
     """
     if isinstance(task, Task):
         return task
@@ -192,39 +181,44 @@ def make_task(task: AnyTask) -> Task:
             "task: expected a name, a mapping with a `name`, a Task or a "
             f"function, got {told(task)}"
         )
-    given = {"name": task} if isinstance(task, str) else task
-    name = str(given.get("name", Classification.name))
-    options: dict[str, Any] = {key: given[key] for key in given if key != "name"}
+    setting: Mapping[str, Any] = {"name": task} if isinstance(task, str) else task
+    name = str(setting.get("name", Classification.name))
+    options = {key: value for key, value in setting.items() if key != "name"}
     if JOINED in name:
-        names = [part.strip() for part in name.split(JOINED)]
-        for part, of_part in options.items():
-            if part not in names:
-                raise UnknownNameError(
-                    f"option of task {JOINED.join(names)!r}:", part, names
-                )
-            if not isinstance(of_part, Mapping):
-                raise InputError(
-                    f"task {part}: expected its options as a mapping, got "
-                    f"{of_part!r:.80}"
-                )
-        return Together(
-            parts=tuple(
-                make_task({**options.get(part, {}), "name": part}) for part in names
-            )
-        )
+        return _make_joint_task(name, options)
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
     build: Callable[..., Any] = TASKS[name]
-    made: Any = build(**options)
-    if made.judges_rig:
-        made = replace(made, part=make_task(made.task))
-    result: Task = made
-    return result
+    result: Any = build(**options)
+    if result.judges_rig:
+        result = replace(result, part=make_task(result.task))
+    created: Task = result
+    return created
+
+
+def _make_joint_task(name: str, options: Mapping[str, Any]) -> Together:
+    """Create the joint task of several names; each has its options under its name."""
+    names = [part.strip() for part in name.split(JOINED)]
+    for task_name, task_options in options.items():
+        if task_name not in names:
+            raise UnknownNameError(
+                f"option of task {JOINED.join(names)!r}:", task_name, names
+            )
+        if not isinstance(task_options, Mapping):
+            raise InputError(
+                f"task {task_name}: expected its options as a mapping, got "
+                f"{task_options!r:.80}"
+            )
+    parts = [
+        make_task({**options.get(task_name, {}), "name": task_name})
+        for task_name in names
+    ]
+    return Together(parts=tuple(parts))
 
 
 def __getattr__(name: str) -> Any:
-    """Import the class of another built-in task when it is asked for by name: Depth."""
+    """Import the class of another built-in task on first use, such as `Depth`."""
     return get_class("task", name)
 
 

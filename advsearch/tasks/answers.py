@@ -1,6 +1,4 @@
-"""Free answers: whether the text that a model says of a picture has one of the right
-words in it.
-"""
+"""Judge free answers: whether the text of a model contains one of the right words."""
 
 from __future__ import annotations
 
@@ -18,22 +16,24 @@ from advsearch.extend import InputError, Model, Task, tasks
 
 Words = tuple[str, ...]
 
-SILENCE = "(nothing)"  # what an answer without a word is called
-MOST = 256  # most tokens of an answer
+SILENCE = "(nothing)"  # label of an answer without a word
+MOST = 256  # maximum of `tokens` and of `times`
 
 
 class Texts(TypedDict):
-    """What a model that only answers says of one picture: the text of each time that it
-    was asked.
-    """
+    """The answers of a model without logits about one image, one per request."""
 
     texts: list[str]
 
 
 class Utterance(TypedDict):
-    """What a model says of one picture: the text, logits (T, tokens) float32 of all
-    that it could have said at each step, of which it took the largest, and from a word
-    to the tokens that may begin it, where any does.
+    """The answer of a model with logits about one image.
+
+    Attributes:
+        text: the answer.
+        logits: (T, tokens) float32, of all tokens at each of T steps; the largest was
+            chosen.
+        begins: returns the tokens that may begin a word.
     """
 
     text: str
@@ -43,21 +43,20 @@ class Utterance(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class FreeAnswer(Task):
-    """A model's answer has one of the right words in it, as a whole word, in any case.
+    """Judge whether an answer contains one of the right words, as a full word in any case.
 
-    The truth is those words. The text alone says whether an answer is right; how
-    nearly, the logits say. Let p be the sigmoid of the lead that tokens which begin
-    such a word have over all others, at the step where it is greatest: the loss is
-    log(1 - p) of a right answer and -log(p) of a wrong one.
+    The truth is those words. Whether an answer is right depends on its text alone; how
+    nearly, on the logits. Let p be the sigmoid of the lead that tokens which begin such a
+    word have over all others, at the step where it is largest: the loss is log(1 - p) for a
+    right answer and -log(p) for a wrong one.
 
-    Of a model that gives no logits (`Texts`) the loss is 1 - 2 s, where s is the share
-    of right answers among those of one picture: it is right where at least half of them
-    are.
+    For a model without logits (`Texts`) the loss is 1 - 2 s, where s is the fraction of
+    right answers among those about one image: it is right if at least half of them are.
 
     Args:
-        tokens: the most that an answer has.
-        times: how often each picture is asked, for a model behind an address, whose
-            answers may differ.
+        tokens: maximum number of tokens of an answer.
+        times: number of requests per image, for a model behind an address, whose answers
+            may differ.
 
     Raises:
         InputError: `tokens` or `times` is less than one, or more than `MOST`.
@@ -72,9 +71,8 @@ class FreeAnswer(Task):
 
     def __post_init__(self) -> None:
         for name in ("tokens", "times"):
-            if not (
-                isinstance(value := getattr(self, name), int) and 1 <= value <= MOST
-            ):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not 1 <= value <= MOST:
                 raise InputError(
                     f"task answer: {name}: expected a whole number from 1 "
                     f"to {MOST}, got {value!r}"
@@ -83,8 +81,8 @@ class FreeAnswer(Task):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> FreeAnswer:
-        """See `Task.on`: the target is a word, or several with commas between them, of
-        which the answer has one.
+        """See `Task.on`: the target is a word, or several separated by commas, of which the
+        answer has to contain one.
         """
         if model.read is None:
             raise InputError(
@@ -104,8 +102,8 @@ class FreeAnswer(Task):
     def read(self, returned: Any, count: int) -> list[Utterance | Texts]:
         keys = Utterance.__required_keys__
         if isinstance(returned, (list, tuple)) and all(
-            isinstance(one, Mapping) and (keys <= one.keys() or "texts" in one)
-            for one in returned
+            isinstance(answer, Mapping) and (keys <= answer.keys() or "texts" in answer)
+            for answer in returned
         ):
             return list(returned)
         raise ValueError(
@@ -117,65 +115,54 @@ class FreeAnswer(Task):
         self.truth(facts)
 
     def truth(self, facts: tasks.Facts) -> Words:
-        """Return the right words: what was said, or else the object's own label. Raises
-        InputError: there are none, or one is the target too.
+        """Return the right words: the setting `label`, or else the object's own label.
+
+        Raises:
+            InputError: there are none, or one is a target too.
         """
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(
                 f"label: expected the right words for {facts.object}, got none"
             )
-        right = _words("label", text)
-        if both := sorted(set(right) & set(self.target or ())):
+        right_words = _words("label", text)
+        common_words = sorted(set(right_words) & set(self.target or ()))
+        if common_words:
             raise InputError(
                 "target: expected words that are not right answers, got "
-                f"{both}, which `label` has too"
+                f"{common_words}, which `label` has too"
             )
-        return right
+        return right_words
 
     def truth_names(self, truth: Words) -> Words:
         return truth
 
     def loss(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
+        """Compute the loss of each answer, (N,), see the class."""
         losses = []
-        for one in output:
-            if "texts" in one:
-                shares = torch.tensor(
-                    [float(has_word(text, truth)) for text in _texts(one)]
-                )
-                losses.append(1.0 - 2.0 * shares.mean())
+        for answer in output:
+            if "texts" in answer:
+                is_right = [float(has_word(text, truth)) for text in _texts(answer)]
+                losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue
-            logits = one["logits"]
-            begin = sorted({number for word in truth for number in one["begins"](word)})
-            if not begin:
-                raise InputError(
-                    "label: the model has no token that begins one of "
-                    f"{', '.join(truth)}; name others"
-                )
-            inside = torch.zeros(
-                logits.shape[1], dtype=torch.bool, device=logits.device
-            )
-            inside[begin] = True
-            best, other = (
-                logits.masked_fill(hidden, -torch.inf).amax(dim=1)
-                for hidden in (~inside, inside)
-            )
-            lead = (best - other).max()
-            losses.append(
-                functional.logsigmoid(-lead)
-                if has_word(one["text"], truth)
-                else -functional.logsigmoid(lead)
-            )
+            lead = _token_lead(answer["logits"], answer["begins"], truth)
+            if has_word(answer["text"], truth):
+                losses.append(functional.logsigmoid(-lead))
+            else:
+                losses.append(-functional.logsigmoid(lead))
         return torch.stack(losses)
 
     def predictions(
         self, output: Sequence[Utterance | Texts], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return the text of each picture, the most frequent first, in one line without
-        signs that steer a terminal.
+        """Return the texts about each image, the most frequent first, on one line and
+        without control characters.
         """
-        each = (Counter(_texts(one)).most_common(count) for one in output)
-        return [tuple(_said(text) for text, _ in texts) for texts in each]
+        predictions_of_images = []
+        for answer in output:
+            texts = Counter(_texts(answer)).most_common(count)
+            predictions_of_images.append(tuple(_prediction(text) for text, _ in texts))
+        return predictions_of_images
 
     def said(
         self,
@@ -183,47 +170,78 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.Said]:
-        """See `Task.said`: of several texts the most frequent among those that decide,
-        and all of them beside it.
+        """See `Task.said`: of several texts, the most frequent among those that decided.
+
+        The payload has all of them.
         """
-        found = list[tasks.Said]()
-        for one, margin in zip(output, margins, strict=True):
-            texts = _texts(one)
-            deciding = [
-                text for text in texts if has_word(text, truth) == (margin >= 0.0)
-            ] or texts
-            kept: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
-            found.append((_said(Counter(deciding).most_common(1)[0][0]), kept))
-        return found
+        results = list[tasks.Said]()
+        for answer, margin in zip(output, margins, strict=True):
+            texts = _texts(answer)
+            is_right = margin >= 0.0
+            deciding = [text for text in texts if has_word(text, truth) == is_right]
+            most_frequent = Counter(deciding or texts).most_common(1)[0][0]
+            payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
+            results.append((_prediction(most_frequent), payload))
+        return results
 
 
-def _texts(one: Utterance | Texts) -> list[str]:
-    return one["texts"] if "texts" in one else [one["text"]]  # type: ignore[typeddict-item]
+def _token_lead(
+    logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
+) -> Tensor:
+    """Compute the largest lead over all steps of tokens that begin one of the words.
+
+    Args:
+        logits: (T, tokens).
+        begins: returns the tokens that may begin a word.
+        words: at least one.
+
+    Returns:
+        Their largest logit minus that of all other tokens, ().
+
+    Raises:
+        InputError: no token begins one of the words.
+    """
+    begin_tokens = sorted({token for word in words for token in begins(word)})
+    if not begin_tokens:
+        raise InputError(
+            "label: the model has no token that begins one of "
+            f"{', '.join(words)}; name others"
+        )
+    is_begin = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
+    is_begin[begin_tokens] = True
+    begin_logit = logits.masked_fill(~is_begin, -torch.inf).amax(dim=1)
+    other_logit = logits.masked_fill(is_begin, -torch.inf).amax(dim=1)
+    return (begin_logit - other_logit).max()
 
 
-def _said(text: str) -> tasks.Prediction:
-    shown = "".join(sign if sign.isprintable() else " " for sign in text)
-    return tasks.Prediction(" ".join(shown.split()) or SILENCE)
+def _texts(answer: Utterance | Texts) -> list[str]:
+    """Return all texts of an answer."""
+    if "texts" in answer:
+        return answer["texts"]
+    return [answer["text"]]  # type: ignore[typeddict-item]
+
+
+def _prediction(text: str) -> tasks.Prediction:
+    """Return a text as a prediction: on one line, without control characters."""
+    printable = "".join(char if char.isprintable() else " " for char in text)
+    return tasks.Prediction(" ".join(printable.split()) or SILENCE)
 
 
 def _words(setting: str, text: str) -> Words:
-    found = tuple(
-        dict.fromkeys(
-            " ".join(part.split()).casefold()
-            for part in text.split(",")
-            if part.strip()
-        )
-    )
-    if not found:
+    """Parse words separated by commas, in lower case and without duplicates."""
+    words = [
+        " ".join(part.split()).casefold() for part in text.split(",") if part.strip()
+    ]
+    if not words:
         raise InputError(
             f"{setting}: expected words, separated by commas, got {text!r}"
         )
-    return found
+    return tuple(dict.fromkeys(words))
 
 
 def has_word(text: str, words: Words) -> bool:
-    """Whether a text has one of some words, or terms of several, in any case; "mug" is
-    no word of "smug".
+    """Whether a text contains one of the words or terms in any case; "mug" is no word of
+    "smug".
     """
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)

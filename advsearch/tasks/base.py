@@ -1,8 +1,8 @@
-"""The contract of a task, and what it says of a picture.
+"""Define the contract of a task: how a model's output is evaluated.
 
 A task is the only place that knows what a model's output means. The search maximises a
-number of it, verification counts judgements, and store, tables and report print the
-words: none of them knows of classes.
+number that the task computes, verification counts its judgements, and results and
+reports print its labels; none of these knows of classes.
 """
 
 from __future__ import annotations
@@ -25,22 +25,21 @@ from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW, Outcome, get_outcome
 
-# what a model returns for N pictures: a tensor (N, ...), or a list with one thing for
-# each picture
+# What a model returns for N images: a tensor (N, ...), or a list with N elements.
 Output = Any
-# what is true of a scene, as its task needs it: the right classes, a number, boxes
+# The ground truth of a scene, as its task needs it: right classes, a number, boxes.
 Truth = Any
-Own = TypeVar("Own", bound="Task")
+TaskType = TypeVar("TaskType", bound="Task")
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """One prediction of a model about a picture.
+    """One prediction of a model about an image.
 
     Attributes:
         label: in words.
-        index: its number among the model's classes; None where there are no classes.
-        probability: in [0, 1]; None where the model gives none.
+        index: of the class; None if there are no classes.
+        probability: in [0, 1]; None if the model gives none.
     """
 
     label: str
@@ -49,26 +48,25 @@ class Prediction:
 
     @property
     def is_out_of_view(self) -> bool:
-        """Whether nothing of what is judged can be seen in the picture."""
+        """Whether nothing of the evaluated object is visible in the image."""
         return self.label == OUT_OF_VIEW
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a task says of a model's output for one picture.
+    """The evaluation of a model's output for one image.
 
     Attributes:
-        score: over 0 where it is a success, which is what is sought. NaN is none.
-        margin: the task's loss with its sign turned, whatever is sought: below 0
-            exactly where the prediction is not right.
+        score: over 0 if the output is a success of the search. NaN is no success.
+        margin: the task's loss with its sign reversed, whatever is sought: below 0
+            exactly if the prediction is not right.
         right: whether the prediction is right. NaN is not right.
-        prediction: what the model says.
-        payload: what else is kept of it in the run's rows, as JSON values (boxes,
-            masks); None where there is nothing.
-        objective: what a search maximises, of this picture; None where nothing is
-            searched.
-        metrics: numbers that the run's metrics say of this picture, by name, or None in
-            the place of one that is none; None where there are no metrics.
+        prediction: of the model.
+        payload: what else is stored in the run's rows, as JSON values (boxes, masks);
+            None if there is nothing.
+        objective: what the search maximises for this image; None without a search.
+        metrics: values of the run's metrics for this image by name, None for one that is
+            not a number; None if there are no metrics.
     """
 
     score: float
@@ -87,50 +85,42 @@ class Judgement:
         prediction: Prediction,
         payload: JsonValue = None,
     ) -> Judgement:
-        """Return the judgement of an output; where its margin is NaN or infinite, that
-        it is not a number.
-        """
+        """Create the judgement of an output; `NOT_A_NUMBER` if its margin is not finite."""
         if not math.isfinite(margin):
-            return cls(
-                math.nan, math.nan, right=False, prediction=Prediction(NOT_A_NUMBER)
-            )
+            not_a_number = Prediction(NOT_A_NUMBER)
+            return cls(math.nan, math.nan, right=False, prediction=not_a_number)
         return cls(score, margin, margin >= 0.0, prediction, payload)
 
     @property
     def success(self) -> bool:
-        """Whether the output is what is sought."""
+        """Whether the output is a success of the search."""
         return self.score > 0.0
 
     @property
     def outcome(self) -> Outcome | None:
-        """What becomes of the object; None where the task does not say it."""
+        """What becomes of the object; None if the task does not state it."""
         return get_outcome(self.payload)
 
     @property
     def not_a_number(self) -> bool:
-        """Whether the model returned NaN or infinity, which is neither right nor a
-        success.
-        """
+        """Whether the model returned NaN or infinity, neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
 
 
-# what a model says of a picture, and what else is kept of it
+# The prediction about an image, and its payload: what else is stored of it.
 Said = tuple[Prediction, JsonValue]
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What a picture shows of a prediction, or of what is true: a box, or the pixels of
-    a mask.
+    """A box, a mask or a map to draw on an image, of a prediction or of the truth.
 
     Attributes:
-        text: that stands beside it.
-        true: whether it is what is true of the scene; otherwise it is what the model
-            says.
-        box: x0, y0, x1, y1 in pixels of the picture, from the top left.
-        mask: (h, w) bool over the whole picture, of any size.
-        map: (h, w) numbers over the whole picture, which are shown beside it, larger
-            ones lighter.
+        text: the label next to it.
+        true: whether it shows the ground truth; otherwise it shows the prediction.
+        box: x0, y0, x1, y1 in pixels of the image, from the top left.
+        mask: (h, w) bool over the full image, of any size.
+        map: (h, w) values over the full image, drawn next to it, larger ones lighter.
     """
 
     text: str
@@ -142,15 +132,14 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the camera sees first through the middle of each pixel of a picture, without
-    noise.
+    """What the camera sees first through the center of each pixel, without noise.
 
     Attributes:
         mask: (H, W) bool, where it is the object.
-        depth: (H, W) float, how far it is, see `Facts.depth`.
+        depth: (H, W) float, its distance, see `Facts.depth`.
         z_depth: (H, W) float, see `Facts.z_depth`.
-        metres: of the object's longest side; None where they are not known, and
-            distances are in object sizes.
+        metres: of the object's longest side; None if it is unknown, and distances are
+            in object sizes.
     """
 
     mask: Tensor
@@ -161,21 +150,21 @@ class Sight:
 
 @dataclass(frozen=True)
 class Facts:
-    """What a scene gives a task to judge by, in one configuration.
+    """The ground truth of a scene in one configuration, from which a task takes its own.
 
     Attributes:
-        object: what it is called, for messages.
-        label: what was said to be right (the setting `label`); None if nothing was.
-        own_label: what the object says it is; None if it does not.
-        describe: the numbers of the configuration by parameter ("pose.yaw"), in the
-            units that rows have.
-        look: says what is seen in the picture, see `mask` and `depth`; None where no
-            configuration is meant.
-        each: the facts of each thing that is judged, by name, the object first; empty
-            where it is one thing alone.
-        others: the facts of every other thing in the scene, the object included where a
-            thing is judged.
-        views: the facts in the picture of each camera of a rig; empty of one camera.
+        object: its name, for messages.
+        label: the right label by the setting `label`; None without it.
+        own_label: the label that the object's file states; None if it states none.
+        describe: returns the values of the configuration by parameter ("pose.yaw"), in
+            the units that rows have.
+        look: computes what is visible in the image, see `mask` and `depth`; None if the
+            facts belong to no configuration.
+        each: the facts of each evaluated thing by name, the object first; empty if only
+            the object is evaluated.
+        others: the facts of every other thing in the scene, the object included if
+            another thing is evaluated.
+        views: the facts in the image of each camera of a rig; empty for a single camera.
     """
 
     object: str
@@ -190,8 +179,10 @@ class Facts:
 
     @cached_property
     def sight(self) -> Sight:
-        """What is seen of the configuration; the camera looks when this is asked for,
-        and once. Raises InputError for no configuration is meant.
+        """What is visible in the configuration, computed once, on first use.
+
+        Raises:
+            InputError: the facts belong to no configuration.
         """
         if self.look is None:
             raise InputError(
@@ -202,56 +193,53 @@ class Facts:
 
     @property
     def mask(self) -> Tensor:
-        """The pixels of the picture in which the object is the first thing that the
-        camera sees, (H, W) bool.
+        """The pixels in which the object is the first thing that the camera sees, (H, W) bool.
 
-        Each is asked for at its middle. Where something hides the object, it is not
-        seen; an image corruption leaves the mask as it is. Raises InputError: as for
-        `sight`.
+        A pixel is probed at its center. Where something occludes the object the mask is
+        false; an image corruption leaves it as it is. Raises InputError as `sight`.
         """
         return self.sight.mask.clone()
 
     @property
     def depth(self) -> Tensor:
-        """How far what is seen in each pixel is from the camera, along the ray, (H, W)
-        float32.
+        """The distance from the camera along the ray of each pixel, (H, W) float32.
 
-        In metres; in object sizes where the size of the object is not known. Infinite
-        where there is nothing but the environment. Asked for and unaffected as the mask
-        is. Raises InputError: as for `sight`.
+        In metres; in object sizes if the size of the object is unknown. Infinite where there
+        is only the environment. Probed as the mask is. Raises InputError as `sight`.
         """
         return self.sight.depth.clone()
 
     @property
     def z_depth(self) -> Tensor:
-        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a
-        depth camera gives. Raises InputError: as for `sight`.
+        """The component of `depth` along the camera's axis, (H, W) float32: what a depth camera
+        measures. Raises InputError as `sight`.
         """
         return self.sight.z_depth.clone()
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
-        """The smallest box round what is seen of the object: x0, y0, x1, y1 in pixels
+        """The smallest box around the visible part of the object: x0, y0, x1, y1 in pixels
         from the top left.
 
-        The pixels have x0 <= x < x1 and y0 <= y < y1. None where nothing is seen.
-        Raises InputError: as for `sight`.
+        Its pixels have x0 <= x < x1 and y0 <= y < y1. None if the object is out of view.
+        Raises InputError as `sight`.
         """
-        columns, rows = (
-            self.mask.any(dim=side).nonzero().flatten().tolist() for side in (0, 1)
-        )
-        return (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if rows else None
+        columns = self.mask.any(dim=0).nonzero().flatten().tolist()
+        rows = self.mask.any(dim=1).nonzero().flatten().tolist()
+        if not rows:
+            return None
+        return columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
 
     @cached_property
     def numbers(self) -> Mapping[str, float]:
-        """The numbers of the configuration: of everything that varies, and of what the
-        scene was given.
-        """
+        """The values of the configuration by parameter, both varied and fixed ones."""
         return MappingProxyType(dict(self.describe()))
 
     def number(self, name: str) -> float:
-        """Return the number that a parameter has in this configuration. Raises
-        InputError: nothing in the scene is called that.
+        """Return the value of a parameter in this configuration.
+
+        Raises:
+            InputError: the scene has no such parameter.
         """
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
@@ -264,30 +252,28 @@ class Facts:
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """How a model's output is judged against what is true of the scene. Write one by
-    the three abstract methods.
+    """Evaluate a model's output against the ground truth of the scene.
 
-    A task is a dataclass; its fields are its options, but for those marked `FROM_RUN`:
-    `on` gives the one that a run works with.
+    Define one by the three abstract methods. A task is a dataclass; its fields are its
+    options, except for those with the metadata `FROM_RUN`, which `on` sets for a run.
 
     Attributes:
-        minimise: success is a right prediction: the object is to be made easier to
+        minimise: a right prediction is sought: the object is to be made easier to
             recognise.
-        target: what is sought in place of any wrong prediction, as if it were the
-            truth; None for any.
+        target: what is sought instead of any wrong prediction, in the form of a truth;
+            None for any.
         name: on the command line.
-        objective: name of the objective where none is asked for; "score" is the task's
-            own score.
+        objective: name of the default objective; "score" is the task's own score.
         reads_logits: whether its models return logits (N, classes). Then their outputs
-            are checked as such, and the objectives of classification take them.
-        labelled: whether it takes a label; with one that takes none, others get it
-            (`together`).
+            are checked as such, and the objectives of classification accept them.
+        labelled: whether it takes a label. In a joint task, a label goes to the tasks
+            that take one.
         names_from: where its names come from, if neither from the model nor from the
             setting `labels`.
-        varies: whether the truth depends on the configuration; it is asked for at each
+        varies: whether the truth depends on the configuration; it is computed for each
             one then.
-        judges_rig: whether it judges the images of several cameras together.
-        needs_all_images: whether one output is made of all images of a rig.
+        judges_rig: whether it evaluates the images of several cameras together.
+        needs_all_images: whether a single output is made from all images of a rig.
     """
 
     name: ClassVar[str]
@@ -304,116 +290,131 @@ class Task(ABC):
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        asked = (
-            "loss score predictions payloads marks judge said average "
-            "after_calibration as_logits"
-        ).split()
-        hand_copies(cls, truth_names=slice(None), **dict.fromkeys(asked, slice(None)))
+        receive_copies: tuple[Callable[..., Any], ...] = (
+            Task.truth_names,
+            Task.loss,
+            Task.score,
+            Task.predictions,
+            Task.payloads,
+            Task.marks,
+            Task.judge,
+            Task.said,
+            Task.average,
+            Task.after_calibration,
+            Task.as_logits,
+        )
+        method_names = [method.__name__ for method in receive_copies]
+        hand_copies(cls, **dict.fromkeys(method_names, slice(None)))
 
     def check_numbers(
         self, fits: Callable[[float], bool], expected: str, *names: str
     ) -> None:
-        """Check options that are numbers. Raises InputError where one is none, or does
-        not fit; it says what was `expected`.
+        """Check options that are numbers.
+
+        Args:
+            fits: whether a value is in range.
+            expected: the range in words.
+            *names: of the options.
+
+        Raises:
+            InputError: a value is not a number, or does not fit.
         """
         for name in names:
             value: object = getattr(self, name)
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not fits(value)
-            ):
+            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not is_number or not fits(value):  # type: ignore[arg-type]
                 raise InputError(
                     f"task {self.name}: {name}: expected {expected}, got {value!r}"
                 )
 
-    # ---- what a task has to say
-    # -------------------------------------------------------------------------------------
+    # ---- a task must define ----
 
     @abstractmethod
     def truth(self, facts: Facts) -> Truth:
-        """Return what is true of the scene. Raises InputError: the facts do not say it,
-        or the model cannot predict it.
+        """Return the ground truth of the scene for this task.
+
+        Raises:
+            InputError: the facts do not contain it, or the model cannot predict it.
         """
 
     @abstractmethod
     def loss(self, output: Output, truth: Truth) -> Tensor:
-        """Return how wrong each of N outputs is, (N,): over 0 exactly where it is not
-        right; differentiable.
+        """Compute how wrong each of N outputs is, (N,); differentiable.
 
-        It is maximised where no other objective is asked for, so it should rise towards
-        a wrong prediction from afar.
+        It is over 0 exactly if the output is not right. It is maximised if no other objective
+        is chosen, so it should rise towards a wrong prediction from afar.
         """
 
     @abstractmethod
     def predictions(
         self, output: Output, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return what the model says of each of N pictures: at most `count`
-        predictions, the likeliest first.
-        """
+        """Return at most `count` predictions for each of N images, the likeliest first."""
 
-    # ---- what it may say
-    # --------------------------------------------------------------------------------------------
+    # ---- a task may define ----
 
     def read(self, returned: Any, count: int) -> Output:
-        """Return the output in what a network returned for `count` pictures.
+        """Read the output from what a network returned for `count` images.
 
-        Not called where the task `reads_logits`. What a network returns for each
-        picture is kept in this order. Raises ValueError: there is none; the text says
-        what was expected.
+        Not called if the task `reads_logits`. The order of the images is kept.
+
+        Raises:
+            ValueError: there is no such output; the message states what was expected.
         """
         if isinstance(returned, Tensor) and returned.shape[:1] == (count,):
             return returned.float()
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
     def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a network as it is called with pictures alone; its own, unless the
-        task gives it more.
+        """Return a network that takes images alone; it is the same one unless the task passes
+        further inputs to it.
         """
         return network
 
     @property
     def calibrates(self) -> bool:
-        """Whether the task is to be shown an output for a clean picture of the scene
-        (`after_calibration`) before it judges.
+        """Whether the task needs the output for a clean image of the scene before it judges
+        (`after_calibration`).
         """
         return False
 
-    def after_calibration(self: Own, output: Output, truth: Truth | None) -> Own:
-        """Return the task with what its model's output for a clean picture of the scene
-        shows of how outputs are read.
+    def after_calibration(
+        self: TaskType, output: Output, truth: Truth | None
+    ) -> TaskType:
+        """Return the task with what the output for a clean image of the scene shows.
 
         Args:
-            output: of one picture.
-            truth: of the scene; None where nobody knows it.
+            output: for one image.
+            truth: of the scene; None if it is unknown.
         """
         return self
 
     @property
     def ambiguities(self) -> str:
-        """What has to be said for its model's outputs to be read, as a message; empty
-        where nothing has.
-        """
+        """What the user must state for outputs to be readable, as a message; empty if nothing."""
         return ""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences that a reader has to know about how outputs are read."""
+        """What a reader has to know about how outputs are read, as sentences."""
         return ()
 
     @property
     def reader(self) -> Callable[[Any, int], Output] | None:
-        """What reads the outputs of its models; None where these are logits."""
+        """The function that reads the outputs of its models; None if these are logits."""
         return None if self.reads_logits else self.read
 
     def on(
-        self: Own, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> Own:
-        """Return the task for one model and what is sought.
+        self: TaskType,
+        model: Model,
+        *,
+        target: str | None = None,
+        minimise: bool = False,
+    ) -> TaskType:
+        """Return the task for one model, with what is sought.
 
         Args:
-            model: whose output it will judge.
+            model: whose output it will evaluate.
             target: the label that the model should predict; None for any wrong one.
             minimise: a right prediction is sought.
 
@@ -424,127 +425,136 @@ class Task(ABC):
             raise InputError(f"target: task {self.name} has none; leave it out")
         return replace(self, minimise=minimise)
 
-    def seeking(self: Own, objective: str) -> Own:
-        """Return the task where an objective of its own is maximised, which may say
-        what counts as success.
-        """
+    def seeking(self: TaskType, objective: str) -> TaskType:
+        """Return the task with one of its objectives, which may define what counts as success."""
         return self
 
     def check(self, facts: Facts) -> None:
-        """Refuse a scene of which nothing could be judged, before anything is rendered.
-        Raises InputError: as for `truth`.
+        """Reject a scene that cannot be evaluated, before anything is rendered.
+
+        Raises:
+            InputError: as for `truth`.
         """
         if not self.varies:
             self.truth(facts)
 
     def score(self, output: Output, truth: Truth) -> Tensor:
-        """Return (N,): over 0 exactly where an output is a success; differentiable."""
+        """Compute how near each output is to a success, (N,); differentiable.
+
+        It is over 0 exactly if the output is a success.
+        """
         if self.target is not None:
             return -self.loss(output, self.target)
         loss = self.loss(output, truth)
         return -loss if self.minimise else loss
 
     def as_logits(self, output: Output, truth: Truth) -> Output:
-        """Return the output as objectives of logits take it: without what is no
-        prediction.
+        """Return the output as objectives of logits take it, without classes that are no
+        predictions.
         """
         return output
 
     def payloads(self, output: Output) -> Sequence[Any]:
-        """Return what is kept of each of N outputs beside the words, as JSON values."""
+        """Return what is stored of each of N outputs beyond its label, as JSON values."""
         return [None] * len(output)
 
     def marks(self, output: Output, truth: Truth) -> list[list[Mark]]:
-        """Return what is drawn into each of N pictures to show the prediction; empty
-        where words say it all.
+        """Return what to draw on each of N images to show the prediction; empty if its label
+        says it all.
         """
         return [[] for _ in range(len(output))]
 
     def average(self, outputs: Sequence[Output]) -> Output:
-        """Return one output for several pictures of a configuration; each is of one
-        picture, as is the result.
+        """Average the outputs of several images of a configuration.
+
+        Args:
+            outputs: each of one image.
+
+        Returns:
+            The output of one image.
         """
         return torch.stack(list(outputs)).mean(dim=0)
 
     @property
     def of_one_image(self) -> Task:
-        """The task of a single image: of a rig of cameras that of each of its images,
+        """The task of a single image: for a rig of cameras that of each of its images,
         otherwise the task itself.
         """
         return self
 
     @property
     def title(self) -> str:
-        """What the task is called in results."""
+        """The name of the task in results."""
         return self.name
 
     @property
     def goal(self) -> str:
         """What counts as success, in words."""
-        return (
-            "a target answer"
-            if self.target is not None
-            else "a right answer"
-            if self.minimise
-            else "a wrong answer"
-        )
+        if self.target is not None:
+            return "a target answer"
+        return "a right answer" if self.minimise else "a wrong answer"
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        """The labels that are sought; empty where any wrong one is."""
+        """The labels that are sought; empty if any wrong one is."""
         return () if self.target is None else self.truth_names(self.target)
 
     def truth_names(self, truth: Truth) -> tuple[str, ...]:
         """Return the right labels in words."""
         return (str(truth),)
 
-    # ---- the judgement
-    # ----------------------------------------------------------------------------------------------
+    # ---- judgement ----
 
     def judge(self, output: Output, truth: Truth) -> list[Judgement]:
-        """Return what is to be said of each of N outputs."""
+        """Evaluate each of N outputs."""
         with torch.no_grad():
             scores = self.score(output, truth).tolist()
             margins = (0.0 - self.loss(output, truth)).tolist()
-            each = zip(scores, margins, self.said(output, truth, margins), strict=True)
-            return [Judgement.of(score, margin, *said) for score, margin, said in each]
+            described = self.said(output, truth, margins)
+            return [
+                Judgement.of(score, margin, prediction, payload)
+                for score, margin, (prediction, payload) in zip(
+                    scores, margins, described, strict=True
+                )
+            ]
 
     def said(
         self, output: Output, truth: Truth, margins: Sequence[float]
     ) -> list[Said]:
-        """Return the prediction of each of N pictures, and what is kept beside it;
-        `margins` are theirs.
+        """Return the prediction about each of N images and its payload.
+
+        `margins` are those of the N judgements.
         """
-        return [
-            (first, kept)
-            for (first, *_), kept in zip(
-                self.predictions(output), self.payloads(output), strict=True
-            )
-        ]
+        first_predictions = [predictions[0] for predictions in self.predictions(output)]
+        return list(zip(first_predictions, self.payloads(output), strict=True))
 
 
 def typical(judgements: Sequence[Judgement]) -> Judgement:
-    """Return what the model usually says: the most frequent prediction (the lowest
-    index of equals), with the mean score, margin and probability of the judgements that
-    have it.
+    """Return the most frequent prediction of at least one judgement, as a judgement.
+
+    Of equally frequent ones it is that with the lowest class index. Score, margin and
+    probability are the means of the judgements with this prediction.
     """
-    counts = Counter((one.prediction.label, one.prediction.index) for one in judgements)
+    key_of_judgement = [(x.prediction.label, x.prediction.index) for x in judgements]
+    counts = Counter(key_of_judgement)
     label, index = min(counts, key=lambda key: (-counts[key], key[1] or 0))
-    chosen = [
-        one
-        for one in judgements
-        if (one.prediction.label, one.prediction.index) == (label, index)
+    matching = [
+        judgement
+        for judgement, key in zip(judgements, key_of_judgement, strict=True)
+        if key == (label, index)
     ]
-    sure = [
-        one.prediction.probability
-        for one in chosen
-        if one.prediction.probability is not None
+    probabilities = [
+        judgement.prediction.probability
+        for judgement in matching
+        if judgement.prediction.probability is not None
     ]
-    prediction = Prediction(label, index, mean(sure) if sure else None)
-    margins = [one.margin for one in chosen]
-    scores = [one.score for one in chosen]
+    probability = mean(probabilities) if probabilities else None
     return Judgement(
-        mean(scores), mean(margins), chosen[0].right, prediction, chosen[0].payload
+        mean([judgement.score for judgement in matching]),
+        mean([judgement.margin for judgement in matching]),
+        matching[0].right,
+        Prediction(label, index, probability),
+        matching[0].payload,
     )
 
 

@@ -1,6 +1,4 @@
-"""Boxes round what a detector sees, x0, y0, x1, y1 from the top left: how far two
-overlap, and how they are read.
-"""
+"""Compute with boxes (x0, y0, x1, y1 from the top left): overlap, suppression, formats."""
 
 from __future__ import annotations
 
@@ -12,48 +10,55 @@ from torch import Tensor
 
 Labels = tuple[int, ...]
 Box = tuple[float, float, float, float]
-# what is found in a picture, see `advsearch.tasks.detector_outputs`
+# The detections of one image, see `advsearch.tasks.detector_outputs`.
 Detections = Mapping[str, Tensor]
 
 FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
-"""How a box may be given: corners; a corner or the middle with width and height;
-corners with y first.
+"""Formats of a box: two corners; the first corner, or the center, with width and
+height; two corners with y first.
 """
 
-# scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8
+# Probabilities are clamped to [SMALLEST, 1 - SMALLEST], that is to log-odds of 13.8.
 SMALLEST = 1e-6
 LEAST_OVERLAP = 0.1
-"""Least intersection over union of a box that is on the object at all (TIDE's threshold
-of the background).
+"""Minimum intersection over union of a box that is on the object at all (TIDE's
+threshold of the background).
 """
 
-AMONG = 500  # among how many of the best scores boxes are looked for
+AMONG = 500  # how many of the best scores are considered for the list of boxes
 
 MOST = 2000
-"""Most boxes of a class that are looked at in suppression, the best ones: a network
-that has learnt has fewer.
+"""Maximum number of boxes of a class that take part in suppression, the best ones: a
+trained network has fewer.
 """
 
 
 def overlap(boxes: Tensor, box: Tensor) -> Tensor:
-    """Return intersection over union of boxes (D, 4) with one box (4,), (D,) in [0, 1];
-    differentiable.
+    """Compute the intersection over union of boxes with one box; differentiable.
+
+    Args:
+        boxes: (D, 4).
+        box: (4,), or any shape that broadcasts.
+
+    Returns:
+        (D,) in [0, 1].
     """
-    common = _common(boxes, box)
-    return common / (_area(boxes) + _area(box) - common).clamp_min(1e-12)
+    intersection = _intersection_area(boxes, box)
+    union = _area(boxes) + _area(box) - intersection
+    return intersection / union.clamp_min(1e-12)
 
 
 def share_inside(boxes: Tensor, box: Tensor) -> Tensor:
-    """Return how much of each of boxes (D, 4) lies in one box (4,), (D,) in [0, 1];
-    differentiable.
+    """Compute the fraction of each box (D, 4) that lies in one box (4,), (D,) in
+    [0, 1]; differentiable.
     """
-    return _common(boxes, box) / _area(boxes).clamp_min(1e-12)
+    return _intersection_area(boxes, box) / _area(boxes).clamp_min(1e-12)
 
 
-def _common(boxes: Tensor, box: Tensor) -> Tensor:
-    low = torch.maximum(boxes[..., :2], box[..., :2])
-    high = torch.minimum(boxes[..., 2:], box[..., 2:])
-    return (high - low).clamp_min(0.0).prod(dim=-1)
+def _intersection_area(boxes: Tensor, box: Tensor) -> Tensor:
+    lower = torch.maximum(boxes[..., :2], box[..., :2])
+    upper = torch.minimum(boxes[..., 2:], box[..., 2:])
+    return (upper - lower).clamp_min(0.0).prod(dim=-1)
 
 
 def _area(boxes: Tensor) -> Tensor:
@@ -61,45 +66,60 @@ def _area(boxes: Tensor) -> Tensor:
 
 
 def corners(boxes: Tensor, form: str) -> Tensor:
-    """Return boxes (..., 4) of one of `FORMS` as x0, y0, x1, y1; differentiable."""
+    """Convert boxes (..., 4) of one of `FORMS` to x0, y0, x1, y1; differentiable."""
     if form == "yxyx":
         return boxes[..., [1, 0, 3, 2]]
     if form == "xyxy":
         return boxes
-    start = boxes[..., :2]
+    anchor = boxes[..., :2]
     size = boxes[..., 2:]
-    low = start - size / 2.0 if form == "cxcywh" else start
-    return torch.cat([low, low + size], dim=-1)
+    top_left = anchor - size / 2.0 if form == "cxcywh" else anchor
+    return torch.cat([top_left, top_left + size], dim=-1)
 
 
 def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
-    """Return which of boxes (D, 4) of one class, with scores (D,), are left when of
-    those that overlap (by an intersection over union of `iou`) only the best one is
-    kept (greedy suppression), (D,) bool; of those beyond the best `MOST`, none is.
+    """Apply greedy non-maximum suppression to the boxes of one class.
 
-    Each round keeps the boxes that no better one overlaps which may still be left, and
+    Each round keeps the undecided boxes that no better undecided box overlaps, and
     removes those that they overlap.
+
+    Args:
+        boxes: (D, 4).
+        scores: (D,).
+        iou: intersection over union from which a better box suppresses another.
+
+    Returns:
+        Which boxes survive, (D,) bool; none of those beyond the best `MOST` does.
     """
     order = scores.argsort(descending=True)[:MOST]
-    best = boxes[order]
-    parts = [overlap(best, some[:, None]) >= iou for some in best.split(256)]
-    over = torch.cat(parts).tril(-1)  # whether box j, which is better, overlaps box i
-    undecided = torch.ones(len(best), dtype=torch.bool, device=boxes.device)
-    kept = ~undecided
+    sorted_boxes = boxes[order]
+    overlap_chunks = [
+        overlap(sorted_boxes, chunk[:, None]) >= iou
+        for chunk in sorted_boxes.split(256)
+    ]
+    # Row i, column j: whether box j, which is better, overlaps box i.
+    is_overlapped = torch.cat(overlap_chunks).tril(-1)
+    undecided = torch.ones(len(sorted_boxes), dtype=torch.bool, device=boxes.device)
+    survives = ~undecided
     while bool(undecided.any()):
-        kept = kept | (undecided & ~(over & undecided).any(dim=1))
-        undecided = undecided & ~kept & ~(over & kept).any(dim=1)
-    left = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
-    left[order] = kept
-    return left
+        survives = survives | (undecided & ~(is_overlapped & undecided).any(dim=1))
+        is_suppressed = (is_overlapped & survives).any(dim=1)
+        undecided = undecided & ~survives & ~is_suppressed
+    result = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
+    result[order] = survives
+    return result
 
 
 @dataclass(frozen=True)
 class Place:
-    """What is to be found in a picture, the truth of detection: indices of the right
-    classes, and the smallest box round what is seen of the object, x0, y0, x1, y1 in
-    pixels, or None. Size: (height, width) of the picture in pixels. And the boxes round
-    what is seen of other things with one of these classes.
+    """What a detector has to find in an image: the truth of detection.
+
+    Attributes:
+        labels: indices of the right classes.
+        box: the smallest box around the visible part of the object, x0, y0, x1, y1 in
+            pixels; None if it is out of view.
+        size: (height, width) of the image in pixels.
+        others: boxes around the visible parts of other things of these classes.
     """
 
     labels: Labels
@@ -109,140 +129,168 @@ class Place:
 
     @property
     def shares(self) -> Tensor | None:
-        """The box as shares of width and height, (4,)."""
+        """The box as fractions of the image's width and height, (4,)."""
         return None if self.box is None else self.fractions_of(self.box)
 
     def fractions_of(self, box: tuple[int, int, int, int]) -> Tensor:
-        """Return a box in pixels as fractions of width and height, (4,)."""
+        """Convert a box in pixels to fractions of width and height, (4,)."""
         height, width = self.size
         return torch.tensor(box) / torch.tensor([width, height, width, height])
 
 
-def overlap_with(one: Detections, truth: Place) -> Tensor:
-    """Return intersection over union with the true box, which there is, (D,)."""
+def overlap_with(detections: Detections, truth: Place) -> Tensor:
+    """Compute the intersection over union with the true box, which must exist, (D,)."""
     assert truth.shares is not None
-    return overlap(one["boxes"], truth.shares.to(one["boxes"]))
+    boxes = detections["boxes"]
+    return overlap(boxes, truth.shares.to(boxes))
 
 
-def suppressed(one: Detections, least: float, iou: float) -> Detections:
-    """Return what suppression leaves of boxes with a score of every class: the score of
-    one that it removes is 0. What has a score under `least` counts for nobody and is
-    left alone. The choice has no derivative; what is left has. Boxes that come with
-    their labels are left as they are, and so are all where `iou` is 1.
+def suppressed(detections: Detections, least: float, iou: float) -> Detections:
+    """Set the scores of suppressed boxes to 0, class by class.
+
+    The choice of boxes has no derivative; the scores that remain have. Boxes that come
+    with labels stay as they are.
+
+    Args:
+        detections: of one image, with a score of every class.
+        least: minimum score of a box that takes part.
+        iou: intersection over union from which boxes are duplicates; 1 disables
+            suppression.
     """
-    if "labels" in one or iou == 1.0 or not len(one["boxes"]):
-        return one
-    scores = one["scores"].detach()
-    boxes = one["boxes"].detach()
+    if "labels" in detections or iou == 1.0 or not len(detections["boxes"]):
+        return detections
+    scores = detections["scores"].detach()
+    boxes = detections["boxes"].detach()
     rows, classes = (scores >= least).nonzero(as_tuple=True)
-    removed = torch.zeros_like(scores, dtype=torch.bool)
+    is_suppressed = torch.zeros_like(scores, dtype=torch.bool)
     for label in classes.unique().tolist():
-        mine = rows[classes == label]
-        if len(mine) > 1:
-            removed[mine, label] = ~left_over(boxes[mine], scores[mine, label], iou)
-    return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
+        class_rows = rows[classes == label]
+        if len(class_rows) > 1:
+            survives = left_over(boxes[class_rows], scores[class_rows, label], iou)
+            is_suppressed[class_rows, label] = ~survives
+    remaining_scores = torch.where(is_suppressed, 0.0, detections["scores"])
+    return {**detections, "scores": remaining_scores}
 
 
 def listed(
-    one: Detections, count: int, least: float, iou: float
+    detections: Detections, count: int, least: float, iou: float
 ) -> list[tuple[Box, int, float]]:
-    """Return the best boxes, of a class and a place one: shares of width and height,
-    class, score.
+    """List the best boxes of an image after suppression, by falling score.
+
+    Args:
+        detections: of one image, boxes in fractions of width and height.
+        count: maximum number of boxes.
+        least: minimum score.
+        iou: intersection over union from which boxes of a class are duplicates.
+
+    Returns:
+        Tuples of box, class and score.
     """
-    boxes = one["boxes"].detach()
-    scores = one["scores"].detach()
-    best, places = scores.flatten().topk(min(AMONG, scores.numel()))
-    each = 1 if "labels" in one else scores.shape[1]
-    rows = places // each
-    classes = one["labels"][rows] if "labels" in one else places % each
-    found: list[tuple[Box, int, float]] = []
-    for label in classes[best >= least].unique().tolist():
-        mine = ((classes == label) & (best >= least)).nonzero().flatten()
-        # the best are first
-        for place in mine[left_over(boxes[rows[mine]], best[mine], iou)][
-            :count
-        ].tolist():
-            x0, y0, x1, y1 = boxes[rows[place]].tolist()
-            found.append(((x0, y0, x1, y1), label, float(best[place])))
-    return sorted(found, key=lambda row: -row[2])[:count]
+    rows, classes, scores = _top_scores(detections)
+    boxes = detections["boxes"].detach()[rows]
+    results: list[tuple[Box, int, float]] = []
+    for label in classes[scores >= least].unique().tolist():
+        is_candidate = (classes == label) & (scores >= least)
+        candidates = is_candidate.nonzero().flatten()
+        survives = left_over(boxes[candidates], scores[candidates], iou)
+        # The scores are sorted, so the first are the best.
+        for index in candidates[survives][:count].tolist():
+            x0, y0, x1, y1 = boxes[index].tolist()
+            results.append(((x0, y0, x1, y1), label, float(scores[index])))
+    return sorted(results, key=lambda result: -result[2])[:count]
 
 
-def log_odds(shares: Tensor) -> Tensor:
-    """Return log(p / (1 - p)), with what lies outside [0, 1] taken for its end."""
-    inside = shares.clamp(SMALLEST, 1.0 - SMALLEST)
-    return inside.log() - torch.log1p(-inside)
+def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the row, class and score (K,) each of the best scores, falling."""
+    scores = detections["scores"].detach()
+    top_scores, flat_index = scores.flatten().topk(min(AMONG, scores.numel()))
+    if "labels" in detections:
+        return flat_index, detections["labels"][flat_index], top_scores
+    n_classes = scores.shape[1]
+    return flat_index // n_classes, flat_index % n_classes, top_scores
+
+
+def log_odds(probabilities: Tensor) -> Tensor:
+    """Compute log(p / (1 - p)), with p clamped to [SMALLEST, 1 - SMALLEST]."""
+    clamped = probabilities.clamp(SMALLEST, 1.0 - SMALLEST)
+    return clamped.log() - torch.log1p(-clamped)
 
 
 def best_of(values: Tensor, among: Tensor | None = None) -> Tensor:
-    """Return the largest of values (D,), or of those where `among` is true; 0 where
+    """Return the largest of values (D,), or of those where `among` (D,) is true; 0 if
     there are none.
     """
-    chosen = values if among is None else torch.where(among, values, 0.0)
-    return torch.cat([chosen, chosen.new_zeros(1)]).amax()
+    candidates = values if among is None else torch.where(among, values, 0.0)
+    return torch.cat([candidates, candidates.new_zeros(1)]).amax()
 
 
-# ---- how they are read
-# -----------------------------------------------------------------------------------------------
+# ---- formats ----
 
 
 def nowhere(boxes: Tensor) -> Tensor:
-    """Whether boxes (D, 4) of any form are none: four times the same number, or one
-    that is not finite, (D,) bool.
+    """Whether boxes (D, 4) of any format are invalid, (D,) bool: four equal numbers, or one
+    that is not finite.
     """
     return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
 
 
-def counted(one: Detections) -> Tensor:
-    """Rows that say something: a box, and a number over 0 beside it, (D,) bool."""
-    return ~nowhere(one["boxes"]) & (numbers_of(one) > 0.0).any(dim=1)
+def counted(detections: Detections) -> Tensor:
+    """Which rows count, (D,) bool: they have a valid box and a number over 0 with it."""
+    has_number = (numbers_of(detections) > 0.0).any(dim=1)
+    return ~nowhere(detections["boxes"]) & has_number
 
 
-def numbers_of(one: Detections) -> Tensor:
-    """The numbers of each box that are scores, or may be, without derivatives, (D,
-    K).
-    """
-    beside = (one["either"] if "either" in one else one["scores"]).detach()
-    return beside if beside.ndim == 2 else beside[:, None]
+def numbers_of(detections: Detections) -> Tensor:
+    """Return the numbers of each box that are scores, or may be, detached, (D, K)."""
+    if "either" in detections:
+        values = detections["either"].detach()
+    else:
+        values = detections["scores"].detach()
+    return values if values.ndim == 2 else values[:, None]
 
 
 def as_option(options: str) -> str:
-    """Return what says options of detection, as messages name settings."""
+    """Return options of detection as messages name settings."""
     return f"`task='detection={{{options}}}'`"
 
 
 UNITS = ("fractions", "pixels")
 
 KNOWN = "boxes_are_corners_in_pixels"
-"""The attribute of a network that says so of its boxes, which are then not guessed from
-what they look like.
+"""Attribute by which a network declares the format of its boxes, which is not inferred
+then.
 """
 
-# the best boxes of a picture that are looked at: what has no score says nothing
+# How many of the best boxes of an image the format is inferred from.
 LOOKED_AT = 100
 
 FRACTION = 1.5
 PIXEL = 4.0
-"""The largest number of a box, in the median: up to the first these are fractions of
-the picture, from the second on pixels.
+"""Limits of the median of the boxes' largest coordinates: up to the first these are
+fractions of the image, from the second on pixels.
 """
 
-# how far outside the picture the middle of a box may lie, in sides of the picture
+# How far outside the image a box's center may lie, as a fraction of its width or height.
 BEYOND = 0.25
 
 ODD = 0.5
 USUAL = 0.8
-"""Share of boxes that are as boxes are: a reading with less is doubted, one with more
-is named in its place.
+"""Fractions of plausible boxes: a format with less than the first is doubted, one with
+at least the second is suggested instead.
 """
 
-# how much more a box has to overlap the object in another reading for that to be named
+# By how much the best overlap with the object must grow for a format to be suggested.
 NEARER = 0.1
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How boxes are read: in one of `FORMS`, one of `UNITS`, and for a model's input of
-    a size (height, width) in pixels.
+    """How the four numbers of a box are read.
+
+    Attributes:
+        form: one of `FORMS`.
+        unit: one of `UNITS`.
+        size: of the model's input, (height, width) in pixels.
     """
 
     form: str
@@ -250,119 +298,121 @@ class Reading:
     size: tuple[int, int]
 
     def fractions(self, boxes: Tensor) -> Tensor:
-        """Return boxes (D, 4) as corners in shares of width and height;
+        """Convert boxes (D, 4) to corners in fractions of width and height;
         differentiable.
         """
         height, width = self.size if self.unit == "pixels" else (1, 1)
         return corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
 
     def faults(self, boxes: Tensor) -> dict[str, Tensor]:
-        """Return what is odd about which of boxes (D, 4) in this reading, (D,) bool
-        each.
-        """
-        read = self.fractions(boxes)
-        (height, width) = self.size
-        middle = (read[:, :2] + read[:, 2:]) / 2.0
-        sides = read[:, 2:] - read[:, :2]
+        """Find which of boxes (D, 4) are implausible in this format, (D,) bool by fault."""
+        fractions = self.fractions(boxes)
+        height, width = self.size
+        center = (fractions[:, :2] + fractions[:, 2:]) / 2.0
+        box_size = fractions[:, 2:] - fractions[:, :2]
+        is_near_image = (center >= -BEYOND) & (center <= 1.0 + BEYOND)
+        size_in_pixels = box_size.abs() * box_size.new_tensor([width, height])
         return {
-            "lie far outside the picture": ~(
-                (middle >= -BEYOND) & (middle <= 1.0 + BEYOND)
-            ).all(dim=1),
+            "lie far outside the picture": ~is_near_image.all(dim=1),
             "have a right edge left of the left one, or a bottom above the top": ~(
-                sides > 0.0
+                box_size > 0.0
             ).all(dim=1),
-            "are smaller than a pixel": ~(
-                sides.abs() * sides.new_tensor([width, height]) > 1.0
-            ).any(dim=1),
+            "are smaller than a pixel": ~(size_in_pixels > 1.0).any(dim=1),
         }
 
     def usual(self, boxes: Tensor) -> float:
-        """Return the share of boxes (D, 4), D at least 1, about which nothing is
-        odd.
-        """
-        return float(
-            (~torch.stack([*self.faults(boxes).values()])).all(dim=0).float().mean()
-        )
+        """Compute the fraction of boxes (D, 4), D at least 1, that are plausible."""
+        has_fault = torch.stack([*self.faults(boxes).values()])
+        return float((~has_fault).all(dim=0).float().mean())
 
     def fault(self, boxes: Tensor) -> str:
-        """Return what is odd about most boxes (D, 4) in this reading; empty if nothing
-        is.
-        """
+        """Describe what is implausible about boxes (D, 4); empty if most are plausible."""
         if not len(boxes) or self.usual(boxes) >= ODD:
             return ""
-        shares = {
-            fault: 1.0 - float((~odd).float().mean())
-            for fault, odd in self.faults(boxes).items()
+        fraction_by_fault = {
+            fault: 1.0 - float((~is_faulty).float().mean())
+            for fault, is_faulty in self.faults(boxes).items()
         }
-        worst = max(shares, key=shares.__getitem__)
-        return f"{100.0 * shares[worst]:.0f} % of them {worst}"
+        worst = max(fraction_by_fault, key=fraction_by_fault.__getitem__)
+        return f"{100.0 * fraction_by_fault[worst]:.0f} % of them {worst}"
 
     def instead(self, boxes: Tensor) -> str:
-        """Return which other readings would be usual ones: those that differ least in
-        what is said.
+        """Suggest the formats in which boxes (D, 4) are plausible; empty if there is none.
+
+        Of several, those that differ least from this one.
         """
-        others = [
+        alternatives = [
             Reading(form, unit, self.size) for unit in UNITS for form in FORMS[:3]
         ]
-        fitting = [self.change_to(one) for one in others if one.usual(boxes) >= USUAL]
-        nearest = [
-            one
-            for one in fitting
-            if one.count(":") == min(two.count(":") for two in fitting)
+        changes = [
+            self.change_to(alternative)
+            for alternative in alternatives
+            if alternative.usual(boxes) >= USUAL
         ]
-        return f"; {' or '.join(nearest)} would mend that" if nearest else ""
+        if not changes:
+            return ""
+        # A change has one colon per option that differs.
+        min_options = min(change.count(":") for change in changes)
+        smallest_changes = [
+            change for change in changes if change.count(":") == min_options
+        ]
+        return f"; {' or '.join(smallest_changes)} would mend that"
 
     def change_to(self, other: Reading) -> str:
-        """Return what says another reading in place of this one, such as ``boxes:
-        xywh``.
-        """
-        said = [("boxes", self.form, other.form), ("unit", self.unit, other.unit)]
-        return as_option(
-            ", ".join(f"{name}: {new}" for name, old, new in said if old != new)
-        )
+        """Return the options that select another format, such as ``boxes: xywh``."""
+        options = []
+        if other.form != self.form:
+            options.append(f"boxes: {other.form}")
+        if other.unit != self.unit:
+            options.append(f"unit: {other.unit}")
+        return as_option(", ".join(options))
 
     def better(self, boxes: Tensor, true: Tensor, least: float) -> str:
-        """Return what says the reading in which one of boxes (D, 4), those with the
-        right name, overlaps the true box (4,), in shares of width and height, `NEARER`
-        than in this one, and at `least` so.
+        """Suggest the format in which a box fits the true box much better; empty if none.
+
+        Args:
+            boxes: (D, 4), with a right class.
+            true: the true box (4,) in fractions of width and height.
+            least: minimum intersection over union in the suggested format, which must
+                exceed that in this one by `NEARER` too.
         """
         if not len(boxes):
             return ""
-        every = [
-            self,
-            *(Reading(form, unit, self.size) for unit in UNITS for form in FORMS),
+        candidates = [self]
+        candidates += [
+            Reading(form, unit, self.size) for unit in UNITS for form in FORMS
         ]
-        overlaps = {
-            one: float(overlap(one.fractions(boxes), true).max()) for one in every
+        best_overlap = {
+            candidate: float(overlap(candidate.fractions(boxes), true).max())
+            for candidate in candidates
         }
-        best = max(overlaps, key=overlaps.__getitem__)
-        return (
-            self.change_to(best)
-            if overlaps[best] >= max(least, overlaps[self] + NEARER)
-            else ""
-        )
+        best = max(best_overlap, key=best_overlap.__getitem__)
+        if best_overlap[best] >= max(least, best_overlap[self] + NEARER):
+            return self.change_to(best)
+        return ""
 
 
-def strongest_boxes(found: Sequence[Detections]) -> Tensor:
-    """Return the boxes with the best scores of each picture, as they came, without what
-    says nothing, (D, 4).
+def strongest_boxes(images: Sequence[Detections]) -> Tensor:
+    """Return the boxes with the best scores of each image, as they came, (D, 4).
+
+    Rows that do not count are left out, see `counted`.
     """
-    kept = []
-    for one in found:
-        rows = counted(one).nonzero().flatten()
-        numbers = numbers_of(one)
-        best = numbers.amax(dim=1) if numbers.shape[1] else numbers.sum(dim=1)
-        kept.append(
-            one["boxes"].detach()[rows[best[rows].argsort(descending=True)[:LOOKED_AT]]]
-        )
-    return torch.cat(kept) if kept else torch.zeros(0, 4)
+    boxes_of_images = []
+    for detections in images:
+        rows = counted(detections).nonzero().flatten()
+        numbers = numbers_of(detections)
+        # A box without numbers has a score of 0.
+        score = numbers.amax(dim=1) if numbers.shape[1] else numbers.sum(dim=1)
+        best_rows = rows[score[rows].argsort(descending=True)[:LOOKED_AT]]
+        boxes_of_images.append(detections["boxes"].detach()[best_rows])
+    return torch.cat(boxes_of_images) if boxes_of_images else torch.zeros(0, 4)
 
 
 def unit_in(boxes: Tensor) -> str:
-    """Return which of `UNITS` boxes (D, 4) of any form are in; "" if they leave it
-    open.
-    """
+    """Infer which of `UNITS` boxes (D, 4) of any format have; "" if it is open."""
     if not len(boxes):
         return ""
     largest = float(boxes.abs().amax(dim=1).median())
-    return "fractions" if largest <= FRACTION else "pixels" if largest >= PIXEL else ""
+    if largest <= FRACTION:
+        return "fractions"
+    return "pixels" if largest >= PIXEL else ""

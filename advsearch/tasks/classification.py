@@ -1,7 +1,6 @@
-"""Tasks whose models know classes by number, and the plainest of them: which class a
-picture is of.
+"""Judge classification, and define the base of tasks whose models know classes by index.
 
-Names of classes, softmax, argmax and the lead of a prediction stand here.
+Names of classes, softmax, argmax and leads of logits are defined here.
 """
 
 from __future__ import annotations
@@ -22,21 +21,23 @@ from advsearch.options import FROM_RUN, NOT_A_NUMBER
 from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
 Labels = tuple[int, ...]
-Own = TypeVar("Own", bound="ClassTask")
+ClassTaskType = TypeVar("ClassTaskType", bound="ClassTask")
 
-NO = "no "  # how a prediction says that the object is not found
+NO = "no "  # prefix of the label of an object that is not found
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """A task whose model knows classes by number. Raises InputError: there is a target
-    to minimise.
+    """A task whose model knows classes by index.
+
+    Raises:
+        InputError: there is a target to minimise.
     """
 
-    # one name per class, or a placeholder
+    # One name per class, or a placeholder.
     labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
     named: bool = field(default=True, metadata=FROM_RUN)
-    # where there are some, only these are a success
+    # If there are targets, only these are a success.
     target: Labels | None = field(default=None, metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
@@ -46,61 +47,73 @@ class ClassTask(Task):
             )
 
     def on(
-        self: Own, model: Model, *, target: str | None = None, minimise: bool = False
-    ) -> Own:
-        """See `Task.on`: the target is one of the model's classes, or several. Raises
-        InputError where there is no such class, or the model's outputs are not what the
-        task reads.
+        self: ClassTaskType,
+        model: Model,
+        *,
+        target: str | None = None,
+        minimise: bool = False,
+    ) -> ClassTaskType:
+        """See `Task.on`: the target is one of the model's classes, or several.
+
+        Raises:
+            InputError: there is no such class, or the model's outputs are not what the
+                task reads.
         """
         if self.reads_logits != (model.read is None):
-            other = f'it was loaded for its logits; load it with task="{self.name}"'
             if self.reads_logits:
-                other = (
+                advice = (
                     "it was loaded for another task than classification; give the "
                     "same `task` here"
                 )
-            raise InputError(f"model {model.name}: {other}")
-        labels, named = (
-            (model.labels, model.named) if self.reads_logits else self._names(model)
-        )
-        try:
-            wanted = (
-                None
-                if target is None
-                else find_label_set(target, labels, named=named).indices
-            )
-        except InputError as error:
-            raise InputError(f"target: {error}") from None
+            else:
+                advice = (
+                    f'it was loaded for its logits; load it with task="{self.name}"'
+                )
+            raise InputError(f"model {model.name}: {advice}")
+        if self.reads_logits:
+            labels, named = model.labels, model.named
+        else:
+            labels, named = self._names(model)
+        target_classes = None
+        if target is not None:
+            try:
+                target_classes = find_label_set(target, labels, named=named).indices
+            except InputError as error:
+                raise InputError(f"target: {error}") from None
         return replace(
-            self, labels=labels, named=named, target=wanted, minimise=minimise
+            self, labels=labels, named=named, target=target_classes, minimise=minimise
         )
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        """The names of the classes that a model predicts, and whether they are
-        names.
+        """Return the names of the classes that a model predicts, and whether they are
+        names or placeholders.
         """
+        gray_image = torch.full((1, *model.input_size, 3), 0.5)
         with torch.no_grad():
-            count = self.classes_in(model(torch.full((1, *model.input_size, 3), 0.5)))
-        given = model.labels or None
-        if count is None and given is None:
-            raise InputError(
-                "labels: expected a file with the names of the classes "
-                f"of model {model.name}, got none"
-            )
-        return (
-            model.labels
-            if count is None
-            else fitting_labels(count, given, LabelsOrigin(), model.name)
-        ), given is not None
+            n_classes = self.classes_in(model(gray_image))
+        if n_classes is None:
+            if not model.labels:
+                raise InputError(
+                    "labels: expected a file with the names of the classes "
+                    f"of model {model.name}, got none"
+                )
+            return model.labels, True
+        labels = fitting_labels(
+            n_classes, model.labels or None, LabelsOrigin(), model.name
+        )
+        return labels, bool(model.labels)
 
     def classes_in(self, output: Output) -> int | None:
-        """Return how many classes an output is of; None where it does not show that."""
+        """Return the number of classes of an output; None if it does not show it."""
         return None
 
     def right_classes(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: what was said, or else the object's
-        own label. Raises InputError where the model has no such class, the object has
-        no label, or a target is right.
+        """Return the indices of the right classes: of the setting `label`, or else of the
+        object's own label.
+
+        Raises:
+            InputError: the model has no such class, the object has no label, or a target
+                is right.
         """
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
@@ -108,7 +121,7 @@ class ClassTask(Task):
                 f"label: expected the right labels for {facts.object}, got none"
             )
         try:
-            right = find_label_set(text, self.labels, named=self.named).indices
+            right_classes = find_label_set(text, self.labels, named=self.named).indices
         except InputError as error:
             if facts.label is not None:
                 raise InputError(f"label: {error}") from None
@@ -116,29 +129,30 @@ class ClassTask(Task):
                 f"label: the label of {facts.object} itself does not fit "
                 f"the model ({error})"
             ) from None
-        both = sorted(set(right) & set(self.target or ()))
-        if both:
+        common_classes = sorted(set(right_classes) & set(self.target or ()))
+        if common_classes:
             raise InputError(
                 "target: expected classes that are not right labels, got "
-                f"{both}, which `label` has too"
+                f"{common_classes}, which `label` has too"
             )
-        return right
+        return right_classes
 
     def check(self, facts: Facts) -> None:
         self.right_classes(facts)
 
     @cached_property
     def nothing(self) -> Labels:
-        """Indices of classes that stand for no thing, such as "background", but for
-        what is sought: no predictions.
+        """Indices of classes that stand for no thing, such as "background".
+
+        They are no predictions, unless they are targets.
         """
         if not self.named:
             return ()
-        sought = self.target or ()
+        targets = self.target or ()
         return tuple(
-            k
-            for k, name in enumerate(self.labels)
-            if k not in sought and names_nothing(name)
+            index
+            for index, name in enumerate(self.labels)
+            if index not in targets and names_nothing(name)
         )
 
     @property
@@ -156,10 +170,10 @@ class ClassTask(Task):
 
 @dataclass(frozen=True, kw_only=True)
 class Classification(ClassTask):
-    """The model's largest logit names the class of the object.
+    """Judge whether the largest logit is that of a right class.
 
-    The truth is the indices of the right classes, of which there may be several
-    ("coffee mug" and "cup").
+    The truth is the indices of the right classes, of which there may be several ("coffee
+    mug" and "cup").
     """
 
     name = "classification"
@@ -170,15 +184,15 @@ class Classification(ClassTask):
         return self.right_classes(facts)
 
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.as_logits`: a class that stands for no thing has a logit of minus
-        infinity, unless it is right or there is no other wrong one.
+        """See `Task.as_logits`: a class that stands for no thing gets a logit of minus
+        infinity, unless it is right or there is no other wrong class.
         """
         nothing = set(self.nothing) - set(truth)
-        if not nothing or len(nothing) + max(1, len(truth)) >= output.shape[1]:
+        n_classes = output.shape[1]
+        if not nothing or len(nothing) + max(1, len(truth)) >= n_classes:
             return output
-        return output.index_fill(
-            1, torch.tensor(sorted(nothing), device=output.device), -math.inf
-        )
+        indices = torch.tensor(sorted(nothing), device=output.device)
+        return output.index_fill(1, indices, -math.inf)
 
     def loss(self, output: Tensor, truth: Labels) -> Tensor:
         return wrong_lead(self.as_logits(output, truth), truth)
@@ -191,117 +205,124 @@ class Classification(ClassTask):
     def predictions(
         self, output: Tensor, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return the likeliest classes of each picture; with a count of 1, the first of
-        equal ones.
+        """Return the likeliest classes of each image; with a count of 1, the one with the
+        lowest index of equally likely ones.
         """
         return self._likeliest(self.as_logits(output, ()), count)
 
-    def _likeliest(self, output: Tensor, count: int) -> list[tuple[Prediction, ...]]:
-        probabilities = output.detach().softmax(dim=1)
+    def _likeliest(self, logits: Tensor, count: int) -> list[tuple[Prediction, ...]]:
+        """Return the `count` likeliest classes of each row of logits (N, classes)."""
+        probabilities = logits.detach().softmax(dim=1)
         if count == 1:
-            indices = probabilities.argmax(dim=1, keepdim=True)
-            values = probabilities.gather(1, indices)
+            top_classes = probabilities.argmax(dim=1, keepdim=True)
+            top_probabilities = probabilities.gather(1, top_classes)
         else:
-            values, indices = probabilities.topk(min(count, output.shape[1]), dim=1)
-        found = []
-        for row in zip(indices.tolist(), values.tolist(), strict=True):
-            listed = [
-                Prediction(self.name_of(i), i, p)
-                for i, p in zip(*row, strict=True)
-                if p > 0.0 or count == 1
-            ]
-            found.append(
-                tuple(listed)
-                if math.isfinite(row[1][0])
-                else (Prediction(NOT_A_NUMBER),)
+            k = min(count, logits.shape[1])
+            top_probabilities, top_classes = probabilities.topk(k, dim=1)
+        predictions_of_images: list[tuple[Prediction, ...]] = []
+        for classes, class_probabilities in zip(
+            top_classes.tolist(), top_probabilities.tolist(), strict=True
+        ):
+            if not math.isfinite(class_probabilities[0]):
+                predictions_of_images.append((Prediction(NOT_A_NUMBER),))
+                continue
+            predictions = tuple(
+                Prediction(self.name_of(class_id), class_id, probability)
+                for class_id, probability in zip(
+                    classes, class_probabilities, strict=True
+                )
+                if probability > 0.0 or count == 1
             )
-        return found
+            predictions_of_images.append(predictions)
+        return predictions_of_images
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
+        """See `Task.judge`; the logits are computed once for all that needs them."""
         logits = self.as_logits(output, truth)
-        own = type(self)
-        losses = (
-            wrong_lead(logits, truth)
-            if own.loss is Classification.loss
-            else self.loss(output, truth)
-        )
-        if own.score is not Classification.score or self.target is not None:
+        task_class = type(self)
+        if task_class.loss is Classification.loss:
+            losses = wrong_lead(logits, truth)
+        else:
+            losses = self.loss(output, truth)
+        if task_class.score is not Classification.score or self.target is not None:
             scores = self.score(output, truth)
         else:
             scores = -losses if self.minimise else losses
-        rows = zip(
+        judgements = []
+        for score, margin, predictions in zip(
             scores.tolist(),
             (0.0 - losses).tolist(),
             self._likeliest(logits, 1),
             strict=True,
-        )
-        return [Judgement.of(score, margin, first) for score, margin, (first,) in rows]
+        ):
+            judgements.append(Judgement.of(score, margin, predictions[0]))
+        return judgements
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         return self.names(truth)
 
 
-# ---- logits
-# ---------------------------------------------------------------------------------------------------------
+# ---- logits ----
 
 
 def wrong_lead(logits: Tensor, right: Labels) -> Tensor:
-    """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly
-    where the prediction is wrong. Raises InputError as for `members`.
+    """Compute the largest wrong logit minus the largest right one, (N,).
+
+    It is over 0 exactly if the prediction is wrong. Raises InputError as `members`.
     """
-    inside = members(logits, right)
-    return logits.masked_fill(inside, -math.inf).amax(dim=1) - logits.masked_fill(
-        ~inside, -math.inf
-    ).amax(dim=1)
+    is_right = members(logits, right)
+    return largest(logits, ~is_right) - largest(logits, is_right)
 
 
 def target_lead(logits: Tensor, targets: Labels) -> Tensor:
-    """Return the largest logit of the targets minus the largest other one, (N,): over 0
-    exactly where one is predicted. Raises InputError as for `members`.
+    """Compute the largest logit of the targets minus the largest other one, (N,).
+
+    It is over 0 exactly if a target is predicted. Raises InputError as `members`.
     """
-    inside = members(logits, targets, "target")
-    return logits.masked_fill(~inside, -math.inf).amax(dim=1) - logits.masked_fill(
-        inside, -math.inf
-    ).amax(dim=1)
+    is_target = members(logits, targets, "target")
+    return largest(logits, is_target) - largest(logits, ~is_target)
 
 
 def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> Tensor:
-    """Return (C,) bool, true for the classes of a label set; checks the logits (N, C)
-    and the labels, which are right for all N. Raises InputError, which names the
-    setting: logits of another shape, no index, one out of range, or all classes.
+    """Return which classes are in a label set, (C,) bool.
+
+    Args:
+        logits: (N, C).
+        labels: indices of classes, the same for all N.
+        setting: named in messages.
+
+    Raises:
+        InputError: logits of another shape; no index, one out of range, or all classes.
     """
     if logits.ndim != 2:
         raise InputError(
             "model output: expected logits of shape (N, classes), got "
             f"{tuple(logits.shape)}"
         )
-    classes = logits.shape[1]
-    labels = (
-        tuple(dict.fromkeys(labels.flatten().tolist()))
-        if isinstance(labels, Tensor)
-        else labels
-    )
-    if not labels or not all(0 <= label < classes for label in labels):
+    n_classes = logits.shape[1]
+    if isinstance(labels, Tensor):
+        labels = tuple(dict.fromkeys(labels.flatten().tolist()))
+    if not labels or not all(0 <= label < n_classes for label in labels):
         raise InputError(
-            f"{setting}: expected class indices from 0 to {classes - 1}, "
+            f"{setting}: expected class indices from 0 to {n_classes - 1}, "
             f"got {tuple(labels)}"
         )
-    found = torch.zeros(classes, dtype=torch.bool, device=logits.device)
-    found[list(labels)] = True
-    if bool(found.all()):
-        outcome = (
-            "no prediction could be wrong"
-            if setting == "label"
-            else "every prediction would be a hit"
-        )
+    is_member = torch.zeros(n_classes, dtype=torch.bool, device=logits.device)
+    is_member[list(labels)] = True
+    if bool(is_member.all()):
+        if setting == "label":
+            consequence = "no prediction could be wrong"
+        else:
+            consequence = "every prediction would be a hit"
         raise InputError(
-            f"{setting}: the label set holds all {classes} classes, so {outcome}"
+            f"{setting}: the label set holds all {n_classes} classes, so {consequence}"
         )
-    return found
+    return is_member
 
 
 def largest(logits: Tensor, among: Tensor) -> Tensor:
-    """Return the largest logit (N,) of the classes (C,) that are true in `among`; ties
-    share the gradient.
+    """Return the largest logit (N,) of the classes (C,) that are true in `among`.
+
+    Ties share the gradient.
     """
     return logits.masked_fill(~among, -math.inf).amax(dim=1)

@@ -1,6 +1,4 @@
-"""Command: how far the action that a policy commands leaves an envelope about the one
-in the clean scene.
-"""
+"""Judge commands: how far a policy's action leaves an envelope around its clean action."""
 
 from __future__ import annotations
 
@@ -25,33 +23,32 @@ from advsearch.extend import (
 
 Numbers = tuple[float, ...]
 
-MOST = 4096  # numbers of a state, names of one, and elements of an action
-LARGEST = 1 << 20  # bytes of a file with a state
+MOST = 4096  # maximum of numbers of a state, and of elements of an action
+LARGEST = 1 << 20  # maximum size of a file with a state, in bytes
 
 INSIDE = "action within its envelope"
 REACHED = "action within the envelope of the target"
-"""Labels of actions; others are outside of their envelope."""
+"""Labels of actions; others are outside their envelope."""
 
-SHOWN = 4  # elements of an action that are said in words
+SHOWN = 4  # how many elements of an action its text has
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Task):
-    """A policy commands about the action that it commands in the clean scene: open
-    loop, one picture, one action.
+    """Judge the action of a policy by the one in the clean scene.
 
-    The output is actions (N, A), in whatever units the policy has. The truth is the
-    clean action c (A,), from one picture of the clean scene. Let e be the envelope: the
-    loss is max |a - c| / e over the elements, less 1. With a target t, a success is max
-    |a - t| / e of at most 1.
+    It is open loop: one image, one action. The output is actions (N, A), in the units of
+    the policy. The truth is the clean action c (A,), from one image of the clean scene.
+    With the envelope e the loss is max |a - c| / e over the elements, minus 1. With a
+    target t, a success is max |a - t| / e of at most 1.
 
     Args:
-        state: what the policy gets beside pictures: numbers, or a list of numbers, by
+        state: inputs of the policy other than images: numbers, or lists of numbers, by
             name, or a JSON file of such.
-        envelope: how far an element may be off, in its own unit: a number, or one for
-            each element.
-        names: of the elements, a list or a text with commas; "action 1" and so on
-            without.
+        envelope: maximum deviation of an element in its unit: a number, or one for each
+            element.
+        names: of the elements, a list or a string with commas; "action 1" and so on
+            without it.
         units: of the elements, likewise, or one for all.
 
     Raises:
@@ -67,37 +64,24 @@ class Command(Task):
     envelope: Any = None
     names: Any = ()
     units: Any = ()
-    # (A,)
+    # The clean action, (A,).
     clean: Tensor | None = field(
         default=None, compare=False, repr=False, metadata=tasks.FROM_RUN
     )
 
     def __post_init__(self) -> None:
-        # what files and lists say, in the one form that compares and is written down
-        put = object.__setattr__
-        put(self, "state", _state(self.state))
-        for option in ("names", "units"):
-            given = getattr(self, option)
-            texts = (
-                [part.strip() for part in given.split(",")]
-                if isinstance(given, str) and given
-                else [*(given or ())]
-            )
-            if len(texts) > MOST or not all(
-                isinstance(one, str) and one and one.isprintable() for one in texts
-            ):
-                expected = "expected texts, or one with commas between them"
-                raise InputError(
-                    f"task command: {option}: {expected}, got {given!r:.80}"
-                )
-            put(self, option, tuple(texts))
+        # Normalise the options, so that equal tasks compare as equal.
+        set_field = object.__setattr__  # the dataclass is frozen
+        set_field(self, "state", _load_state(self.state))
+        set_field(self, "names", _parse_names("names", self.names))
+        set_field(self, "units", _parse_names("units", self.units))
         if len(set(self.names)) < len(self.names):
             raise InputError(
                 "task command: names: expected different names, got "
                 f"{', '.join(self.names):.80}"
             )
         if self.envelope is not None:
-            put(self, "envelope", _numbers("envelope", self.envelope))
+            set_field(self, "envelope", _parse_numbers("envelope", self.envelope))
             if min(self.envelope) <= 0.0:
                 raise InputError(
                     "task command: envelope: expected numbers over 0, "
@@ -105,53 +89,60 @@ class Command(Task):
                 )
 
     def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
+        """See `Task.wrapped`: a policy gets the state next to images."""
         if isinstance(network, models.AllAtOnce):
             inner: Any = self.wrapped(network.network)
             return models.AllAtOnce(inner, network.cameras, network.layout)
-        alone = network.network if isinstance(network, models.WithState) else network
-        return (
-            models.WithState(alone, self.state)
-            if self.state or hasattr(alone, "select_action")
-            else network
-        )
+        policy = network.network if isinstance(network, models.WithState) else network
+        if self.state or hasattr(policy, "select_action"):
+            return models.WithState(policy, self.state)
+        return network
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return actions (count, A) of (count, A) or (count,), which may be the first
-        of a tuple, or `action` of a mapping. Raises ValueError where it is none, or has
-        another size than the options.
+        """Read actions (count, A) from (count, A) or (count,).
+
+        They may be the first of a tuple, or `action` of a mapping.
+
+        Raises:
+            ValueError: there are none, or their size differs from that of the options.
         """
-        found = returned.get("action") if isinstance(returned, Mapping) else returned
-        found = found[0] if type(found) in (tuple, list) and found else found
+        actions = returned.get("action") if isinstance(returned, Mapping) else returned
+        if type(actions) in (tuple, list) and actions:
+            actions = actions[0]
         if (
-            not isinstance(found, Tensor)
-            or not found.is_floating_point()
-            or found.shape[:1] != (count,)
+            not isinstance(actions, Tensor)
+            or not actions.is_floating_point()
+            or actions.shape[:1] != (count,)
         ):
             raise ValueError(
                 "expected an action for each picture, (N, A), or a "
                 "mapping with these under action"
             )
-        found = found[:, None] if found.ndim == 1 else found
-        if found.ndim != 2 or not 1 <= found.shape[1] <= MOST:
+        if actions.ndim == 1:
+            actions = actions[:, None]
+        if actions.ndim != 2 or not 1 <= actions.shape[1] <= MOST:
             raise ValueError(
                 f"expected one action for each picture, (N, A), with A from 1 to {MOST}"
             )
         for option in ("envelope", "names", "units"):
-            if (size := len(getattr(self, option) or ())) > (
-                option != "names"
-            ) and size != found.shape[1]:
+            size = len(getattr(self, option) or ())
+            # One envelope or unit is for all elements.
+            min_size = 1 if option == "names" else 2
+            if size >= min_size and size != actions.shape[1]:
                 raise ValueError(
                     f"expected actions of {size} elements, as task command has {option}"
                 )
-        return found.float()
+        return actions.float()
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Command:
-        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its
-        elements, ``yaw rate=-0.3``. Raises InputError: there is no envelope, the model
-        was loaded for another task or with names of classes, the target is none, or the
-        clean action is sought.
+        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its elements,
+        ``yaw rate=-0.3``.
+
+        Raises:
+            InputError: there is no envelope, the model was loaded for another task or with
+                names of classes, the target is no action, or the clean action is sought.
         """
         if model.read is None:
             raise InputError(
@@ -177,24 +168,22 @@ class Command(Task):
         return replace(self, target=None if target is None else self._target(target))
 
     def _target(self, text: str) -> Tensor:
-        """The action in a text, (A,), with NaN for the elements that it does not
-        name.
-        """
-        parts = [part.rpartition("=") for part in str(text).split(",")]
-        wanted = torch.tensor(
-            _numbers("target", [number.strip() for _, _, number in parts])
-        )
-        elements = [name.strip() for name, _, _ in parts]
-        if not any(elements):
-            return wanted
-        if unknown := [name for name in elements if name not in self.names]:
+        """Parse a target action (A,), with NaN for elements that are not named."""
+        assignments = [part.rpartition("=") for part in str(text).split(",")]
+        numbers = [number.strip() for _, _, number in assignments]
+        values = torch.tensor(_parse_numbers("target", numbers))
+        element_names = [name.strip() for name, _, _ in assignments]
+        if not any(element_names):
+            return values
+        unknown = [name for name in element_names if name not in self.names]
+        if unknown:
             known = ", ".join(self.names) or "none; give `names`"
             raise InputError(
                 f"target: expected elements that `names` has ({known}), "
                 f"got {unknown[0]!r}"
             )
         action = torch.full((len(self.names),), math.nan)
-        action[[self.names.index(name) for name in elements]] = wanted
+        action[[self.names.index(name) for name in element_names]] = values
         return action
 
     @property
@@ -202,54 +191,57 @@ class Command(Task):
         return self.clean is None
 
     def after_calibration(self, output: Tensor, truth: Tensor | None) -> Command:
-        """See `Task.after_calibration`. Raises InputError where the clean action is not
-        finite, or the target has another size.
+        """See `Task.after_calibration`: store the clean action.
+
+        Raises:
+            InputError: the clean action is not finite, or the target has another size or
+                is too near to it.
         """
         if not self.calibrates:
             return self
-        clean = output[0].detach().float()
-        if not bool(clean.isfinite().all()):
+        clean_action = output[0].detach().float()
+        if not bool(clean_action.isfinite().all()):
             raise InputError(
                 "task command: the clean action has NaN or infinity, and "
                 "nothing can be judged by it"
             )
         if self.target is not None:
-            if len(self.target) != len(clean):
-                raise InputError(
-                    f"target: expected an action of {len(clean)} "
-                    f"elements, got {len(self.target)}"
-                )
-            # an action would be right, and what is sought
-            if float(self.loss(clean[None], self.target)) <= 1.0:
-                raise InputError(
-                    "target: expected an action more than two envelopes from the clean "
-                    "one, which is "
-                    f"{self._said(clean.tolist())}"
-                )
-        return replace(self, clean=clean)
+            self._check_target(clean_action)
+        return replace(self, clean=clean_action)
+
+    def _check_target(self, clean_action: Tensor) -> None:
+        """Check the target's size, and that its envelope is apart from the clean one."""
+        if len(self.target) != len(clean_action):
+            raise InputError(
+                f"target: expected an action of {len(clean_action)} "
+                f"elements, got {len(self.target)}"
+            )
+        # Otherwise an action could be right and a success at once.
+        if float(self.loss(clean_action[None], self.target)) <= 1.0:
+            raise InputError(
+                "target: expected an action more than two envelopes from the clean "
+                f"one, which is {self._format_action(clean_action.tolist())}"
+            )
 
     @property
     def remarks(self) -> tuple[str, ...]:
         if self.clean is None:
             return ()
-        around = self._said(
-            [*self.envelope] * (1 if len(self.envelope) > 1 else len(self.clean)),
-            sign="± ",
-        )
+        is_shared = len(self.envelope) == 1
+        envelope = [*self.envelope] * (len(self.clean) if is_shared else 1)
+        clean_action = self._format_action(self.clean.tolist())
         return (
-            f"The clean action is {self._said(self.clean.tolist())}, from one picture "
+            f"The clean action is {clean_action}, from one picture "
             "of the clean scene; its envelope "
-            f"is {around}. An action is judged by itself: nothing moves, and no later "
-            "picture follows from it.",
+            f"is {self._format_action(envelope, sign='± ')}. An action is judged by "
+            "itself: nothing moves, and no later picture follows from it.",
         )
 
     @property
     def goal(self) -> str:
-        return (
-            "a target action"
-            if self.target is not None
-            else "an action outside the envelope of the clean one"
-        )
+        if self.target is not None:
+            return "a target action"
+        return "an action outside the envelope of the clean one"
 
     def check(self, facts: tasks.Facts) -> None:
         if facts.label is not None:
@@ -263,142 +255,168 @@ class Command(Task):
         return self.clean
 
     def truth_names(self, truth: Tensor | None) -> tuple[str, ...]:
-        return () if truth is None else (self._said(truth.tolist()),)
+        return () if truth is None else (self._format_action(truth.tolist()),)
 
-    def _off(self, output: Tensor, centre: Tensor | None) -> Tensor:
-        """How many envelopes each element is over an action, (N, A); 0 where that is
-        NaN.
+    def _deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
+        """Compute the deviation of each element from an action in envelopes, (N, A).
+
+        It is 0 where the action is NaN.
         """
-        if centre is None:
+        if center is None:
             raise InputError(
                 "task command: expected a clean picture that it was shown first"
             )
-        known = centre.to(output).where(
-            ~centre.isnan().to(output.device), output.detach()
-        )
-        return (output - known) / output.new_tensor(self.envelope)
+        is_known = ~center.isnan().to(output.device)
+        center = center.to(output).where(is_known, output.detach())
+        return (output - center) / output.new_tensor(self.envelope)
 
     def loss(self, output: Tensor, truth: Tensor | None) -> Tensor:
-        return self._off(output, truth).abs().amax(dim=1) - 1.0
+        """Compute the largest deviation of an element in envelopes, minus 1, (N,)."""
+        return self._deviation(output, truth).abs().amax(dim=1) - 1.0
 
     def predictions(
         self, output: Tensor, count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        return [(tasks.Prediction(self._said(action)),) for action in output.tolist()]
+        return [
+            (tasks.Prediction(self._format_action(action)),)
+            for action in output.tolist()
+        ]
 
     def said(
         self, output: Tensor, truth: Tensor | None, margins: Sequence[float]
     ) -> list[tasks.Said]:
-        """See `Task.said`: whether an action left its envelope, and which element is
-        furthest out. Beside it stand the action and the clean one, also in words, and
-        how many envelopes lie between them.
+        """See `Task.said`: whether an action left its envelope, and by which element.
+
+        The payload has the action and the clean one, also as text, and the number of
+        envelopes between them.
         """
         assert truth is not None
-        found: list[tasks.Said] = []
-        reached = (
-            [False] * len(output)
-            if self.target is None
-            else self.loss(output, self.target) <= 0.0
-        )
-        for off, action, margin, hit in zip(
-            self._off(output, truth), output.tolist(), margins, reached, strict=True
+        results: list[tasks.Said] = []
+        reaches_target = [False] * len(output)
+        if self.target is not None:
+            reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
+        deviations = self._deviation(output, truth)
+        clean_action = truth.tolist()
+        for row, (action, margin) in enumerate(
+            zip(output.tolist(), margins, strict=True)
         ):
-            furthest = int(off.abs().argmax())
-            side = (
-                f"{self._name(furthest)} "
-                f"{'above' if off[furthest] > 0.0 else 'below'} it"
-            )
-            label = (
-                REACHED
-                if hit
-                else INSIDE
-                if margin >= 0.0
-                else f"action outside its envelope ({side})"
-            )
-            text = (
-                f"{self._said(action)}, clean {self._said(truth.tolist(), named=False)}"
-            )
-            kept = {
+            if reaches_target[row]:
+                label = REACHED
+            elif margin >= 0.0:
+                label = INSIDE
+            else:
+                label = self._outside_label(deviations[row])
+            clean_text = self._format_action(clean_action, with_names=False)
+            payload: tasks.JsonValue = {
                 "action": action,
-                "clean": truth.tolist(),
+                "clean": clean_action,
                 "envelopes": 1.0 - margin,
-                "text": text,
+                "text": f"{self._format_action(action)}, clean {clean_text}",
             }
-            found.append((tasks.Prediction(label), kept))
-        return found
+            results.append((tasks.Prediction(label), payload))
+        return results
 
-    def _name(self, place: int) -> str:
-        return self.names[place] if self.names else f"action {place + 1}"
+    def _outside_label(self, deviation: Tensor) -> str:
+        """Return the label of an action outside its envelope, with its deviation (A,)."""
+        furthest = int(deviation.abs().argmax())
+        direction = "above" if deviation[furthest] > 0.0 else "below"
+        return f"action outside its envelope ({self._name(furthest)} {direction} it)"
 
-    def _said(
-        self, action: Sequence[float], *, sign: str = "", named: bool = True
+    def _name(self, index: int) -> str:
+        """Return the name of an element."""
+        return self.names[index] if self.names else f"action {index + 1}"
+
+    def _format_action(
+        self, action: Sequence[float], *, sign: str = "", with_names: bool = True
     ) -> str:
+        """Return the first elements of an action as text, with names and units."""
         units = self.units if len(self.units) > 1 else [*self.units] * len(action)
-        parts = [
-            f"{self._name(place) + ' ' if named else ''}{sign}{number:.3g} "
-            f"{units[place] if units else ''}".rstrip()
-            for place, number in enumerate(action[:SHOWN])
-        ]
-        return ", ".join(parts) + (
-            f" and {len(action) - SHOWN} more" if len(action) > SHOWN else ""
+        elements = []
+        for index, number in enumerate(action[:SHOWN]):
+            name = f"{self._name(index)} " if with_names else ""
+            unit = units[index] if units else ""
+            elements.append(f"{name}{sign}{number:.3g} {unit}".rstrip())
+        text = ", ".join(elements)
+        if len(action) > SHOWN:
+            text += f" and {len(action) - SHOWN} more"
+        return text
+
+
+def _parse_names(option: str, value: Any) -> tuple[str, ...]:
+    """Parse names from a list, or a string with commas between them."""
+    if isinstance(value, str) and value:
+        names = [part.strip() for part in value.split(",")]
+    else:
+        names = [*(value or ())]
+    are_names = all(
+        isinstance(name, str) and name and name.isprintable() for name in names
+    )
+    if len(names) > MOST or not are_names:
+        raise InputError(
+            f"task command: {option}: expected texts, or one with commas between "
+            f"them, got {value!r:.80}"
         )
+    return tuple(names)
 
 
-def _numbers(option: str, given: Any) -> Numbers:
-    """The finite numbers in a number, a text with one, or a list of such."""
-    listed = given.tolist() if hasattr(given, "tolist") else given
-    listed = list(listed) if isinstance(listed, (list, tuple)) else [listed]
+def _parse_numbers(option: str, value: Any) -> Numbers:
+    """Parse finite numbers from a number, a string with one, or a list of such."""
+    items = value.tolist() if hasattr(value, "tolist") else value
+    items = list(items) if isinstance(items, (list, tuple)) else [items]
     try:
-        if any(isinstance(one, bool) for one in listed):
+        if any(isinstance(item, bool) for item in items):
             raise ValueError
-        found = tuple(float(one) for one in listed)
+        numbers = tuple(float(item) for item in items)
     except (TypeError, ValueError, OverflowError):
-        found = ()
-    if not 1 <= len(found) <= MOST or not all(
-        math.isfinite(one) and abs(one) < 1e30 for one in found
-    ):
-        got = f"{len(listed):,} of them" if len(listed) > MOST else f"{given!r:.80}"
+        numbers = ()
+    are_finite = all(math.isfinite(number) and abs(number) < 1e30 for number in numbers)
+    if not 1 <= len(numbers) <= MOST or not are_finite:
+        got = f"{len(items):,} of them" if len(items) > MOST else f"{value!r:.80}"
         raise InputError(
             f"task command: {option}: expected a finite number, or a list of 1 to "
             f"{MOST} of them, got {got}"
         )
-    return found
+    return numbers
 
 
-def _state(given: Any) -> dict[str, Numbers]:
-    """The numbers of a state by name, from a mapping or the file that a text names."""
-    if isinstance(given, (str, Path)) and str(given):
-        path = Path(given).expanduser()
-        try:
-            given = stored_files.parse_json(
-                stored_files.read_text(
-                    path, "a state: numbers by name in JSON", LARGEST
-                ),
-                finite=True,
-            )
-        except OSError as error:
-            raise errors.FileFormatError(
-                f"task command: state: {path} cannot be read "
-                f"({error.strerror or error})"
-            ) from None
-        except ValueError as error:
-            raise errors.FileFormatError(
-                f"{path}: expected a state: numbers by name in JSON ({error})"
-            ) from None
-    if not given:
+def _load_state(value: Any) -> dict[str, Numbers]:
+    """Return the numbers of a state by name, from a mapping or a JSON file's path.
+
+    Raises:
+        InputError: it is not numbers by name, or too many.
+        FileFormatError: the file cannot be read as such.
+    """
+    if isinstance(value, (str, Path)) and str(value):
+        value = _read_state_file(Path(value).expanduser())
+    if not value:
         return {}
-    if not isinstance(given, Mapping) or not all(
-        isinstance(name, str) and name for name in given
+    if not isinstance(value, Mapping) or not all(
+        isinstance(name, str) and name for name in value
     ):
         raise InputError(
             f"task command: state: expected numbers by name, such as {{speed: 1.5}}, "
-            f"or a JSON file, got {given!r:.80}"
+            f"or a JSON file, got {value!r:.80}"
         )
-    found = {
-        name: _numbers(f"state {name:.40}", numbers) for name, numbers in given.items()
+    state = {
+        name: _parse_numbers(f"state {name:.40}", numbers)
+        for name, numbers in value.items()
     }
-    if sum(map(len, found.values())) > MOST:
+    if sum(map(len, state.values())) > MOST:
         raise InputError(
             f"task command: state: expected at most {MOST:,} numbers in all"
         )
-    return found
+    return state
+
+
+def _read_state_file(path: Path) -> Any:
+    """Read a JSON file. Raises FileFormatError if it cannot be read, or is no JSON."""
+    expected = "a state: numbers by name in JSON"
+    try:
+        text = stored_files.read_text(path, expected, LARGEST)
+        return stored_files.parse_json(text, finite=True)
+    except OSError as error:
+        raise errors.FileFormatError(
+            f"task command: state: {path} cannot be read ({error.strerror or error})"
+        ) from None
+    except ValueError as error:
+        raise errors.FileFormatError(f"{path}: expected {expected} ({error})") from None

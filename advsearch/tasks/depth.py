@@ -1,16 +1,16 @@
-"""Depth: whether a model judges the object to be as far away as it is.
+"""Judge depth: whether a model predicts the object at its true distance.
 
-Models mean the z-depth, the distance along the camera's axis, and so it is what they
-are compared with. Relative ones give it, or its inverse (disparity), up to a scale and
-a shift, which are found by least squares (Ranftl et al. 2020, "Towards robust monocular
-depth estimation", arXiv 1907.01341, sections 5 and 6). They are found on what is seen
-beside the object, so that the object has no say in how it is judged.
+Models predict z-depth, the distance along the camera's axis, and are compared with it.
+Relative ones predict it, or its inverse (disparity), up to a scale and a shift, which
+are fitted by least squares (Ranftl et al. 2020, "Towards robust monocular depth
+estimation", arXiv 1907.01341, sections 5 and 6). The fit uses the pixels outside the
+object, so that the object does not affect how it is judged.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Model, Task, tasks
 
-# cosine of the angle to the camera's axis from which on z-depth is no distance any more
+# Minimum cosine of the angle to the camera's axis at which z-depth is a distance.
 ASIDE = 0.1
 DISPARITY = "relative disparity"
 RELATIVE = "relative depth"
@@ -32,7 +32,7 @@ KINDS = {
     RELATIVE: "the distance, up to a scale and a shift",
     METRIC: "the distance in metres",
 }
-"""What a model's numbers may be."""
+"""What the values of a model may be."""
 
 AS_FAR = "as far as it is"
 OUT_OF_SHAPE = "out of shape"
@@ -45,26 +45,30 @@ GOALS = {
     "farther": f"the object is judged {FARTHER}",
     "gone": f"the object is judged to be {GONE}",
 }
-"""What an attack may be after, by the name of the objective."""
+"""What an attack may seek, by the name of the objective."""
 
 FEWEST = 16
 SPREAD = 1.1
-"""Pixels beside the object on which scale and shift are found, at least, and how many
-times as far as the nearest of them the farthest is.
+"""Minimum number of pixels outside the object for the fit of scale and shift, and
+minimum ratio of their farthest to their nearest distance.
 """
-LARGEST = 100.0  # the largest factor by which a pixel counts as too near or too far
+LARGEST = 100.0  # maximum factor by which a pixel counts as too near or too far
 
 Map = Mapping[str, Tensor]
-"""What a model returns for one picture: (h, w), by one of `KINDS`, or by "" where it
-does not say.
+"""What a model returns for one image: (h, w), by one of `KINDS`, or "" if it does not
+state which.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """What is true of a picture: in which pixels the object is seen, (H, W) bool, and
-    the z-depth of everything, (H, W), infinite where there is nothing: in metres, or in
-    object sizes where the object's `metres` are not known.
+    """The true distances in an image: the truth of depth.
+
+    Attributes:
+        mask: (H, W) bool, the pixels in which the object is visible.
+        z: (H, W) z-depth of everything, infinite where there is nothing; in metres, or
+            in object sizes if `metres` is None.
+        metres: size of the object.
     """
 
     mask: Tensor
@@ -73,66 +77,72 @@ class Distances:
 
     @property
     def seen(self) -> bool:
-        """Whether there is anything of the object in the picture."""
+        """Whether any of the object is visible."""
         return bool(self.mask.any())
 
     @cached_property
     def beside(self) -> Tensor:
-        """What is seen beside the object at a finite distance, (H, W) bool."""
+        """The pixels outside the object at a finite distance, (H, W) bool."""
         return self.z.isfinite() & ~self.mask
 
     @cached_property
     def anchored(self) -> bool:
-        """Whether what is beside the object says scale and shift: enough pixels at
-        distances that differ enough.
+        """Whether the pixels outside the object determine scale and shift.
+
+        There must be enough of them, and their distances must differ enough.
         """
-        there = self.z[self.beside]
-        return len(there) >= FEWEST and float(there.max()) >= SPREAD * float(
-            there.min()
-        )
+        distances = self.z[self.beside]
+        if len(distances) < FEWEST:
+            return False
+        return float(distances.max()) >= SPREAD * float(distances.min())
 
     @property
     def fitted(self) -> Tensor:
-        """Where scale and shift are found, (H, W) bool: beside the object, or in the
-        whole picture where that says nothing.
+        """The pixels on which scale and shift are fitted, (H, W) bool: those outside the object,
+        or all if those do not determine them.
         """
         return self.beside if self.anchored else self.z.isfinite()
 
     @cached_property
     def behind(self) -> Tensor:
-        """The disparity of what is behind the object, as far as it can be told, (H, W):
-        NaN where it can't. It is that of the nearest pixels beside the object in the
-        same row, in a straight line between both: exact of a plane. What is infinitely
-        far has a disparity of 0.
+        """The disparity of what is behind the object, (H, W); NaN if it is unknown.
+
+        It is interpolated linearly between the nearest pixels to the left and right of the
+        object in the same row, which is exact for a plane. What is infinitely far has a
+        disparity of 0.
         """
         height, width = self.mask.shape
-        inverse = self.z.reciprocal()
+        disparity = self.z.reciprocal()
         column = torch.arange(width).expand(height, width)
+        # Nearest columns outside the object; -1 and `width` if there are none.
         left = torch.where(self.mask, -1, column).cummax(dim=1).values
-        right = (
-            torch.where(self.mask, width, column).flip(1).cummin(dim=1).values.flip(1)
-        )
-        first = inverse.gather(1, left.clamp_min(0))
-        last = inverse.gather(1, right.clamp_max(width - 1))
-        between = first + (column - left) / (right - left).clamp_min(1) * (last - first)
-        found = torch.where(left < 0, last, torch.where(right == width, first, between))
-        return torch.where((left < 0) & (right == width), math.nan, found)
+        right_edges = torch.where(self.mask, width, column).flip(1)
+        right = right_edges.cummin(dim=1).values.flip(1)
+        left_disparity = disparity.gather(1, left.clamp_min(0))
+        right_disparity = disparity.gather(1, right.clamp_max(width - 1))
+        weight = (column - left) / (right - left).clamp_min(1)
+        between = left_disparity + weight * (right_disparity - left_disparity)
+        has_left = left >= 0
+        has_right = right != width
+        from_right = torch.where(has_right, between, left_disparity)
+        result = torch.where(has_left, from_right, right_disparity)
+        return torch.where(has_left | has_right, result, math.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Depth(Task):
-    """A model judges how far the object is: off by a factor of less than 1 +
-    `tolerance`, its pixels' geometric mean.
+    """Judge whether a model predicts the object's distance within a factor of 1 + `tolerance`.
 
-    Where nothing of the object is seen, every prediction is right.
+    The factor is the geometric mean over the object's pixels. If nothing of the object is
+    visible, every prediction is right.
 
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014
             (arXiv 1406.2283).
-        kind: of the model's numbers, one of `KINDS`; "" for what the network says.
+        kind: of the model's values, one of `KINDS`; "" for what the network states.
         size: of the real object, its longest side in metres, for a model that predicts
-            metres; the scene's own without it.
-        seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
+            metres; without it the scene's.
+        seek: what an attack seeks, one of `GOALS`; "" for any wrong distance.
 
     Raises:
         InputError: a value that is none of these.
@@ -146,10 +156,10 @@ class Depth(Task):
     kind: str = ""
     size: float = 0.0
     seek: str = ""
-    seen_kind: str = field(default="", metadata=tasks.FROM_RUN)  # what the network says
-    missing: str = field(
-        default="", metadata=tasks.FROM_RUN
-    )  # what its user has to say before predictions can be judged
+    # Which of `KINDS` the network states.
+    resolved_kind: str = field(default="", metadata=tasks.FROM_RUN)
+    # What the user has to state before predictions can be judged.
+    missing: str = field(default="", metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
         self.check_numbers(
@@ -160,57 +170,46 @@ class Depth(Task):
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
-        for name, known in (("kind", KINDS), ("seek", GOALS)):
-            if getattr(self, name) not in ("", *known):
+        for option, choices in (("kind", KINDS), ("seek", GOALS)):
+            value = getattr(self, option)
+            if value not in ("", *choices):
                 raise InputError(
-                    f"task depth: {name}: expected one of "
-                    f"{', '.join(known)}, got {getattr(self, name)!r}"
+                    f"task depth: {option}: expected one of "
+                    f"{', '.join(choices)}, got {value!r}"
                 )
 
-    # ---- what is read
-    # -----------------------------------------------------------------------------------------------
+    # ---- reading ----
 
     def read(self, returned: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network returned, by what its
-        numbers are. Raises ValueError: there is none.
+        """Read the map (h, w) of each image, by what its values are.
+
+        Raises:
+            ValueError: there is none.
         """
-        kind = ""
-        if isinstance(returned, Mapping):
-            kind = next((one for one in KINDS if one in returned), "")
-            returned = (
-                returned[kind]
-                if kind
-                else returned.get("predicted_depth", returned.get("depth"))
-            )
-        elif hasattr(returned, "predicted_depth"):
-            returned = returned.predicted_depth
-        elif isinstance(returned, (list, tuple)) and returned:
-            boxes = isinstance(returned[0], Tensor) and returned[0].shape[-1:] == (4,)
-            returned = None if boxes and len(returned) > 1 else returned[0]
+        kind, maps = _find_maps(returned)
+        if isinstance(maps, Tensor) and maps.ndim == 4 and maps.shape[1] == 1:
+            maps = maps[:, 0]
         if (
-            isinstance(returned, Tensor)
-            and returned.ndim == 4
-            and returned.shape[1] == 1
-        ):
-            returned = returned[:, 0]
-        if (
-            not isinstance(returned, Tensor)
-            or returned.ndim != 3
-            or len(returned) != count
-            or 0 in returned.shape
+            not isinstance(maps, Tensor)
+            or maps.ndim != 3
+            or len(maps) != count
+            or 0 in maps.shape
         ):
             raise ValueError(
                 "expected a number for each pixel, (N, height, width) or (N, 1, "
                 "height, width), or a mapping with "
                 f"these under predicted_depth or {', '.join(KINDS)}"
             )
-        return [{kind: one} for one in returned.float()]
+        return [{kind: depth_map} for depth_map in maps.float()]
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Depth:
-        """See `Task.on`. Raises InputError: the model was loaded for another task or
-        with names of classes, or there is a target.
+        """See `Task.on`.
+
+        Raises:
+            InputError: the model was loaded for another task or with names of classes, or
+                there is a target.
         """
         if model.read is None:
             raise InputError(
@@ -234,10 +233,12 @@ class Depth(Task):
     def after_calibration(
         self, output: Sequence[Map], truth: Distances | None
     ) -> Depth:
+        """See `Task.after_calibration`: find out what the values are."""
         kind = self.kind or next(iter(output[0]))
-        return replace(self, seen_kind=kind, missing=self._missing(kind, truth))
+        return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
     def _missing(self, kind: str, truth: Distances | None) -> str:
+        """Return what the user has to state before predictions can be judged, "" if nothing."""
         if not kind:
             return (
                 f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and "
@@ -267,21 +268,17 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        if not self.seen_kind:
+        if not self.resolved_kind:
             return ()
-        text = (
-            f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
-        )
-        if self.seen_kind == METRIC:
+        text = f"The model's numbers are read as {self.resolved_kind}: {KINDS[self.resolved_kind]}"
+        if self.resolved_kind != METRIC:
             return (
-                f"{text}, of an object of {self.size:g} m."
-                if self.size
-                else f"{text}.",
+                f"{text}, which are found by least squares on what is seen beside the "
+                "object.",
             )
-        return (
-            f"{text}, which are found by least squares on what is seen beside the "
-            "object.",
-        )
+        if self.size:
+            return (f"{text}, of an object of {self.size:g} m.",)
+        return (f"{text}.",)
 
     def check(self, facts: tasks.Facts) -> None:
         """See `Task.check`. Raises InputError: there is a label."""
@@ -289,9 +286,10 @@ class Depth(Task):
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: tasks.Facts) -> Distances:
-        """Return where the object is seen, and how far everything is. Raises
-        InputError: the lens sees so far aside that the distance along its axis says
-        nothing.
+        """Return where the object is visible, and the distance of everything.
+
+        Raises:
+            InputError: the lens sees so far from its axis that z-depth is no distance.
         """
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
             raise InputError(
@@ -305,199 +303,252 @@ class Depth(Task):
     def truth_names(self, truth: Distances) -> tuple[str, ...]:
         return (AS_FAR,)
 
-    # ---- scores
-    # -----------------------------------------------------------------------------------------------------
+    # ---- loss and score ----
 
     def loss(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return by how much more than the tolerance the object's distance is off,
-        (N,). That is the mean over its pixels of |log(judged / true)|, less log(1 +
+        """Compute how much the object's distance is off beyond the tolerance, (N,).
+
+        That is the mean over its pixels of |log(predicted / true)|, minus log(1 +
         tolerance).
         """
-        return self._each(
-            output, truth, lambda factors: factors.abs().mean() - self._bar
+        return self._map_images(
+            output,
+            truth,
+            lambda log_factors: log_factors.abs().mean() - self._log_limit,
         )
 
     def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return how near each of N outputs is to what is sought, (N,): over 0 where it
-        is a success. "nearer" and "farther" take the mean over pixels with its sign.
-        "gone" is the lesser of the loss, and of how far the share of the object's
-        relief that is left lies under a half; see `_relief`.
+        """Compute how near each of N outputs is to what is sought, (N,); over 0 if it is a
+        success.
+
+        "nearer" and "farther" take the signed mean over pixels. "gone" is the lesser of
+        the loss, and of how far the remaining fraction of the object's relief is below a
+        half; see `_relief`.
         """
         if self.minimise or not self.seek:
             return super().score(output, truth)
-        if self.seek == "gone":
-            return self._each(
-                output,
-                truth,
-                lambda f: torch.minimum(
-                    f.abs().mean() - self._bar, 0.5 - self._relief(f, truth)
-                ),
-            )
-        sign = 1.0 if self.seek == "farther" else -1.0
-        return self._each(
-            output, truth, lambda factors: sign * factors.mean() - self._bar
-        )
+
+        def score_gone(log_factors: Tensor) -> Tensor:
+            excess = log_factors.abs().mean() - self._log_limit
+            lost_relief = 0.5 - self._relief(log_factors, truth)
+            return torch.minimum(excess, lost_relief)
+
+        def score_signed(log_factors: Tensor) -> Tensor:
+            sign = 1.0 if self.seek == "farther" else -1.0
+            return sign * log_factors.mean() - self._log_limit
+
+        score_image = score_gone if self.seek == "gone" else score_signed
+        return self._map_images(output, truth, score_image)
 
     @property
-    def _bar(self) -> float:
+    def _log_limit(self) -> float:
+        """Logarithm of the factor up to which a distance is right."""
         return math.log1p(self.tolerance)
 
-    def _each(self, output: Sequence[Map], truth: Distances, value: Any) -> Tensor:
-        """A value of the logarithms of factors of the object's pixels, picture by
-        picture, (N,).
-        """
-        if not truth.seen:
-            return torch.stack(
-                [next(iter(one.values())).sum() * 0.0 - 1.0 for one in output]
-            )
-        return torch.stack([value(self._factors(one, truth)) for one in output])
+    def _map_images(
+        self,
+        output: Sequence[Map],
+        truth: Distances,
+        function: Callable[[Tensor], Tensor],
+    ) -> Tensor:
+        """Apply a function to the log factors of the object's pixels in each image, (N,).
 
-    def _factors(self, one: Map, truth: Distances) -> Tensor:
-        """log(judged / true) of each of the object's pixels, (P,); none is larger than
-        `LARGEST`.
+        The value is -1 if the object is out of view.
         """
-        judged, inverse = self._judged(one, truth)
-        mask = truth.mask.to(judged.device)
-        z = truth.z.to(judged.device)
-        ratio = judged[mask] * z[mask] if inverse else judged[mask] / z[mask]
-        logarithms = ratio.clamp(1.0 / LARGEST, LARGEST).log()
-        whole = judged.sum() * 0.0  # a number that is none anywhere in the map
-        return (-logarithms if inverse else logarithms) + whole
+        values = []
+        for depth_map in output:
+            if truth.seen:
+                values.append(function(self._log_factors(depth_map, truth)))
+            else:
+                # The product keeps the value attached to the graph.
+                values.append(next(iter(depth_map.values())).sum() * 0.0 - 1.0)
+        return torch.stack(values)
 
-    def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
-        """What the model says of every pixel, (H, W) z-depth as the truth has it, or
-        its inverse; and which of the two. A map is brought to the size of the picture
-        as transformers does it in `post_process_depth_estimation`.
+    def _log_factors(self, depth_map: Map, truth: Distances) -> Tensor:
+        """Compute log(predicted / true) of each of the object's pixels, (P,).
+
+        The factors are clamped to `LARGEST` and its inverse.
         """
-        ((said, values),) = one.items()
-        kind = self.kind or said
+        predicted, is_inverse = self._align(depth_map, truth)
+        mask = truth.mask.to(predicted.device)
+        z = truth.z.to(predicted.device)
+        if is_inverse:
+            ratio = predicted[mask] * z[mask]
+        else:
+            ratio = predicted[mask] / z[mask]
+        log_ratio = ratio.clamp(1.0 / LARGEST, LARGEST).log()
+        # A number that is NaN anywhere in the map makes all of them NaN.
+        nan_anywhere = predicted.sum() * 0.0
+        return (-log_ratio if is_inverse else log_ratio) + nan_anywhere
+
+    def _align(self, depth_map: Map, truth: Distances) -> tuple[Tensor, bool]:
+        """Return the predicted z-depth of every pixel in units of the truth, (H, W), or its
+        inverse; and whether it is the inverse.
+
+        A map is resized as transformers does it in `post_process_depth_estimation`.
+        """
+        ((stated_kind, values),) = depth_map.items()
+        kind = self.kind or stated_kind
         size = (truth.mask.shape[0], truth.mask.shape[1])
         if values.shape != size:
             values = F.interpolate(
                 values[None, None], size=size, mode="bicubic", align_corners=False
             )[0, 0]
-        z = truth.z.to(values.device)
-        at = truth.fitted.to(values.device)
         if kind == METRIC:
-            return values * (
-                (truth.metres or 1.0) / self.size if self.size else 1.0
-            ), False
-        return (
-            (_fitted(values, z.reciprocal(), at), True)
-            if kind == DISPARITY
-            else (_fitted(values, z, at), False)
-        )
+            scale = (truth.metres or 1.0) / self.size if self.size else 1.0
+            return values * scale, False
+        z = truth.z.to(values.device)
+        fit_mask = truth.fitted.to(values.device)
+        if kind == DISPARITY:
+            return _fit_scale_and_shift(values, z.reciprocal(), fit_mask), True
+        return _fit_scale_and_shift(values, z, fit_mask), False
 
-    def _relief(self, factors: Tensor, truth: Distances) -> Tensor:
-        """The share of the object's relief that is left, (): 1 where all is as it is, 0
-        where it is as far as what is behind it, in disparity, by least squares over its
-        pixels; 1 where nothing is known to be behind it.
+    def _relief(self, log_factors: Tensor, truth: Distances) -> Tensor:
+        """Compute the remaining fraction of the object's relief, ().
+
+        It is 1 if all distances are true, and 0 if the object is as far as what is behind
+        it: the least-squares coefficient over its pixels, in disparity. It is 1 if nothing
+        is known to be behind the object.
         """
         mask = truth.mask
-        inverse = truth.z[mask].reciprocal().to(factors)
-        behind = truth.behind[mask].to(factors)
-        known = behind.isfinite()
-        true = (inverse - behind)[known]
-        size = true.square().sum()
-        if float(size) <= 1e-6 * float(inverse.square().sum()):
-            return factors.sum() * 0.0 + 1.0
-        said = (inverse * (-factors).exp() - behind)[known]
-        return (said * true).sum() / size
+        disparity = truth.z[mask].reciprocal().to(log_factors)
+        behind = truth.behind[mask].to(log_factors)
+        is_known = behind.isfinite()
+        true_relief = (disparity - behind)[is_known]
+        squared_relief = true_relief.square().sum()
+        if float(squared_relief) <= 1e-6 * float(disparity.square().sum()):
+            return log_factors.sum() * 0.0 + 1.0
+        predicted_disparity = disparity * (-log_factors).exp()
+        predicted_relief = (predicted_disparity - behind)[is_known]
+        return (predicted_relief * true_relief).sum() / squared_relief
 
-    # ---- in words
-    # ---------------------------------------------------------------------------------------------------
+    # ---- predictions ----
 
     def predictions(
         self, output: Sequence[Map], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return between which numbers each map is."""
-        found: list[tuple[tasks.Prediction, ...]] = []
-        for one in output:
-            ((said, values),) = one.items()
-            low, high = (float(end) for end in values.detach().aminmax())
-            text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
-            found.append(
-                (
-                    tasks.Prediction(
-                        text if math.isfinite(low + high) else tasks.NOT_A_NUMBER
-                    ),
-                )
-            )
-        return found
+        """Return the range of the values of each map."""
+        predictions_of_images: list[tuple[tasks.Prediction, ...]] = []
+        for depth_map in output:
+            ((stated_kind, values),) = depth_map.items()
+            lowest, highest = (float(limit) for limit in values.detach().aminmax())
+            kind = self.kind or stated_kind or "numbers"
+            label = f"{kind} from {lowest:.3g} to {highest:.3g}"
+            if not math.isfinite(lowest + highest):
+                label = tasks.NOT_A_NUMBER
+            predictions_of_images.append((tasks.Prediction(label),))
+        return predictions_of_images
 
     def said(
         self, output: Sequence[Map], truth: Distances, margins: Sequence[float]
     ) -> list[tasks.Said]:
-        """See `Task.said`; the payload has the factor by which the distance is off,
-        what is left of the relief, and where scale and shift were found.
+        """See `Task.said`; the payload has the factor by which the distance is off, the
+        remaining relief, and where scale and shift were fitted.
         """
         if not truth.seen:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
-        found: list[tasks.Said] = []
+        results: list[tasks.Said] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        for one, margin in zip(output, margins, strict=True):
-            factors = self._factors(one, truth)
-            mean = float(factors.mean())
-            relief = float(self._relief(factors, truth))
+        for depth_map, margin in zip(output, margins, strict=True):
+            log_factors = self._log_factors(depth_map, truth)
+            mean_log_factor = float(log_factors.mean())
+            relief = float(self._relief(log_factors, truth))
             payload: dict[str, tasks.JsonValue] = {
                 "distance": round(distance, 4),
-                "judged": round(distance * math.exp(mean), 4),
-                "factor": round(math.exp(float(factors.abs().mean())), 4),
+                "judged": round(distance * math.exp(mean_log_factor), 4),
+                "factor": round(math.exp(float(log_factors.abs().mean())), 4),
                 "relief": round(relief, 4),
             }
-            if (self.kind or next(iter(one))) != METRIC:
+            if (self.kind or next(iter(depth_map))) != METRIC:
                 payload["fitted"] = (
                     "beside the object" if truth.anchored else "in the whole picture"
                 )
-            holds = {
-                "nearer": -mean > self._bar,
-                "farther": mean > self._bar,
-                "gone": relief < 0.5,
-            }
-            names = sorted(
-                ("gone", "nearer", "farther"), key=lambda name: name != self.seek
+            label = (
+                AS_FAR if margin >= 0.0 else self._error_label(mean_log_factor, relief)
             )
-            wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
-            found.append(
-                (tasks.Prediction(AS_FAR if margin >= 0.0 else wrong), payload)
-            )
-        return found
+            results.append((tasks.Prediction(label), payload))
+        return results
+
+    def _error_label(self, mean_log_factor: float, relief: float) -> str:
+        """Return the label of a wrong distance; what is sought comes first."""
+        holds = {
+            "gone": relief < 0.5,
+            "nearer": -mean_log_factor > self._log_limit,
+            "farther": mean_log_factor > self._log_limit,
+        }
+        sought_first = sorted(holds, key=lambda goal: goal != self.seek)
+        for goal in sought_first:
+            if holds[goal]:
+                return LABELS[goal]
+        return OUT_OF_SHAPE
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: the object, its pixels of which the distance is right, and
-        the disparity of everything.
+        """See `Task.marks`: the object, its pixels whose distance is right, and the
+        disparity of everything.
         """
-        found = []
-        for one in output:
-            marks = [
-                tasks.Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())
-            ]
-            kind = self.kind or next(iter(one))
-            if truth.seen and not self._missing(
-                kind, truth if kind == METRIC else None
-            ):
-                right = torch.zeros_like(truth.mask)
-                right[truth.mask] = (
-                    self._factors(one, truth).detach().abs() <= self._bar
-                ).to(right.device)
-                judged, inverse = self._judged(one, truth)
-                near = (
-                    judged if inverse else judged.clamp_min(1.0 / LARGEST).reciprocal()
-                )
-                marks.append(
-                    tasks.Mark("disparity", False, mask=right, map=near.detach().cpu())
-                )
-            found.append(marks)
-        return found
+        true_mark = tasks.Mark(
+            "disparity", True, mask=truth.mask, map=truth.z.reciprocal()
+        )
+        marks_of_images = []
+        for depth_map in output:
+            marks = [true_mark]
+            kind = self.kind or next(iter(depth_map))
+            # Whether the fit is reliable does not matter for what is drawn.
+            missing = self._missing(kind, truth if kind == METRIC else None)
+            if truth.seen and not missing:
+                marks.append(self._predicted_mark(depth_map, truth))
+            marks_of_images.append(marks)
+        return marks_of_images
+
+    def _predicted_mark(self, depth_map: Map, truth: Distances) -> tasks.Mark:
+        """Return the predicted disparity, with the object's pixels that are right."""
+        log_factors = self._log_factors(depth_map, truth).detach()
+        is_right = torch.zeros_like(truth.mask)
+        is_right[truth.mask] = (log_factors.abs() <= self._log_limit).to(
+            is_right.device
+        )
+        predicted, is_inverse = self._align(depth_map, truth)
+        if is_inverse:
+            disparity = predicted
+        else:
+            disparity = predicted.clamp_min(1.0 / LARGEST).reciprocal()
+        return tasks.Mark(
+            "disparity", False, mask=is_right, map=disparity.detach().cpu()
+        )
 
 
-def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
-    """Return a scale times the values (H, W) plus a shift, the nearest to what is
-    wanted where `at` (H, W) says, by least squares; there is a pixel there, and what is
-    wanted is finite. A scale is not negative: what the model holds for near stays near.
+def _find_maps(returned: Any) -> tuple[str, Any]:
+    """Return what the network states its values are, "" if nothing, and its maps."""
+    if isinstance(returned, Mapping):
+        kind = next((kind for kind in KINDS if kind in returned), "")
+        if kind:
+            return kind, returned[kind]
+        return "", returned.get("predicted_depth", returned.get("depth"))
+    if hasattr(returned, "predicted_depth"):
+        return "", returned.predicted_depth
+    if isinstance(returned, (list, tuple)) and returned:
+        first = returned[0]
+        is_boxes = isinstance(first, Tensor) and first.shape[-1:] == (4,)
+        return "", None if is_boxes and len(returned) > 1 else first
+    return "", returned
+
+
+def _fit_scale_and_shift(values: Tensor, expected: Tensor, mask: Tensor) -> Tensor:
+    """Return a scale times the values plus a shift, fitted by least squares.
+
+    Args:
+        values: (H, W).
+        expected: (H, W), finite in the mask.
+        mask: (H, W) bool, the pixels of the fit, at least one.
+
+    Returns:
+        (H, W). The scale is not negative: what the model predicts as near stays near.
     """
-    x = values[at]
-    y = wanted[at]
-    x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()
+    x = values[mask]
+    y = expected[mask]
+    x_mean = x.mean()
+    y_mean = y.mean()
+    x = x - x_mean
+    y = y - y_mean
     scale = ((x * y).sum() / x.square().sum().clamp_min(1e-20)).clamp_min(0.0)
-    return level + scale * (values - middle)
+    return y_mean + scale * (values - x_mean)

@@ -1,11 +1,10 @@
-"""Object detection: whether a model finds the object, by a box where it is and the
-right name.
+"""Judge object detection: a box at the object with a right class counts as found.
 
-Boxes with a score of every class are suppressed class by class (greedily) before
-anybody sees one. The object is found by a right box that is left, and has vanished
-where there was none before either; a box that is a success is one that is left. Boxes
-that come with their labels count as they are. Scores p are compared as log-odds, log(p
-/ (1 - p)).
+Dense outputs (a score of every class per box) go through greedy non-maximum
+suppression per class first. The object is found by a right box that survives it, and
+has vanished where there was none before suppression either; a box that makes an attack
+a success must survive too. Boxes that come with labels count as they are. Scores p are
+compared as log-odds, log(p / (1 - p)).
 """
 
 from __future__ import annotations
@@ -62,15 +61,15 @@ GOALS = {
     "object: they are loose or elsewhere",
     "create": "a box is found where nothing is",
 }
-"""What an attack may be after, by the name of the objective."""
+"""What an attack may seek, by the name of the objective."""
 
 MOST = 8
 LEAST = 0.1
-"""Most boxes that are kept of a picture; the least score of one, and of one that is
-suppressed.
+"""Maximum number of boxes stored per image; minimum score of a box that is stored or
+takes part in suppression.
 """
 
-# fraction of a box from which on it is on the object, however little it overlaps
+# A box of which this fraction lies on the object is on it, whatever its overlap.
 ON_IT = 0.5
 
 LABELS = {
@@ -78,22 +77,19 @@ LABELS = {
     Outcome.PHANTOM: "{} elsewhere",
     Outcome.MISSED: f"{NO}{{}}",
 }
-"""What a prediction is called by its outcome and class; by its class alone where it is
-not here.
-"""
+"""Label of a prediction by its outcome; other outcomes are labelled by their class."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What becomes of the object in the boxes of a picture.
+    """What becomes of the object in the detections of one image.
 
     Attributes:
-        outcome: None where nothing of the object is to be seen, and nothing is found
-            either.
-        index: of the class that it is about: the one that is found, or the right one.
-        score: of the box that decides; None where that is no number.
-        iou: intersection over union of that box with the true one; None where there is
-            no box, or no true one.
+        outcome: None if the object is out of view and nothing is detected.
+        index: class of the deciding box, or the first right class if there is none.
+        score: of the deciding box; None if it is not finite.
+        iou: intersection over union of that box with the true one; None if there is
+            no such box, or no true one.
     """
 
     outcome: Outcome | None
@@ -104,30 +100,28 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Detection(ClassTask):
-    """A model finds the object: one of its boxes has a right name, a score of
-    `confidence` and overlaps the true box.
+    """Judge whether a model detects the object.
 
-    Where the object is not seen at all there is nothing to find, and every prediction
-    is right.
+    It does if one of its boxes has a right class, a score of `confidence` or more, and
+    overlaps the true box. If the object is out of view there is nothing to detect, and
+    every prediction is right.
 
     Args:
-        iou: least intersection over union with the true box.
-        confidence: least score of a box that counts.
-        boxes: how the model gives a box, one of `FORMS`; "" for xyxy, of YOLO's heads
-            cxcywh.
-        suppression: intersection over union from which two boxes of a class are one
-            thing, of which the better one is left; 1 where a model's own boxes should
-            all count.
-        unit: of these numbers: "fractions" of the picture's sides, or "pixels" of the
-            model's input; "" for what the boxes in a picture of noise look like, or in
-            a clean picture of the scene where it finds none in noise.
+        iou: minimum intersection over union with the true box.
+        confidence: minimum score of a box that counts.
+        boxes: format of a box, one of `FORMS`; "" for xyxy, or cxcywh for YOLO heads.
+        suppression: intersection over union from which two boxes of a class are
+            duplicates, of which the better one stays; 1 disables suppression.
+        unit: of box coordinates: "fractions" of the image's width and height, or
+            "pixels" of the model's input; "" to infer it from the boxes in an image of
+            noise, or in a clean image of the scene if none are found in noise.
         order: of outputs without names, or of the columns of rows: "boxes labels
-            scores", say, with "batch" for the number of the picture; of YOLO's heads
-            "boxes scores" or "boxes objectness scores", with "channels first" or
-            "channels last" after it; of DETR's "boxes logits", or "boxes logits
-            nothing" where the last class is no thing; "" for what types and numbers
-            show.
-        seek: what an attack is after, one of `GOALS`.
+            scores", say, with "batch" for the index of the image; for YOLO heads
+            "boxes scores" or "boxes objectness scores", optionally followed by
+            "channels first" or "channels last"; for DETR "boxes logits", or "boxes
+            logits nothing" if the last class means no object; "" to infer it from
+            types and values.
+        seek: what an attack seeks, one of `GOALS`.
 
     Raises:
         InputError: a value that is none of these.
@@ -145,20 +139,21 @@ class Detection(ClassTask):
     seek: str = "vanish"
     # of the model, (height, width) in pixels
     input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
-    # what the model's own outputs show; "" where not yet
-    seen_unit: str = field(default="", metadata=FROM_RUN)
-    seen_order: str = field(default="", metadata=FROM_RUN)
-    # only numbers tell scores from classes in its outputs
-    undecided: bool = field(default=False, metadata=FROM_RUN)
-    # (A, B) of what is read as a YOLO's head
-    shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
-    # mask coefficients stand in its outputs, and are left out
-    masks: bool = field(default=False, metadata=FROM_RUN)
-    # its network says what its boxes are, see `KNOWN`
-    told: bool = field(default=False, metadata=FROM_RUN)
-    # a row of NaN says that nothing is found
+    # Inferred from the model's outputs; "" as long as they leave it open.
+    inferred_unit: str = field(default="", metadata=FROM_RUN)
+    inferred_order: str = field(default="", metadata=FROM_RUN)
+    # Only the values distinguish scores from classes in the outputs.
+    is_order_ambiguous: bool = field(default=False, metadata=FROM_RUN)
+    # (A, B) of an output that is read as a YOLO head.
+    head_shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
+    # The outputs contain mask coefficients, which are ignored.
+    ignores_masks: bool = field(default=False, metadata=FROM_RUN)
+    # The network declares the format of its boxes, see `KNOWN`.
+    has_declared_format: bool = field(default=False, metadata=FROM_RUN)
+    # The model fills its output with rows of NaN when it detects nothing.
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
-    doubts: str = field(default="", metadata=FROM_RUN)  # what is odd about its boxes
+    # Why the boxes may be read wrongly; "" if nothing is odd.
+    doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -175,17 +170,9 @@ class Detection(ClassTask):
             outputs.checked_order(self.order or outputs.ORDERS[0])
         except ValueError as error:
             raise InputError(f"task detection: order: {error}") from None
-        for name, known in (
-            ("boxes", ("", *FORMS)),
-            ("unit", ("", *UNITS)),
-            ("seek", tuple(GOALS)),
-        ):
-            if getattr(self, name) not in known:
-                expected = ", ".join(filter(None, known))
-                raise InputError(
-                    f"task detection: {name}: expected one of {expected}, "
-                    f"got {getattr(self, name)!r}"
-                )
+        self._check_choice("boxes", ("", *FORMS))
+        self._check_choice("unit", ("", *UNITS))
+        self._check_choice("seek", tuple(GOALS))
         if self.target is not None and self.seek not in ("mislabel", "create"):
             raise InputError(
                 f"target: {self.seek} has none; add `objective` mislabel or create"
@@ -196,113 +183,153 @@ class Detection(ClassTask):
                 f"is to be found, got {self.seek}"
             )
 
+    def _check_choice(self, option: str, choices: Sequence[str]) -> None:
+        """Raise InputError if the value of an option is none of its choices."""
+        value = getattr(self, option)
+        if value not in choices:
+            expected = ", ".join(filter(None, choices))
+            raise InputError(
+                f"task detection: {option}: expected one of {expected}, got {value!r}"
+            )
+
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Detection:
-        found = super().on(model, target=target, minimise=minimise)
+        """See `Task.on`. One image of noise is run to infer the output's format."""
+        task = super().on(model, target=target, minimise=minimise)
+        generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
-            noise = torch.rand(
-                (1, *model.input_size, 3), generator=torch.Generator().manual_seed(0)
-            )
+            noise = torch.rand((1, *model.input_size, 3), generator=generator)
             output = model(noise)
-        blank = any("blank" in one for one in output)
-        told = not (self.boxes or self.unit) and getattr(model.module, KNOWN, False)
-        return replace(
-            found, input_size=model.input_size, fills_with_nan=blank, told=told
-        )._having_seen(output)
+        fills_with_nan = any("blank" in detections for detections in output)
+        has_format_options = bool(self.boxes or self.unit)
+        is_declared = not has_format_options and getattr(model.module, KNOWN, False)
+        task = replace(
+            task,
+            input_size=model.input_size,
+            fills_with_nan=fills_with_nan,
+            has_declared_format=is_declared,
+        )
+        return task._infer_format(output)
 
     @property
     def calibrates(self) -> bool:
-        return not (self.told or (self.boxes and self.unit)) or (
-            self.undecided and not self.order
-        )
+        knows_format = self.has_declared_format or bool(self.boxes and self.unit)
+        needs_order = self.is_order_ambiguous and not self.order
+        return not knows_format or needs_order
 
     def after_calibration(
         self, output: Sequence[Detections], truth: Place | None
     ) -> Detection:
-        found = self._having_seen(output)
-        output = found._boxed(output)
-        reading = found._reading
-        if truth is not None and truth.shares is not None:
-            each = [
-                (one["boxes"], found._of(one, truth.labels))
-                for one in found._settled(output)
-            ]
-            right = torch.cat([raw[score >= LEAST] for raw, score in each])
-            if len(right):
-                better = reading.better(right, truth.shares, self.iou)
-                said = (
-                    f"one of them is nearer to the object with {better}"
-                    if better
-                    else reading.fault(right)
-                )
-                return replace(found, doubts=said)
-        boxes = strongest_boxes(output)
-        return replace(
-            found,
-            doubts=reading.fault(boxes)
-            and f"{reading.fault(boxes)}{reading.instead(boxes)}",
-        )
+        """See `Task.after_calibration`: note what is odd about the boxes.
 
-    def _having_seen(self, output: Sequence[Detections]) -> Detection:
-        """The task with what an output of its model shows of orders and units."""
-        grids = [one["raw"] for one in output if "raw" in one]
-        last = (
-            any("logits" in one for one in output)
-            and self.named
-            and names_nothing(self.labels[-1])
-        )
-        head = self._head or (QUERIES[1] if last else "")
-        try:
-            order = outputs.order_in(
-                output, len(self.labels) if self.named else None, head
-            )
-        except ValueError as error:
-            what = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
-            asked = f"; {ASK_ORDER}" if any("either" in one for one in output) else ""
-            raise InputError(f"task detection: {what}{error}{asked}") from None
-        # mask coefficients stand beside the scores of a picture's boxes
-        masks = any("beside" in one and "raw" not in one for one in output)
-        if grids:
-            length = grids[0].shape[0 if order.endswith(LAYOUTS[0]) else 1]
-            masks |= length > len(self.labels) + next(
-                start for head, start in HEADS.items() if order.startswith(head)
-            )
-        found = replace(
-            self,
-            seen_order=order or self.seen_order,
-            undecided=self.undecided or any("either" in one for one in output),
-            shape=tuple(grids[0].shape) if grids else self.shape,
-            masks=self.masks or masks,
-        )
-        boxed = found._boxed(output)
-        return replace(
-            found,
-            seen_unit=UNITS[1]
-            if self.told
-            else unit_in(strongest_boxes(boxed)) or self.seen_unit,
-            fills_with_nan=self.fills_with_nan
-            or any("blank" in one and len(one["boxes"]) for one in boxed),
-        )
-
-    def _boxed(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """What the model returned, with the boxes of YOLO's heads and the scores of
-        DETR's found.
+        If there are right boxes and a true one, the box format that fits best is compared
+        with the one in use. Otherwise the strongest boxes are checked for plausibility.
         """
-        return (
-            self._settled(output)
-            if any("raw" in one or "logits" in one for one in output)
-            else output
+        task = self._infer_format(output)
+        output = task._resolve_grids(output)
+        box_format = task._reading
+        if truth is not None and truth.shares is not None:
+            right_boxes = task._find_boxes_of_classes(output, truth.labels)
+            if len(right_boxes):
+                better_format = box_format.better(right_boxes, truth.shares, self.iou)
+                if better_format:
+                    doubts = f"one of them is nearer to the object with {better_format}"
+                else:
+                    doubts = box_format.fault(right_boxes)
+                return replace(task, doubts=doubts)
+        boxes = strongest_boxes(output)
+        fault = box_format.fault(boxes)
+        doubts = fault and f"{fault}{box_format.instead(boxes)}"
+        return replace(task, doubts=doubts)
+
+    def _find_boxes_of_classes(
+        self, output: Sequence[Detections], classes: Labels
+    ) -> Tensor:
+        """Return the boxes (D, 4), as they came, of all images with one of the classes."""
+        selected = []
+        for detections in self._resolve_labels(output):
+            scores = self._scores_of_classes(detections, classes)
+            selected.append(detections["boxes"][scores >= LEAST])
+        return torch.cat(selected)
+
+    def _infer_format(self, output: Sequence[Detections]) -> Detection:
+        """Return the task with the order and unit that an output of its model shows."""
+        grids = [detections["raw"] for detections in output if "raw" in detections]
+        is_ambiguous = any("either" in detections for detections in output)
+        order = self._infer_order(output)
+        has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
+        task = replace(
+            self,
+            inferred_order=order or self.inferred_order,
+            is_order_ambiguous=self.is_order_ambiguous or is_ambiguous,
+            head_shape=tuple(grids[0].shape) if grids else self.head_shape,
+            ignores_masks=has_masks,
         )
+        resolved = task._resolve_grids(output)
+        if self.has_declared_format:
+            unit = UNITS[1]
+        else:
+            unit = unit_in(strongest_boxes(resolved)) or self.inferred_unit
+        has_nan_rows = any(
+            "blank" in detections and len(detections["boxes"])
+            for detections in resolved
+        )
+        return replace(
+            task,
+            inferred_unit=unit,
+            fills_with_nan=self.fills_with_nan or has_nan_rows,
+        )
+
+    def _infer_order(self, output: Sequence[Detections]) -> str:
+        """Return the order that an output shows, "" if it leaves it open.
+
+        Raises:
+            InputError: the output contradicts the options or the number of classes.
+        """
+        grids = [detections["raw"] for detections in output if "raw" in detections]
+        has_logits = any("logits" in detections for detections in output)
+        head = self._head
+        if not head and has_logits and self.named and names_nothing(self.labels[-1]):
+            head = QUERIES[1]
+        n_classes = len(self.labels) if self.named else None
+        try:
+            return outputs.order_in(output, n_classes, head)
+        except ValueError as error:
+            shape = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
+            is_ambiguous = any("either" in detections for detections in output)
+            hint = f"; {ASK_ORDER}" if is_ambiguous else ""
+            raise InputError(f"task detection: {shape}{error}{hint}") from None
+
+    def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
+        """Whether mask coefficients accompany the scores of boxes in an output."""
+        for detections in output:
+            if "map_channels" in detections and "raw" not in detections:
+                return True
+        grids = [detections["raw"] for detections in output if "raw" in detections]
+        if not grids:
+            return False
+        channel_axis = 0 if order.endswith(LAYOUTS[0]) else 1
+        n_channels = grids[0].shape[channel_axis]
+        first_score = next(
+            start for head, start in HEADS.items() if order.startswith(head)
+        )
+        return n_channels > len(self.labels) + first_score
+
+    def _resolve_grids(self, output: Sequence[Detections]) -> Sequence[Detections]:
+        """Return an output with YOLO grids split and DETR logits turned into scores."""
+        if any("raw" in detections or "logits" in detections for detections in output):
+            return self._resolve_labels(output)
+        return output
 
     @property
     def ambiguities(self) -> str:
-        if self.undecided and not (self.order or self.seen_order):
+        if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
                 f"the model does; {ASK_ORDER}"
             )
-        if not (self.unit or self.seen_unit):
+        if not (self.unit or self.inferred_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in "
                 "noise and in the clean scene "
@@ -314,42 +341,42 @@ class Detection(ClassTask):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        said = []
-        order = as_option(f"order: {self.seen_order}")
-        if self.shape and not self.order:
-            said.append(
-                f"The detector's output of {self.shape} is read as a YOLO's: {order}."
+        remarks = []
+        order = as_option(f"order: {self.inferred_order}")
+        is_order_inferred = not self.order
+        if self.head_shape and is_order_inferred:
+            remarks.append(
+                f"The detector's output of {self.head_shape} is read as a YOLO's: {order}."
             )
-        if self.seen_order in QUERIES and not self.order:
-            said.append(f"The detector's output is read as a DETR's: {order}.")
-        if self.masks:
-            said.append(
+        if self.inferred_order in QUERIES and is_order_inferred:
+            remarks.append(f"The detector's output is read as a DETR's: {order}.")
+        if self.ignores_masks:
+            remarks.append(
                 "The detector's masks are left out: its boxes and scores are read."
             )
-        if self.undecided and self.seen_order and not self.order:
-            told = (
-                "Scores and classes of the detector's boxes are told apart by "
-                "their "
-                "values"
+        if self.is_order_ambiguous and self.inferred_order and is_order_inferred:
+            remarks.append(
+                "Scores and classes of the detector's boxes are told apart by their "
+                f"values: they are read as {order}."
             )
-            said.append(f"{told}: they are read as {order}.")
         if self.doubts:
-            said.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
-        return tuple(said)
+            remarks.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
+        return tuple(remarks)
 
     @property
     def _reading(self) -> Reading:
-        form = self.boxes or (
-            "cxcywh" if (self._head or self.seen_order) in TOLD_BY_CLASSES else FORMS[0]
-        )
-        return Reading(form, self.unit or self.seen_unit or UNITS[1], self.input_size)
+        """How the model's boxes are read: by the options, else as inferred."""
+        order = self._head or self.inferred_order
+        default_form = "cxcywh" if order in TOLD_BY_CLASSES else FORMS[0]
+        unit = self.unit or self.inferred_unit or UNITS[1]
+        return Reading(self.boxes or default_form, unit, self.input_size)
 
     @property
     def _head(self) -> str:
-        """The head of `HEADS`, or the one of `QUERIES`, that `order` says; "" where it
-        says none.
-        """
-        order = " ".join(outputs.checked_order(self.order)) if self.order else ""
+        """The head of `HEADS` or `QUERIES` that the option `order` names; "" if none."""
+        if not self.order:
+            return ""
+        order = " ".join(outputs.checked_order(self.order))
         return order if order in TOLD_BY_CLASSES else ""
 
     def seeking(self, objective: str) -> Detection:
@@ -363,18 +390,17 @@ class Detection(ClassTask):
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
 
     def truth(self, facts: Facts) -> Place:
+        """See `Task.truth`: the true box, and those of other things of its classes."""
         height, width = facts.mask.shape
-        right = self.right_classes(facts)
-        others = [other.box for other in facts.others if self._has_class(other, right)]
-        return Place(
-            right,
-            facts.box,
-            (height, width),
-            tuple(box for box in others if box is not None),
-        )
+        right_classes = self.right_classes(facts)
+        other_boxes = []
+        for other in facts.others:
+            if self._has_class(other, right_classes) and other.box is not None:
+                other_boxes.append(other.box)
+        return Place(right_classes, facts.box, (height, width), tuple(other_boxes))
 
     def _has_class(self, facts: Facts, classes: Labels) -> bool:
-        """Whether a thing's own label is one of some classes of the model."""
+        """Whether a thing's own label is one of these classes of the model."""
         try:
             return not set(classes).isdisjoint(self.right_classes(facts))
         except InputError:  # it has no label, or none that the model knows
@@ -383,352 +409,413 @@ class Detection(ClassTask):
     def truth_names(self, truth: Place) -> tuple[str, ...]:
         return self.names(truth.labels)
 
-    # ---- scores
-    # -----------------------------------------------------------------------------------------------------
+    # ---- loss and score ----
 
     def loss(self, output: Sequence[Detections], truth: Place) -> Tensor:
-        """Return how far the best right box stays below `confidence`, in log-odds,
-        (N,). Of `create`: how far the best box where nothing is stands above it.
+        """Compute by how much the best right box is below `confidence`, in log-odds.
+
+        Returns:
+            (N,), over 0 if the object is not found. For `create`: by how much the best
+            box where nothing is exceeds `confidence`.
         """
-        wrong = self._create if self.seek == "create" else self._vanish
-        return self._each(output, truth, lambda one: wrong(self._left(one), truth))
+        loss_of_image = (
+            self._score_create if self.seek == "create" else self._score_vanish
+        )
+        return self._map_images(
+            output,
+            truth,
+            lambda detections: loss_of_image(self._suppress(detections), truth),
+        )
 
     def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
-        """Return how near each of N outputs is to what is sought, (N,), in log-odds:
-        over 0 where it is a success.
+        """Compute how near each output is to what is sought, (N,), in log-odds.
+
+        It is over 0 if the output is a success.
         """
         if self.minimise:
             return -self.loss(output, truth)
-        reach: Callable[[Detections, Place], Tensor] = getattr(self, f"_{self.seek}")
-        return self._each(output, truth, lambda one: reach(one, truth))
+        score_by_goal: dict[str, Callable[[Detections, Place], Tensor]] = {
+            "vanish": self._score_vanish,
+            "mislabel": self._score_mislabel,
+            "displace": self._score_displace,
+            "create": self._score_create,
+        }
+        score_of_image = score_by_goal[self.seek]
+        return self._map_images(
+            output, truth, lambda detections: score_of_image(detections, truth)
+        )
 
-    def _each(
+    def _map_images(
         self,
         output: Sequence[Detections],
         truth: Place,
-        value: Callable[[Detections], Tensor],
+        function: Callable[[Detections], Tensor],
     ) -> Tensor:
-        """A value of each picture, (N,); NaN where a number that counts is none, -1
-        where there is nothing to find.
+        """Apply a function to the detections of each image, (N,).
+
+        The value is NaN if a number that counts is not finite, and -1 if there is
+        nothing to find.
         """
-        hidden = truth.box is None and self.seek != "create"
-        return torch.stack([
-            one["scores"].sum() * math.nan if self._broken(one)
-            else one["scores"].sum() * 0.0 - 1.0 if hidden
-            else value(one)
-            for one in self._read(output)
-        ])  # fmt: skip
+        is_out_of_view = truth.box is None and self.seek != "create"
+        values = []
+        for detections in self._read(output):
+            if self._is_broken(detections):
+                value = detections["scores"].sum() * math.nan
+            elif is_out_of_view:
+                # The product keeps the value attached to the graph.
+                value = detections["scores"].sum() * 0.0 - 1.0
+            else:
+                value = function(detections)
+            values.append(value)
+        return torch.stack(values)
 
-    def _vanish(self, one: Detections, truth: Place) -> Tensor:
-        return self._bar - log_odds(
-            best_of(self._of(one, truth.labels), self._at(one, truth))
-        )
+    def _score_vanish(self, detections: Detections, truth: Place) -> Tensor:
+        """Compute by how much the best right box at the object is below `confidence`."""
+        right_score = self._scores_of_classes(detections, truth.labels)
+        best_score = best_of(right_score, self._is_at_object(detections, truth))
+        return self._min_log_odds - log_odds(best_score)
 
-    def _mislabel(self, one: Detections, truth: Place) -> Tensor:
-        called = (
-            log_odds(
-                best_of(
-                    self._rivals(self._left(one), truth.labels), self._at(one, truth)
-                )
-            )
-            - self._bar
-        )
-        return torch.minimum(self._vanish(one, truth), called)
-
-    def _displace(self, one: Detections, truth: Place) -> Tensor:
-        """The lesser of two: how far the best overlap of a box that counts is under
-        `iou`, and that some box counts. The first is in units in which a small step
-        from `iou` is as long as one in log-odds.
+    def _score_mislabel(self, detections: Detections, truth: Place) -> Tensor:
+        """Compute the lesser of two: that the object vanishes, and that a box at it has a
+        wrong class.
         """
-        scores = self._of(one, truth.labels)
-        sure = log_odds(best_of(scores)) - self._bar
-        away = (
-            self.iou - best_of(overlap_with(one, truth), scores >= self.confidence)
-        ) / (self.iou * (1.0 - self.iou))
-        return torch.minimum(away, sure)
+        wrong_score = self._scores_of_rivals(self._suppress(detections), truth.labels)
+        best_score = best_of(wrong_score, self._is_at_object(detections, truth))
+        wrong_lead = log_odds(best_score) - self._min_log_odds
+        return torch.minimum(self._score_vanish(detections, truth), wrong_lead)
 
-    def _create(self, one: Detections, truth: Place) -> Tensor:
-        return log_odds(best_of(self._as_phantoms(self._left(one), truth))) - self._bar
+    def _score_displace(self, detections: Detections, truth: Place) -> Tensor:
+        """Compute the lesser of two: how far the best overlap of a box that counts is
+        below `iou`, and that some box counts.
 
-    def _at(self, one: Detections, truth: Place) -> Tensor:
-        """Which boxes are where the object is, (D,) bool."""
-        return overlap_with(one, truth) >= self.iou
+        The first is scaled so that a small step from `iou` is as long as one in log-odds.
+        """
+        scores = self._scores_of_classes(detections, truth.labels)
+        score_lead = log_odds(best_of(scores)) - self._min_log_odds
+        best_overlap = best_of(
+            overlap_with(detections, truth), scores >= self.confidence
+        )
+        overlap_lead = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
+        return torch.minimum(overlap_lead, score_lead)
+
+    def _score_create(self, detections: Detections, truth: Place) -> Tensor:
+        """Compute by how much the best box where nothing is exceeds `confidence`."""
+        phantom_score = self._phantom_scores(self._suppress(detections), truth)
+        return log_odds(best_of(phantom_score)) - self._min_log_odds
+
+    def _is_at_object(self, detections: Detections, truth: Place) -> Tensor:
+        """Which boxes fit the true box, (D,) bool."""
+        return overlap_with(detections, truth) >= self.iou
 
     @property
-    def _bar(self) -> float:
+    def _min_log_odds(self) -> float:
+        """`confidence` as log-odds."""
         return math.log(self.confidence / (1.0 - self.confidence))
 
-    # ---- boxes and scores of one picture
-    # ----------------------------------------------------------------------------
+    # ---- boxes and scores of one image ----
 
-    def _settled(self, output: Sequence[Detections]) -> list[Detections]:
-        """What the model returned, with scores and classes told apart, boxes as they
-        came.
-        """
+    def _resolve_labels(self, output: Sequence[Detections]) -> list[Detections]:
+        """Return an output with scores and classes identified, boxes as they came."""
+        n_classes = len(self.labels) or None
         try:
             return [
-                outputs.settled(one, self.seen_order, len(self.labels) or None)
-                for one in output
+                outputs.settled(detections, self.inferred_order, n_classes)
+                for detections in output
             ]
         except ValueError as error:
             raise InputError(f"task detection: {error}") from None
 
     def _read(self, output: Sequence[Detections]) -> list[Detections]:
-        """What the model returned, with boxes as shares of the picture; what names no
-        thing has a score of 0.
+        """Return the detections of each image with boxes as fractions of the image.
+
+        Classes that stand for nothing get a score of 0. Boxes that are not finite are
+        dropped if all their scores are below the minimum.
         """
-        found = list[Detections]()
-        reading = self._reading
-        nothing = torch.tensor(self.nothing, dtype=torch.long)
-        for one in self._settled(output):
-            boxes = reading.fractions(one["boxes"])
-            scores = one["scores"]
-            if "labels" in one:
-                scores = scores.masked_fill(
-                    torch.isin(one["labels"], nothing.to(scores.device)), 0.0
+        images = list[Detections]()
+        box_format = self._reading
+        nothing_classes = torch.tensor(self.nothing, dtype=torch.long)
+        for detections in self._resolve_labels(output):
+            boxes = box_format.fractions(detections["boxes"])
+            scores = detections["scores"]
+            if "labels" in detections:
+                is_nothing = torch.isin(
+                    detections["labels"], nothing_classes.to(scores.device)
                 )
-            elif len(nothing):
-                scores = scores.index_fill(1, nothing.to(scores.device), 0.0)
-            read = {**one, "boxes": boxes, "scores": scores}
-            there = boxes.detach().isfinite().all(dim=1) | ~(
-                numbers_of(read) < self._least
-            ).all(dim=1)
-            if not bool(there.all()):
-                read = {
-                    name: part if name == "blank" else part[there]
-                    for name, part in read.items()
+                scores = scores.masked_fill(is_nothing, 0.0)
+            elif len(nothing_classes):
+                scores = scores.index_fill(1, nothing_classes.to(scores.device), 0.0)
+            resolved = {**detections, "boxes": boxes, "scores": scores}
+            is_finite = boxes.detach().isfinite().all(dim=1)
+            is_weak = (numbers_of(resolved) < self._min_score).all(dim=1)
+            counts = is_finite | ~is_weak
+            if not bool(counts.all()):
+                resolved = {
+                    name: values if name == "blank" else values[counts]
+                    for name, values in resolved.items()
                 }
-            found.append(read)
-        return found
+            images.append(resolved)
+        return images
 
     @property
-    def _least(self) -> float:
+    def _min_score(self) -> float:
+        """The minimum score of a box that is stored or takes part in suppression."""
         return min(LEAST, self.confidence)
 
-    def _broken(self, one: Detections) -> bool:
-        """Whether a score, or the place of what has one, is not a number; or all rows
-        are NaN that do not fill up.
+    def _is_broken(self, detections: Detections) -> bool:
+        """Whether a score or a box that counts is not finite, or all rows are NaN although
+        the model does not fill its outputs with NaN.
         """
-        blank = "blank" in one and not len(one["boxes"]) and not self.fills_with_nan
-        return blank or not all(
-            bool(one[name].detach().isfinite().all()) for name in ("boxes", "scores")
+        has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
+        if has_only_nan_rows and not self.fills_with_nan:
+            return True
+        return not all(
+            bool(detections[name].detach().isfinite().all())
+            for name in ("boxes", "scores")
         )
 
-    def _left(self, one: Detections) -> Detections:
-        return suppressed(one, self._least, self.suppression)
+    def _suppress(self, detections: Detections) -> Detections:
+        """Apply non-maximum suppression with the options of the task."""
+        return suppressed(detections, self._min_score, self.suppression)
 
-    def _elsewhere(self, one: Detections, truth: Place) -> Tensor:
-        """Boxes of which most is not on the object, and that do not frame it, (D,)
-        bool.
-        """
+    def _is_elsewhere(self, detections: Detections, truth: Place) -> Tensor:
+        """Which boxes neither fit the object nor lie mostly inside its box, (D,) bool."""
+        boxes = detections["boxes"]
         if truth.shares is None:
-            return torch.ones(
-                len(one["boxes"]), dtype=torch.bool, device=one["boxes"].device
-            )
-        return (
-            share_inside(one["boxes"], truth.shares.to(one["boxes"])) < ON_IT
-        ) & ~self._at(one, truth)
+            return torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+        is_mostly_outside = share_inside(boxes, truth.shares.to(boxes)) < ON_IT
+        return is_mostly_outside & ~self._is_at_object(detections, truth)
 
     @staticmethod
-    def _lie_on(boxes: Tensor, true: Tensor) -> Tensor:
-        """Find boxes (D, 4) that are on what has a true box (4,), however loosely, (D,)
+    def _is_on(boxes: Tensor, true_box: Tensor) -> Tensor:
+        """Which boxes (D, 4) are on a thing with a true box (4,), however loosely, (D,)
         bool.
         """
-        return (overlap(boxes, true) >= LEAST_OVERLAP) | (
-            share_inside(boxes, true) >= ON_IT
-        )
+        overlaps = overlap(boxes, true_box) >= LEAST_OVERLAP
+        lies_inside = share_inside(boxes, true_box) >= ON_IT
+        return overlaps | lies_inside
 
-    def _loosely(self, one: Detections, truth: Place) -> Tensor:
-        """Boxes on the object that fit no other thing of its class better, (D,)
+    def _is_loosely_on_object(self, detections: Detections, truth: Place) -> Tensor:
+        """Which boxes are on the object and fit no other thing of its class better, (D,)
         bool.
         """
-        boxes = one["boxes"]
-        true = truth.shares
-        assert true is not None
-        on_it = self._lie_on(boxes, true.to(boxes))
-        for other in truth.others:
-            on_it = on_it & (
-                overlap_with(one, truth)
-                >= overlap(boxes, truth.fractions_of(other).to(boxes))
-            )
-        return on_it
+        boxes = detections["boxes"]
+        true_box = truth.shares
+        assert true_box is not None
+        is_on_object = self._is_on(boxes, true_box.to(boxes))
+        object_overlap = overlap_with(detections, truth)
+        for other_box in truth.others:
+            other_overlap = overlap(boxes, truth.fractions_of(other_box).to(boxes))
+            is_on_object = is_on_object & (object_overlap >= other_overlap)
+        return is_on_object
 
-    def _away(self, one: Detections, truth: Place) -> Tensor:
-        """Boxes that are neither on the object nor on another thing of its class, (D,)
+    def _is_on_nothing(self, detections: Detections, truth: Place) -> Tensor:
+        """Which boxes are on no thing of the right classes, the object included, (D,)
         bool.
         """
-        boxes = one["boxes"]
-        away = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-        for true in [*([] if truth.box is None else [truth.box]), *truth.others]:
-            away = away & ~self._lie_on(boxes, truth.fractions_of(true).to(boxes))
-        return away
+        boxes = detections["boxes"]
+        true_boxes = list(truth.others)
+        if truth.box is not None:
+            true_boxes.insert(0, truth.box)
+        is_on_nothing = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+        for true_box in true_boxes:
+            is_on_thing = self._is_on(boxes, truth.fractions_of(true_box).to(boxes))
+            is_on_nothing = is_on_nothing & ~is_on_thing
+        return is_on_nothing
 
-    def _as_phantoms(self, one: Detections, truth: Place) -> Tensor:
-        """The score of each box as one where nothing is, (D,): of a class that is
-        sought, or any. A loose box of the object's own class is none.
+    def _phantom_scores(self, detections: Detections, truth: Place) -> Tensor:
+        """Return the score of each box as one where nothing is, (D,).
+
+        The score is that of a target class, or of any class without a target. A loose box
+        of the object's class is no phantom.
         """
+        right_classes = set(truth.labels)
         if self.target is not None:
-            sought = set(self.target)
-            own = self._of(one, tuple(sorted(sought & set(truth.labels))))
-            different = self._of(one, tuple(sorted(sought - set(truth.labels))))
+            targets = set(self.target)
+            right_score = self._scores_of_classes(
+                detections, tuple(sorted(targets & right_classes))
+            )
+            wrong_score = self._scores_of_classes(
+                detections, tuple(sorted(targets - right_classes))
+            )
         else:
-            own = self._of(one, truth.labels)
-            different = self._rivals(one, truth.labels)
-        own = torch.where(self._away(one, truth), own, 0.0)
-        return torch.maximum(
-            own, torch.where(self._elsewhere(one, truth), different, 0.0)
+            right_score = self._scores_of_classes(detections, truth.labels)
+            wrong_score = self._scores_of_rivals(detections, truth.labels)
+        right_phantom = torch.where(
+            self._is_on_nothing(detections, truth), right_score, 0.0
         )
+        wrong_phantom = torch.where(
+            self._is_elsewhere(detections, truth), wrong_score, 0.0
+        )
+        return torch.maximum(right_phantom, wrong_phantom)
 
     @staticmethod
-    def _of(one: Detections, labels: Labels) -> Tensor:
-        """The score of a class among these for each box, (D,)."""
-        scores = one["scores"]
-        if "labels" not in one:
-            return (
-                scores[:, list(labels)].amax(dim=1)
-                if len(scores) and labels
-                else scores.sum(dim=1) * 0.0
-            )
-        return scores * torch.isin(
-            one["labels"], torch.tensor(labels, device=scores.device)
-        )
+    def _scores_of_classes(detections: Detections, classes: Labels) -> Tensor:
+        """Return the largest score of one of the classes for each box, (D,)."""
+        scores = detections["scores"]
+        if "labels" in detections:
+            class_ids = torch.tensor(classes, device=scores.device)
+            return scores * torch.isin(detections["labels"], class_ids)
+        if len(scores) and classes:
+            return scores[:, list(classes)].amax(dim=1)
+        # The product keeps the zeros attached to the graph.
+        return scores.sum(dim=1) * 0.0
 
-    def _rivals(self, one: Detections, labels: Labels) -> Tensor:
-        """The score of a class that is none of these, or of those that are sought, for
-        each box, (D,).
+    def _scores_of_rivals(self, detections: Detections, classes: Labels) -> Tensor:
+        """Return the largest score of a target for each box, (D,); without a target, of a
+        class other than these.
         """
         if self.target is not None:
-            return self._of(one, self.target)
-        if "labels" in one:
-            return one["scores"] - self._of(one, labels)
-        return self._of(
-            one, tuple(sorted(set(range(one["scores"].shape[1])) - set(labels)))
-        )
+            return self._scores_of_classes(detections, self.target)
+        if "labels" in detections:
+            return detections["scores"] - self._scores_of_classes(detections, classes)
+        n_classes = detections["scores"].shape[1]
+        rivals = tuple(sorted(set(range(n_classes)) - set(classes)))
+        return self._scores_of_classes(detections, rivals)
 
-    # ---- in words
-    # ---------------------------------------------------------------------------------------------------
+    # ---- predictions ----
 
     def predictions(
         self, output: Sequence[Detections], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        found = []
-        for one in self._read(output):
-            broken = self._broken(one)
-            boxes = [] if broken else listed(one, count, SMALLEST, self.suppression)
-            said = tuple(
+        """See `Task.predictions`: the boxes with the best scores."""
+        predictions_of_images: list[tuple[Prediction, ...]] = []
+        for detections in self._read(output):
+            if self._is_broken(detections):
+                predictions_of_images.append((Prediction(NOT_A_NUMBER),))
+                continue
+            boxes = listed(detections, count, SMALLEST, self.suppression)
+            predictions = tuple(
                 Prediction(self.name_of(label), label, score)
                 for _, label, score in boxes
             )
-            found.append(said or (Prediction(NOT_A_NUMBER if broken else "nothing"),))
-        return found
+            predictions_of_images.append(predictions or (Prediction("nothing"),))
+        return predictions_of_images
 
     def said(
         self, output: Sequence[Detections], truth: Place, margins: Sequence[float]
     ) -> list[Said]:
-        """See `Task.said`; the prediction is what the model says of the object, the
-        payload its boxes in pixels.
-        """
+        """See `Task.said`: what becomes of the object; the payload has boxes in pixels."""
+        results: list[Said] = []
+        for detections in self._read(output):
+            finding = self._match_object(self._suppress(detections), truth)
+            payload: dict[str, JsonValue] = {
+                "box": None if truth.box is None else list(truth.box),
+                "found": self._boxes_in_pixels(detections, truth),
+            }
+            if finding.outcome is not None:
+                payload[OUTCOME] = finding.outcome.value
+                payload["class"] = self.name_of(finding.index)
+                payload["iou"] = None if finding.iou is None else round(finding.iou, 3)
+            results.append((self._describe(finding, truth), payload))
+        return results
+
+    def _boxes_in_pixels(self, detections: Detections, truth: Place) -> list[JsonValue]:
+        """Return the best boxes of an image as they are stored in rows."""
         height, width = truth.size
-        found: list[Said] = []
-        for one in self._read(output):
-            boxes: list[JsonValue] = [
+        scale = [width, height] * 2
+        boxes: list[JsonValue] = []
+        for box, label, score in listed(
+            detections, MOST, self._min_score, self.suppression
+        ):
+            pixels: list[JsonValue] = [
+                round(fraction * size, 1)
+                for fraction, size in zip(box, scale, strict=True)
+            ]
+            boxes.append(
                 {
-                    "box": [
-                        round(share * side, 1)
-                        for share, side in zip(box, [width, height] * 2, strict=True)
-                    ],
+                    "box": pixels,
                     "label": self.name_of(label),
                     "score": round(score, 3),
                 }
-                for box, label, score in listed(
-                    one, MOST, self._least, self.suppression
-                )
-            ]
-            finding = self._find(self._left(one), truth)
-            payload: dict[str, JsonValue] = {
-                "box": None if truth.box is None else list(truth.box),
-                "found": boxes,
-            }
-            if finding.outcome is not None:
-                iou = None if finding.iou is None else round(finding.iou, 3)
-                payload |= {
-                    OUTCOME: finding.outcome.value,
-                    "class": self.name_of(finding.index),
-                    "iou": iou,
-                }
-            found.append((self._prediction(finding, truth), payload))
-        return found
+            )
+        return boxes
 
-    def _find(self, one: Detections, truth: Place) -> Finding:
-        """Decide what becomes of the object in boxes that suppression has left."""
-        right_score = self._of(one, truth.labels)
-        away = self._away(one, truth)
-        if self.seek == "create" and float(self._create(one, truth)) > 0.0:
-            phantom_score = self._as_phantoms(one, truth)
-            return self._decided(
-                Outcome.PHANTOM, one, phantom_score, phantom_score > 0.0, truth
+    def _match_object(self, detections: Detections, truth: Place) -> Finding:
+        """Decide what becomes of the object in boxes that survived suppression."""
+        right_score = self._scores_of_classes(detections, truth.labels)
+        is_on_nothing = self._is_on_nothing(detections, truth)
+        if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
+            phantom_score = self._phantom_scores(detections, truth)
+            is_phantom = phantom_score > 0.0
+            return self._finding(
+                Outcome.PHANTOM, detections, phantom_score, is_phantom, truth
             )
         if truth.box is None:
-            if (
-                self.seek != "create"
-                and float(best_of(right_score, away)) >= self.confidence
-            ):
-                return self._decided(Outcome.PHANTOM, one, right_score, away, truth)
+            best_phantom = float(best_of(right_score, is_on_nothing))
+            if self.seek != "create" and best_phantom >= self.confidence:
+                return self._finding(
+                    Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
+                )
             return Finding(None, truth.labels[0])
-        at = self._at(one, truth)
+        is_at_object = self._is_at_object(detections, truth)
+        is_loose = self._is_loosely_on_object(detections, truth) & ~is_at_object
+        wrong_score = self._scores_of_rivals(detections, truth.labels)
         candidates = (
-            (Outcome.FOUND, right_score, at),
-            (Outcome.WRONG_CLASS, self._rivals(one, truth.labels), at),
-            (Outcome.LOOSE, right_score, self._loosely(one, truth) & ~at),
-            (Outcome.PHANTOM, right_score, away),
+            (Outcome.FOUND, right_score, is_at_object),
+            (Outcome.WRONG_CLASS, wrong_score, is_at_object),
+            (Outcome.LOOSE, right_score, is_loose),
+            (Outcome.PHANTOM, right_score, is_on_nothing),
         )
-        for outcome, score, among in candidates:
-            if float(best_of(score, among)) >= self.confidence:
-                return self._decided(outcome, one, score, among, truth)
-        best = float(best_of(right_score, at))
+        for outcome, scores, is_candidate in candidates:
+            if float(best_of(scores, is_candidate)) >= self.confidence:
+                return self._finding(outcome, detections, scores, is_candidate, truth)
+        best_score = float(best_of(right_score, is_at_object))
         return Finding(
-            Outcome.MISSED, truth.labels[0], best if math.isfinite(best) else None
+            Outcome.MISSED,
+            truth.labels[0],
+            best_score if math.isfinite(best_score) else None,
         )
 
     @staticmethod
-    def _decided(
-        outcome: Outcome, one: Detections, scores: Tensor, among: Tensor, truth: Place
+    def _finding(
+        outcome: Outcome,
+        detections: Detections,
+        scores: Tensor,
+        is_candidate: Tensor,
+        truth: Place,
     ) -> Finding:
-        """The outcome that the best box among some decides."""
-        place = int(torch.where(among, scores, -1.0).argmax())
-        score = float(scores[place])
-        index = int(
-            one["labels"][place]
-            if "labels" in one
-            else (one["scores"][place] == score).nonzero()[0]
-        )
-        iou = None if truth.box is None else float(overlap_with(one, truth)[place])
-        return Finding(outcome, index, score, iou)
+        """Return an outcome with the best box among the candidates."""
+        row = int(torch.where(is_candidate, scores, -1.0).argmax())
+        score = float(scores[row])
+        if "labels" in detections:
+            class_id = int(detections["labels"][row])
+        else:
+            class_id = int((detections["scores"][row] == score).nonzero()[0])
+        iou = None
+        if truth.box is not None:
+            iou = float(overlap_with(detections, truth)[row])
+        return Finding(outcome, class_id, score, iou)
 
-    def _prediction(self, finding: Finding, truth: Place) -> Prediction:
-        """What a model says of the object, with the score of the box that says so."""
-        name = self.name_of(finding.index)
+    def _describe(self, finding: Finding, truth: Place) -> Prediction:
+        """Return the prediction about the object, with the score of the deciding box."""
+        class_name = self.name_of(finding.index)
         if finding.outcome is None or (truth.box is None and self.seek != "create"):
             return Prediction(OUT_OF_VIEW)
         if finding.outcome in LABELS:
-            return Prediction(LABELS[finding.outcome].format(name), None, finding.score)
-        return Prediction(name, finding.index, finding.score)
+            label = LABELS[finding.outcome].format(class_name)
+            return Prediction(label, None, finding.score)
+        return Prediction(class_name, finding.index, finding.score)
 
     def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
-        """See `Task.marks`: the true box, and every box with a score of
-        `confidence`.
-        """
-        height, width = truth.size
-        true = (
-            []
-            if truth.box is None
-            else [Mark(" or ".join(self.names(truth.labels)), True, box=truth.box)]
-        )
+        """See `Task.marks`: the true box, and every box with a score of `confidence`."""
+        true_marks = []
+        if truth.box is not None:
+            true_name = " or ".join(self.names(truth.labels))
+            true_marks.append(Mark(true_name, True, box=truth.box))
         return [
-            true + [
-                Mark(f"{self.name_of(label)} {score:.2f}", False, box=(a * width, b * height, c * width, d * height))
-                for (a, b, c, d), label, score
-                in ([] if self._broken(one) else listed(one, MOST, self.confidence, self.suppression))
-            ]
-            for one in self._read(output)
-        ]  # fmt: skip
+            [*true_marks, *self._predicted_marks(detections, truth)]
+            for detections in self._read(output)
+        ]
+
+    def _predicted_marks(self, detections: Detections, truth: Place) -> list[Mark]:
+        """Return a mark for every box of an image with a score of `confidence`."""
+        if self._is_broken(detections):
+            return []
+        height, width = truth.size
+        marks = []
+        for (x0, y0, x1, y1), label, score in listed(
+            detections, MOST, self.confidence, self.suppression
+        ):
+            box = (x0 * width, y0 * height, x1 * width, y1 * height)
+            marks.append(Mark(f"{self.name_of(label)} {score:.2f}", False, box=box))
+        return marks

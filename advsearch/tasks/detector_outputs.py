@@ -1,14 +1,20 @@
-"""What a detector returns: which of its outputs are boxes, scores and classes, and
-which rows only fill up.
+"""Read what a detector returns: which outputs are boxes, scores and classes, and which
+rows are padding.
 
-Detections of one picture are a mapping with `boxes` (D, 4) as they came and `scores`:
-(D, C) of every class, or (D,) with `labels` (D,), the class of each box. Where types,
-names and shapes leave open which of two numbers of a box is its score and which its
-class, these stand as `either` (D, 2) in place of both. One tensor that only the number
-of classes explains stands as `raw` (A, B) in place of all, with the channels of maps
-that came with it as `beside` (K,), see `boxes`. Logits that only that number explains
-stand as `logits` (D, K) in place of scores, see `QUERIES`. Rows that only fill up are
-gone; how many of them were NaN throughout is said as `blank` (1,), if any.
+The detections of one image are a mapping with
+
+* `boxes` (D, 4), as they came, and
+* `scores`: (D, C) of every class, or (D,) with `labels` (D,), the class of each box.
+
+Instead of these it may have, as long as the outputs leave it open:
+
+* `either` (D, 2) for scores and labels: two numbers per box, of which types, names and
+  shapes do not show which is the score and which the class;
+* `raw` (A, B) for everything: one tensor that only the number of classes explains, with
+  `map_channels` (K,), the channels of feature maps that came with it;
+* `logits` (D, K) for scores: only the number of classes explains them, see `QUERIES`.
+
+Rows of padding are removed. `blank` (1,) counts those that were NaN throughout, if any.
 """
 
 from __future__ import annotations
@@ -33,36 +39,32 @@ EXPECTED = (
     "each picture a mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
-# what two numbers of a box may be
+# What the two numbers beside a box may be.
 ORDERS = ("boxes scores labels", "boxes labels scores")
 
 QUERIES = ("boxes logits", "boxes logits nothing")
-"""What DETR's networks return: logits that judge each class by itself, with a sigmoid
-(Zhu et al. 2021, section 4), or of which a softmax chooses one, the last of which
-stands for nothing (Carion et al. 2020, section 3.1).
+"""What DETR networks return: logits of independent classes, for a sigmoid (Zhu et al.
+2021, section 4), or logits of exclusive classes, for a softmax, of which the last
+means no object (Carion et al. 2020, section 3.1).
 """
 
-# what these are called where the boxes are `pred_boxes`
+# Names of the logits in an output whose boxes are named `pred_boxes`.
 QUERY_LOGITS = ("pred_logits", "logits")
 
 HEADS = {"boxes scores": 4, "boxes objectness scores": 5}
-"""What the numbers of a place of a YOLO's output are, and how many stand before the
-scores.
-"""
+"""Channels of a YOLO head, and the index of the first score among them."""
 
 LAYOUTS = ("channels first", "channels last")
 OF_HEADS = frozenset(
     [*HEADS, *(f"{head} {layout}" for head in HEADS for layout in LAYOUTS)]
 )
 TOLD_BY_CLASSES = OF_HEADS | frozenset(QUERIES)
-"""Orders of outputs that the number of classes explains; their boxes have a middle and
-sides.
-"""
+"""Orders that the number of classes explains; their boxes are center, width, height."""
 
 TOLERANCE = 1e-3  # how far outside [0, 1] a score may lie
 _WITH_ANGLE = f"boxes objectness scores {LAYOUTS[0]}"
-"""What a head of oriented boxes looks like: an angle after the scores makes as many
-numbers as objectness before.
+"""Order that an oriented-box (OBB) head looks like: an angle after the scores makes as
+many channels as objectness before them.
 """
 
 _UNREAD = "which are not read"
@@ -97,30 +99,35 @@ NAMES = {
         "label",
     ),
 }
-"""What the parts of an output are called, the usual name first."""
+"""Names of the components of an output, the usual name first."""
 
 WORDS = {
     "boxes": ("box",),
     "scores": ("score", "conf", "prob", "logit"),
     "labels": ("label", "class", "cls", "categ"),
 }
-"""What is in a name that is none of these."""
+"""Substrings that identify a component whose name is none of `NAMES`."""
 
 ASK_ORDER = f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
-"""What to say where scores and classes cannot be told apart."""
+"""Advice of messages if scores and classes cannot be distinguished."""
 
 NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
 def checked_order(text: str) -> tuple[str, ...]:
-    """Return the parts that an order names: boxes, scores and labels, and "batch" for
-    the number of the picture. Of one of YOLO's heads these are the words of `HEADS`,
-    and of a layout; of DETR's one of `QUERIES`. Raises ValueError: it names others.
+    """Parse the names in an order and check them.
+
+    They are boxes, scores and labels, and optionally "batch" for the index of the
+    image; or the words of one of `HEADS`, optionally with a layout; or those of one of
+    `QUERIES`.
+
+    Raises:
+        ValueError: it is none of these.
     """
-    parts = tuple(text.replace(",", " ").split())
-    if " ".join(parts) in TOLD_BY_CLASSES:
-        return parts
-    if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
+    names = tuple(text.replace(",", " ").split())
+    if " ".join(names) in TOLD_BY_CLASSES:
+        return names
+    if sorted(names) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
             "of a YOLO's head "
@@ -128,128 +135,175 @@ def checked_order(text: str) -> tuple[str, ...]:
             "after it, or of a DETR's "
             f"{' or '.join(map(repr, QUERIES))}, got {text!r}"
         )
-    return parts
+    return names
 
 
 def detections_in(returned: Any, count: int, order: str = "") -> list[Detections]:
-    """Return what a detector returned, as `EXPECTED` says, for each of `count`
-    pictures. The order is of parts that have no names, see `checked_order`; "" for what
-    types and shapes say. Raises ValueError: it is something else, or scores are not in
-    [0, 1].
+    """Read the detections of each of `count` images from what a detector returned.
+
+    Args:
+        returned: by the network, in one of the forms of `EXPECTED`.
+        count: number of images.
+        order: of components without names, see `checked_order`; "" to infer it.
+
+    Raises:
+        ValueError: it has another form, or scores are not in [0, 1].
     """
-    parts = checked_order(order) if order else ()
-    listed = isinstance(returned, (list, tuple)) and len(returned) > 0
-    if listed and all(isinstance(one, Tensor) and one.ndim > 3 for one in returned):
+    order_names = checked_order(order) if order else ()
+    order = " ".join(order_names)
+    is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
+    if is_sequence and all(isinstance(x, Tensor) and x.ndim > 3 for x in returned):
         raise ValueError(
             "expected boxes, and not the maps of a head from which they "
             "are made: export it in .eval()"
         )
-    if (queries := _queries(returned, " ".join(parts))) is not None:
-        boxes, logits = queries
-        if (
-            boxes.ndim != 3
-            or boxes.shape[2] != 4
-            or logits.ndim != 3
-            or boxes.shape[:2] != logits.shape[:2]
-        ):
-            raise ValueError("expected boxes (N, D, 4) and logits (N, D, classes)")
-        return [
-            {"boxes": b.float(), "logits": one.float()}
-            for b, one in zip(boxes, logits, strict=True)
-        ]
-    returned, channels = _first(returned)
-    beside = torch.tensor(sorted(channels), dtype=torch.long)
-    grid = (
+    queries = _find_queries(returned, order)
+    if queries is not None:
+        return _split_queries(*queries)
+
+    returned, channels = _split_off_maps(returned)
+    map_channels = torch.tensor(sorted(channels), dtype=torch.long)
+    is_grid = (
         isinstance(returned, Tensor)
         and returned.ndim == 3
         and returned.shape[0] == count
         and returned.shape[2] != 4
     )
-    masked = (
-        grid
+    # Rows of a box, a score, a class and mask coefficients.
+    is_rows_with_masks = (
+        is_grid
         and returned.shape[2] - 6 in channels
         and bool((returned[..., 5] == returned[..., 5].round()).all())
     )
-    if grid and (
-        " ".join(parts) in OF_HEADS or not (parts or masked or returned.shape[2] == 6)
-    ):
-        return [{"raw": one.float(), "beside": beside} for one in returned]
-    if masked:  # rows of a box, a score, a class and mask coefficients
+    is_rows = bool(order_names) or is_rows_with_masks
+    if is_grid and (order in OF_HEADS or not (is_rows or returned.shape[2] == 6)):
         return [
-            {**one, "beside": beside}
-            for one in detections_in(returned[..., :6], count, order)
+            {"raw": grid.float(), "map_channels": map_channels} for grid in returned
         ]
-    if "objectness" in parts or "channels" in parts:
+    if is_rows_with_masks:
+        return [
+            {**detections, "map_channels": map_channels}
+            for detections in detections_in(returned[..., :6], count, order)
+        ]
+    if "objectness" in order_names or "channels" in order_names:
         raise ValueError(EXPECTED)
+    images = _split_images(returned, count, order_names)
+    return [_checked_detections(components) for components in images]
+
+
+def _split_queries(boxes: Tensor, logits: Tensor) -> list[Detections]:
+    """Return the detections of each image from boxes (N, D, 4) and logits (N, D, C)."""
+    if (
+        boxes.ndim != 3
+        or boxes.shape[2] != 4
+        or logits.ndim != 3
+        or boxes.shape[:2] != logits.shape[:2]
+    ):
+        raise ValueError("expected boxes (N, D, 4) and logits (N, D, classes)")
+    return [
+        {"boxes": image_boxes.float(), "logits": image_logits.float()}
+        for image_boxes, image_logits in zip(boxes, logits, strict=True)
+    ]
+
+
+def _split_images(
+    returned: Any, count: int, order_names: Sequence[str]
+) -> list[dict[str, Tensor]]:
+    """Split an output into the components of each of `count` images, unchecked.
+
+    Raises:
+        ValueError: it is none of the forms of `EXPECTED`.
+    """
     if (
         isinstance(returned, (list, tuple))
         and len(returned) == count
-        and all(map(_is_one, returned))
+        and all(map(_is_image_output, returned))
     ):
-        found = [
-            dict(NOTHING) if one is None else _parts(one, parts) for one in returned
+        return [
+            dict(NOTHING) if output is None else _find_components(output, order_names)
+            for output in returned
         ]
-    elif isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
-        # rows of all pictures, with the number of the picture in the first column, or
-        # where the order says
-        before = parts[: parts.index("batch")] if "batch" in parts else ()
-        place = len(before) + 3 * ("boxes" in before)
-        numbers = returned.detach()[:, place]
-        if not bool(
-            ((numbers == numbers.round()) & (numbers >= -1) & (numbers < count)).all()
-        ):
-            raise ValueError(EXPECTED)
-        rows = torch.cat([returned[:, :place], returned[:, place + 1 :]], dim=1)
-        beside_number = [part for part in parts if part != "batch"]
-        found = [
-            _parts(rows[numbers == number], beside_number) for number in range(count)
-        ]
-    else:
-        together = _parts(returned, parts)
-        # the network has dropped the batch dimension
-        if together["boxes"].ndim == 2 and count == 1:
-            together = {name: part[None] for name, part in together.items()}
-        if together["boxes"].ndim != 3 or any(
-            len(part) != count for part in together.values()
-        ):
-            raise ValueError(EXPECTED)
-        found = [
-            {name: part[k] for name, part in together.items()} for k in range(count)
-        ]
-    return [_one(one) for one in found]
-
-
-def _queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
-    """The boxes and logits of an output as DETR's networks give it, or that is said to
-    be one; None of any other.
-    """
-    # boxes are shares, which logits are not
-    if order in QUERIES and isinstance(returned, (list, tuple)):
-        tensors = [one for one in returned if isinstance(one, Tensor)]
-        boxes = [
-            one
-            for one in tensors
-            if one.shape[-1] == 4 and bool(((one >= 0.0) & (one <= 1.0)).all())
-        ][:1]
-        logits = [one for one in tensors if not any(one is box for box in boxes)][:1]
-        return (boxes[0], logits[0]) if boxes and logits else None
-    part = returned.get if isinstance(returned, Mapping) else partial(getattr, returned)
-    found = [
-        [one] if isinstance(one := part(name, None), Tensor) else []
-        for name in ("pred_boxes", *QUERY_LOGITS)
+    if isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
+        return _split_batch_rows(returned, count, order_names)
+    batch = _find_components(returned, order_names)
+    # The network has dropped the batch dimension.
+    if batch["boxes"].ndim == 2 and count == 1:
+        batch = {name: component[None] for name, component in batch.items()}
+    if batch["boxes"].ndim != 3 or any(len(x) != count for x in batch.values()):
+        raise ValueError(EXPECTED)
+    return [
+        {name: component[index] for name, component in batch.items()}
+        for index in range(count)
     ]
-    boxes = found[0]
-    logits = [*found[1], *found[2]][:1]
-    return (
-        (boxes[0], logits[0]) if boxes and logits and order in ("", *QUERIES) else None
+
+
+def _split_batch_rows(
+    rows: Tensor, count: int, order_names: Sequence[str]
+) -> list[dict[str, Tensor]]:
+    """Split rows (D, 7) of all images by their column with the index of the image.
+
+    It is the first column, or the one of "batch" in the order.
+    """
+    names_before: Sequence[str] = ()
+    if "batch" in order_names:
+        names_before = order_names[: order_names.index("batch")]
+    # A box takes four columns.
+    batch_column = len(names_before) + 3 * ("boxes" in names_before)
+    image_index = rows.detach()[:, batch_column]
+    is_index = (
+        (image_index == image_index.round())
+        & (image_index >= -1)
+        & (image_index < count)
     )
+    if not bool(is_index.all()):
+        raise ValueError(EXPECTED)
+    other_columns = torch.cat(
+        [rows[:, :batch_column], rows[:, batch_column + 1 :]], dim=1
+    )
+    other_names = [name for name in order_names if name != "batch"]
+    return [
+        _find_components(other_columns[image_index == index], other_names)
+        for index in range(count)
+    ]
 
 
-def _first(returned: Any) -> tuple[Any, set[int]]:
-    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w)
-    have that came with them. In training form they are the first of a tuple, feature
-    maps and prototypes of masks stand beside them, in lists and mappings too. Any other
-    output is returned as it is.
+def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
+    """Find the boxes and logits of a DETR output; None if it is no such output.
+
+    It is one if the order is one of `QUERIES`, or by its names.
+    """
+    if order in QUERIES and isinstance(returned, (list, tuple)):
+        tensors = [value for value in returned if isinstance(value, Tensor)]
+        # Boxes are fractions, which logits are not.
+        boxes = next(filter(_are_fraction_boxes, tensors), None)
+        if boxes is None:
+            return None
+        logits = next((tensor for tensor in tensors if tensor is not boxes), None)
+        return None if logits is None else (boxes, logits)
+    if order not in ("", *QUERIES):
+        return None
+    get = returned.get if isinstance(returned, Mapping) else partial(getattr, returned)
+    boxes = get("pred_boxes", None)
+    if not isinstance(boxes, Tensor):
+        return None
+    for name in QUERY_LOGITS:
+        logits = get(name, None)
+        if isinstance(logits, Tensor):
+            return boxes, logits
+    return None
+
+
+def _are_fraction_boxes(tensor: Tensor) -> bool:
+    """Whether a tensor may hold boxes (..., 4) in fractions of the image."""
+    return tensor.shape[-1] == 4 and bool(((tensor >= 0.0) & (tensor <= 1.0)).all())
+
+
+def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
+    """Return the predictions of a YOLO output and the channels of its feature maps.
+
+    In training form the predictions are the first of a tuple; feature maps (N, K, h, w)
+    and prototypes of masks follow, also in lists and mappings. Any other output is
+    returned as it is, with no channels.
     """
     if (
         not isinstance(returned, (list, tuple))
@@ -257,417 +311,549 @@ def _first(returned: Any) -> tuple[Any, set[int]]:
         or not isinstance(returned[0], Tensor)
     ):
         return returned, set()
-    first = returned[0]
-    others = returned[1:]
-    beside = any(isinstance(one, Tensor) and one.ndim < 4 for one in others)
-    if first.ndim != 3 or first.shape[2] == 4 or beside:
+    predictions = returned[0]
+    rest = returned[1:]
+    has_other_tensors = any(isinstance(x, Tensor) and x.ndim < 4 for x in rest)
+    if predictions.ndim != 3 or predictions.shape[2] == 4 or has_other_tensors:
         return returned, set()
-    maps = [
-        part
-        for part in tensors_in(list(others))
-        if part.ndim == 4 and len(part) == len(first)
-    ]
-    return first, {part.shape[1] for part in maps}
+    channels = {
+        tensor.shape[1]
+        for tensor in tensors_in(list(rest))
+        if tensor.ndim == 4 and len(tensor) == len(predictions)
+    }
+    return predictions, channels
 
 
-def _is_one(part: Any) -> bool:
-    """Whether a part of an output is that for one picture, and not boxes or scores of
-    all; None where nothing is.
+def _is_image_output(value: Any) -> bool:
+    """Whether an element of an output is that of one image, and not boxes or scores of
+    all images; None stands for an image without detections.
     """
-    if isinstance(part, Tensor):
-        return part.ndim == 2 and part.shape[1] == 6
+    if isinstance(value, Tensor):
+        return value.ndim == 2 and value.shape[1] == 6
     return (
-        part is None
-        or isinstance(part, (Mapping, list, tuple))
-        or _named(part) is not None
+        value is None
+        or isinstance(value, (Mapping, list, tuple))
+        or _find_named(value) is not None
     )
 
 
-def _parts(returned: Any, order: Sequence[str]) -> dict[str, Tensor]:
-    """Return the parts of an output by name: boxes, and scores, with labels or without,
-    or `either`.
+def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Tensor]:
+    """Find boxes and scores, with or without labels, or `either`, in an output.
+
+    Raises:
+        ValueError: it is none of the forms of `EXPECTED`.
     """
     if isinstance(returned, Tensor):
         if returned.ndim not in (2, 3) or returned.shape[-1] != 6:
             raise ValueError(EXPECTED)
-        if order:
-            columns = returned.split(
-                [4 if name == "boxes" else 1 for name in order], dim=-1
-            )
-            return {
-                name: part if name == "boxes" else part[..., 0]
-                for name, part in zip(order, columns, strict=True)
-            }
-        return {"boxes": returned[..., :4], "either": returned[..., 4:]}
-    named = _named(returned)
+        return _split_columns(returned, order_names)
+    named = _find_named(returned)
     if named is not None and "boxes" in named and "scores" in named:
         return named
-    listed = returned.values() if isinstance(returned, Mapping) else returned
-    if not isinstance(listed, Iterable):
+    values = returned.values() if isinstance(returned, Mapping) else returned
+    if not isinstance(values, Iterable):
         raise ValueError(EXPECTED)
-    tensors = list(listed)
+    tensors = list(values)
     if isinstance(returned, Mapping):
-        tensors = [one for one in tensors if isinstance(one, Tensor)]
-    if not all(isinstance(one, Tensor) for one in tensors):
+        tensors = [value for value in tensors if isinstance(value, Tensor)]
+    if not all(isinstance(value, Tensor) for value in tensors):
         raise ValueError(EXPECTED)
-    if order and len(tensors) == len(order):
-        given = dict(zip(order, tensors, strict=True))
-        shape = given["boxes"].shape[:-1]
+    if order_names and len(tensors) == len(order_names):
+        components = dict(zip(order_names, tensors, strict=True))
+        shape = components["boxes"].shape[:-1]
         return {
-            name: part[..., 0] if part.shape == (*shape, 1) else part
-            for name, part in given.items()
+            name: _squeeze_last(tensor, shape) for name, tensor in components.items()
         }
-    return _by_shape(tensors)
+    return _components_by_shape(tensors)
 
 
-def _named(returned: Any) -> dict[str, Tensor] | None:
-    """The parts of a mapping or an object by their names; None of what is neither."""
+def _split_columns(rows: Tensor, order_names: Sequence[str]) -> dict[str, Tensor]:
+    """Split the columns of rows (..., 6) by an order, if there is one."""
+    if not order_names:
+        return {"boxes": rows[..., :4], "either": rows[..., 4:]}
+    widths = [4 if name == "boxes" else 1 for name in order_names]
+    return {
+        name: columns if name == "boxes" else columns[..., 0]
+        for name, columns in zip(order_names, rows.split(widths, dim=-1), strict=True)
+    }
+
+
+def _squeeze_last(tensor: Tensor, shape: Sequence[int]) -> Tensor:
+    """Remove a last dimension of one from a tensor that is (*shape, 1)."""
+    return tensor[..., 0] if tensor.shape == (*shape, 1) else tensor
+
+
+def _find_named(returned: Any) -> dict[str, Tensor] | None:
+    """Find the components of a mapping or an object by their names.
+
+    None if it is neither a mapping nor an object with boxes.
+    """
     if isinstance(returned, Mapping):
-        given = {
-            str(name): part
-            for name, part in returned.items()
-            if isinstance(part, Tensor)
+        tensors = {
+            str(name): value
+            for name, value in returned.items()
+            if isinstance(value, Tensor)
         }
     elif any(hasattr(returned, name) for name in NAMES["boxes"]):
-        known = [name for names in NAMES.values() for name in names]
-        given = {
+        known_names = [name for names in NAMES.values() for name in names]
+        tensors = {
             name: getattr(returned, name)
-            for name in known
+            for name in known_names
             if isinstance(getattr(returned, name, None), Tensor)
         }
     else:
         return None
-    found = dict[str, Tensor]()
-    left = dict(given)
-    for part, names in NAMES.items():
-        exact = [name for name in names if name in left]
-        near = [
-            name for name in left if any(word in name.lower() for word in WORDS[part])
+    components = dict[str, Tensor]()
+    for component, names in NAMES.items():
+        exact = [name for name in names if name in tensors]
+        words = WORDS[component]
+        similar = [
+            name for name in tensors if any(word in name.lower() for word in words)
         ]
-        if exact or len(near) == 1:
-            found[part] = left.pop((exact or near)[0])
-    return found
+        if exact or len(similar) == 1:
+            match = (exact or similar)[0]
+            components[component] = tensors.pop(match)
+    return components
 
 
-def _by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
-    """The parts of a tuple: boxes have four numbers, classes are whole numbers by
-    type.
+def _components_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Identify the components of a tuple by shape and type.
+
+    Boxes have four columns, classes an integer type.
+
+    Raises:
+        ValueError: shapes and types do not identify them.
     """
-    fours = [one for one in tensors if one.ndim > 1 and one.shape[-1] == 4]
-    fours = [one for one in fours if one.ndim == max(four.ndim for four in fours)]
-    # no scores of four classes
-    far = [one for one in fours if bool((one.detach() > 1.0 + TOLERANCE).any())]
-    if not fours or len(tensors) < 2:
-        raise ValueError(EXPECTED)
-    boxes = far[0] if len(far) == 1 else fours[0]
+    boxes = _boxes_by_shape(tensors)
     shape = boxes.shape[:-1]
-    others = [
-        one for one in tensors if one is not boxes and one.shape[: len(shape)] == shape
+    rest = [
+        tensor
+        for tensor in tensors
+        if tensor is not boxes and tensor.shape[: len(shape)] == shape
     ]
-    if len(others) == 1 and others[0].ndim == boxes.ndim:
-        return {"boxes": boxes, "scores": others[0]}
-    flat = [one[..., 0] if one.shape == (*shape, 1) else one for one in others]
-    whole = [one for one in flat if not one.is_floating_point()]
-    if len(flat) != 2 or len(whole) == 2 or any(one.shape != shape for one in flat):
+    if len(rest) == 1 and rest[0].ndim == boxes.ndim:
+        return {"boxes": boxes, "scores": rest[0]}
+    flat = [_squeeze_last(tensor, shape) for tensor in rest]
+    integer = [tensor for tensor in flat if not tensor.is_floating_point()]
+    if (
+        len(flat) != 2
+        or len(integer) == 2
+        or any(tensor.shape != shape for tensor in flat)
+    ):
         raise ValueError(EXPECTED)
-    if whole:
-        return {
-            "boxes": boxes,
-            "scores": flat[0] if flat[1] is whole[0] else flat[1],
-            "labels": whole[0],
-        }
+    if integer:
+        labels = integer[0]
+        scores = flat[0] if flat[1] is labels else flat[1]
+        return {"boxes": boxes, "scores": scores, "labels": labels}
     return {
         "boxes": boxes,
-        "either": torch.stack([one.to(boxes.dtype) for one in flat], dim=-1),
+        "either": torch.stack([tensor.to(boxes.dtype) for tensor in flat], dim=-1),
     }
 
 
-def _one(one: Mapping[str, Tensor]) -> Detections:
-    """The detections of one picture, checked, without rows that only fill up. Such a
-    row has a class or score of -1, or four equal numbers or NaN for a box, and no
+def _boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
+    """Return the tensor that holds boxes; ValueError if there is none."""
+    candidates = [x for x in tensors if x.ndim > 1 and x.shape[-1] == 4]
+    max_ndim = max((x.ndim for x in candidates), default=0)
+    candidates = [x for x in candidates if x.ndim == max_ndim]
+    if not candidates or len(tensors) < 2:
+        raise ValueError(EXPECTED)
+    # Values over 1 are coordinates, and no scores of four classes.
+    in_pixels = [x for x in candidates if bool((x.detach() > 1.0 + TOLERANCE).any())]
+    return in_pixels[0] if len(in_pixels) == 1 else candidates[0]
+
+
+def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
+    """Check the detections of one image and remove rows of padding.
+
+    Such a row has a class or score of -1, or a box of four equal numbers or NaN and no
     score.
+
+    Raises:
+        ValueError: shapes, classes or scores are not those of detections.
     """
-    boxes = one["boxes"].reshape(-1, 4) if one["boxes"].numel() == 0 else one["boxes"]
-    parts = [part for name, part in one.items() if name != "blank"]
+    boxes = components["boxes"]
+    if boxes.numel() == 0:
+        boxes = boxes.reshape(-1, 4)
+    rows = [tensor for name, tensor in components.items() if name != "blank"]
     if (
         boxes.ndim != 2
         or boxes.shape[1] != 4
-        or any(len(part) != len(boxes) for part in parts)
+        or any(len(tensor) != len(boxes) for tensor in rows)
     ):
         raise ValueError(EXPECTED)
     boxes = boxes.float()
-    if "either" in one:
-        either = one["either"].float()
-        filling = nowhere(boxes.detach()) & ~(either.detach() > 0.0).all(dim=1)
-        return _kept({"boxes": boxes, "either": either}, filling, either.detach())
-    scores = one["scores"].float()
-    labels = one.get("labels")
-    if scores.ndim != (2 if labels is None else 1) or (
-        labels is not None and labels.shape != scores.shape
-    ):
+    if "either" in components:
+        either = components["either"].float()
+        has_scores = (either.detach() > 0.0).all(dim=1)
+        is_padding = nowhere(boxes.detach()) & ~has_scores
+        return _without_padding(
+            {"boxes": boxes, "either": either}, is_padding, either.detach()
+        )
+
+    scores, labels = _checked_scores(components)
+    values = scores.detach() if labels is None else scores.detach()[:, None]
+    has_score = (values > 0.0).any(dim=1)
+    is_marked = (values == -1.0).all(dim=1)
+    is_padding = (nowhere(boxes.detach()) & ~has_score) | is_marked
+    if labels is not None:
+        is_padding = is_padding | (labels < 0)
+    _check_probabilities(values[~is_padding], has_labels=labels is not None)
+    checked = {"boxes": boxes, "scores": scores}
+    if labels is not None:
+        checked["labels"] = labels.long()
+    detections = dict(_without_padding(checked, is_padding, values))
+    if "blank" in components:
+        detections["blank"] = components["blank"]
+    return detections
+
+
+def _checked_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+    """Return the scores of detections and their labels, None without labels.
+
+    The score of a label that is NaN becomes NaN. Raises ValueError if the shapes do not
+    match, or a label is not an integer.
+    """
+    scores = components["scores"].float()
+    labels = components.get("labels")
+    if labels is None:
+        if scores.ndim != 2:
+            raise ValueError(EXPECTED)
+        return scores, None
+    if scores.ndim != 1 or labels.shape != scores.shape:
         raise ValueError(EXPECTED)
-    if labels is not None and labels.is_floating_point():
-        nameless = labels.detach().isnan()
-        scores = scores.masked_fill(nameless, math.nan)
-        labels = labels.detach().masked_fill(nameless, 0.0)
+    if labels.is_floating_point():
+        is_nan = labels.detach().isnan()
+        scores = scores.masked_fill(is_nan, math.nan)
+        labels = labels.detach().masked_fill(is_nan, 0.0)
         if bool((labels != labels.round()).any()):
             raise ValueError("expected classes that are whole numbers")
-    best = scores.detach() if labels is None else scores.detach()[:, None]
-    filling = nowhere(boxes.detach()) & ~(best > 0.0).any(dim=1) | (best == -1.0).all(
-        dim=1
+    return scores, labels
+
+
+def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
+    """Raise ValueError if a finite value is outside [0, 1]."""
+    is_too_low = values < -TOLERANCE
+    is_too_high = (values > 1.0 + TOLERANCE) & values.isfinite()
+    if not bool((is_too_low | is_too_high).any()):
+        return
+    advice = ""
+    if not has_labels:
+        options = " or ".join(as_option(f"order: {order}") for order in QUERIES)
+        advice = f", or say {options}"
+    raise ValueError(
+        "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
+        f"softmax to them{advice}"
     )
-    filling = filling if labels is None else filling | (labels < 0)
-    outside = best[~filling]
-    if bool(
-        (
-            (outside < -TOLERANCE) | (outside > 1.0 + TOLERANCE) & outside.isfinite()
-        ).any()
-    ):
-        said = (
-            f", or say {' or '.join(as_option(f'order: {order}') for order in QUERIES)}"
-            if labels is None
-            else ""
-        )
-        raise ValueError(
-            "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
-            f"softmax to them{said}"
-        )
-    found = {
-        "boxes": boxes,
-        "scores": scores,
-        **({} if labels is None else {"labels": labels.long()}),
-    }
-    return {
-        **_kept(found, filling, best),
-        **{name: one[name] for name in one if name == "blank"},
-    }
 
 
-def _kept(one: dict[str, Tensor], filling: Tensor, numbers: Tensor) -> Detections:
-    """The rows that do not fill up (D,), and how many of those that do are NaN in box
-    and numbers (D, K).
+def _without_padding(
+    components: dict[str, Tensor], is_padding: Tensor, values: Tensor
+) -> Detections:
+    """Remove rows of padding (D,) bool, and count those that are NaN in their box and
+    their values (D, K) as `blank`.
     """
-    if not bool(filling.any()):
-        return one
-    blank = (
-        filling & numbers.isnan().all(dim=1) & one["boxes"].detach().isnan().all(dim=1)
-    )
-    kept = {name: part[~filling] for name, part in one.items()}
-    return {**kept, "blank": blank.sum()[None]} if bool(blank.any()) else kept
+    if not bool(is_padding.any()):
+        return components
+    is_nan_box = components["boxes"].detach().isnan().all(dim=1)
+    is_blank = is_padding & values.isnan().all(dim=1) & is_nan_box
+    remaining = {name: tensor[~is_padding] for name, tensor in components.items()}
+    if bool(is_blank.any()):
+        remaining["blank"] = is_blank.sum()[None]
+    return remaining
 
 
-# ---- scores and classes by what they are
-# ----------------------------------------------------------------------------
+# ---- scores and classes by their values ----
 
 
-def settled(one: Detections, order: str = "", classes: int | None = None) -> Detections:
-    """Return the detections of a picture with boxes, scores and labels told apart, by
-    an order (`ORDERS`, `QUERIES`, or `HEADS` with a layout; "" for what its rows show)
-    and the number of classes, None where nobody says. Raises ValueError: they do not
-    show it, or something else than the order says.
+def settled(
+    detections: Detections, order: str = "", classes: int | None = None
+) -> Detections:
+    """Return the detections of an image with boxes, scores and labels identified.
+
+    Args:
+        detections: of one image, see the module.
+        order: one of `ORDERS` or `QUERIES`, or of `HEADS` with a layout; "" to infer
+            it from the values.
+        classes: number of classes; None if it is unknown.
+
+    Raises:
+        ValueError: the values do not show the order, or contradict it.
     """
-    if "raw" in one or "logits" in one:
+    if "raw" in detections or "logits" in detections:
         if classes is None:
             raise ValueError(EXPECTED)
-        order = order or order_in([one], classes)
-        if "raw" in one:
-            boxes, scores = split(one["raw"], classes, order)
+        order = order or order_in([detections], classes)
+        if "raw" in detections:
+            boxes, scores = split(detections["raw"], classes, order)
         else:
-            boxes = one["boxes"]
-            logits = one["logits"]
-            scores = (
-                logits.softmax(dim=1)[:, :classes]
-                if order == QUERIES[1]
-                else logits.sigmoid()
-            )
-        return _one({"boxes": boxes, "scores": scores})
-    if "either" not in one:
-        return {name: part for name, part in one.items() if name != "beside"}
-    rows = counted(one) | one["either"].isnan().any(dim=1)
-    order = order or order_in([one], classes) or ("" if bool(rows.any()) else ORDERS[0])
+            boxes = detections["boxes"]
+            logits = detections["logits"]
+            if order == QUERIES[1]:
+                scores = logits.softmax(dim=1)[:, :classes]
+            else:
+                scores = logits.sigmoid()
+        return _checked_detections({"boxes": boxes, "scores": scores})
+    if "either" not in detections:
+        return {
+            name: value for name, value in detections.items() if name != "map_channels"
+        }
+
+    either = detections["either"]
+    order = order or order_in([detections], classes)
+    has_values = counted(detections) | either.isnan().any(dim=1)
+    if not order and not bool(has_values.any()):
+        order = ORDERS[0]  # any order will do
     if not order:
         raise ValueError(
             f"which of a box's two numbers is its score does not show; {ASK_ORDER}"
         )
     if order in OF_HEADS:
-        scores = (
-            one["either"].prod(dim=1, keepdim=True)
-            if "objectness" in order
-            else one["either"]
-        )
-        return _one({"boxes": one["boxes"], "scores": scores})
-    first, second = one["either"].unbind(dim=1)
+        has_objectness = "objectness" in order
+        scores = either.prod(dim=1, keepdim=True) if has_objectness else either
+        return _checked_detections({"boxes": detections["boxes"], "scores": scores})
+    first, second = either.unbind(dim=1)
     scores, labels = (first, second) if order == ORDERS[0] else (second, first)
-    said = {
-        name: part for name, part in one.items() if name not in ("either", "beside")
+    rest = {
+        name: value
+        for name, value in detections.items()
+        if name not in ("either", "map_channels")
     }
-    return _one({**said, "scores": scores, "labels": labels})
+    return _checked_detections({**rest, "scores": scores, "labels": labels})
 
 
 def order_in(
     found: Sequence[Detections], classes: int | None = None, head: str = ""
 ) -> str:
-    """Return which order detections of any pictures show, one of `ORDERS`, of
-    `QUERIES`, or of `HEADS` with its layout; "" where they leave it open. Nobody may
-    say how many classes there are; `head` is what is said of outputs in one tensor, one
-    of `HEADS` or of `QUERIES`, or "".
+    """Infer the order that the detections of any images show.
 
-    A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes
-    by falling scores. Two numbers of which none is a class are the scores of two
-    classes, or objectness and the score of the only one.
+    A class is an integer, a score lies in [0, 1]; and suppression returns boxes by
+    falling scores. Two numbers of which neither is a class are the scores of two
+    classes, or objectness and the score of the only class.
+
+    Args:
+        found: detections of images.
+        classes: number of classes; None if it is unknown.
+        head: one of `HEADS` or `QUERIES` that the user stated for outputs in one
+            tensor, or "".
+
+    Returns:
+        One of `ORDERS` or `QUERIES`, or of `HEADS` with its layout; "" if the
+        detections leave it open.
 
     Raises:
         ValueError: no number can be a score, or none a class; or a grid of boxes has
-            none or several of its orders; or there are more or fewer logits than
-            classes.
+            none or several of the orders; or the number of logits does not fit that of
+            the classes.
     """
-    sizes = [one["logits"].shape[1] for one in found if "logits" in one]
-    if sizes and classes is not None:
-        size = sizes[0]
-        order = head or QUERIES[size == classes + 1]
-        if size in ((classes, classes + 1) if order == QUERIES[1] else (classes,)):
-            return order
-        fitting = [
-            f"`labels={name}`"
-            for name in dict.fromkeys([*sets_of(size), *sets_of(size - 1)])
-        ]
-        raise ValueError(
-            f"expected {classes} logits of a box for {classes} classes, or "
-            f"{classes + 1} with one for nothing, got "
-            f"{size}; {' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of its classes'}"
-        )
-    grids = [one for one in found if "raw" in one]
-    if grids and classes is not None:
-        heads = set.intersection(
-            *(
-                set(head_in(one["raw"], one["beside"].tolist(), classes, head))
-                for one in grids
-            )
-        )
-        if not heads:
-            raise ValueError(
-                "pictures do not agree about how its numbers are to be read"
-            )
-        if len(heads) > 1:
-            said = " or ".join(as_option(f"order: {head}") for head in sorted(heads))
-            raise ValueError(
-                f"how its numbers are to be read does not show; say {said}"
-            )
-        return heads.pop()
-    each = [one["either"][counted(one)] for one in found if "either" in one]
-    rows = [one[one.isfinite().all(dim=1)].detach() for one in each]
-    if not any(map(len, rows)):
+    if classes is not None:
+        logits = [x["logits"] for x in found if "logits" in x]
+        if logits:
+            return _order_of_logits(logits[0].shape[1], classes, head)
+        grids = [x for x in found if "raw" in x]
+        if grids:
+            return _order_of_grids(grids, classes, head)
+    return _order_of_pairs(found, classes)
+
+
+def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
+    """Return which of `QUERIES` logits of a box are, by their number."""
+    order = head or QUERIES[n_logits == classes + 1]
+    is_softmax = order == QUERIES[1]
+    if n_logits == classes or (is_softmax and n_logits == classes + 1):
+        return order
+    fitting_sets = dict.fromkeys([*sets_of(n_logits), *sets_of(n_logits - 1)])
+    fitting = [f"`labels={name}`" for name in fitting_sets]
+    if fitting:
+        advice = f"{' or '.join(fitting)} would fit"
+    else:
+        advice = "give the `labels` of its classes"
+    raise ValueError(
+        f"expected {classes} logits of a box for {classes} classes, or "
+        f"{classes + 1} with one for nothing, got {n_logits}; {advice}"
+    )
+
+
+def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str:
+    """Return the only head with layout that fits the grids of all images."""
+    heads_of_images = [
+        set(head_in(x["raw"], x["map_channels"].tolist(), classes, head)) for x in grids
+    ]
+    heads = set.intersection(*heads_of_images)
+    if not heads:
+        raise ValueError("pictures do not agree about how its numbers are to be read")
+    if len(heads) > 1:
+        options = " or ".join(as_option(f"order: {name}") for name in sorted(heads))
+        raise ValueError(f"how its numbers are to be read does not show; say {options}")
+    return heads.pop()
+
+
+def _order_of_pairs(found: Sequence[Detections], classes: int | None) -> str:
+    """Return the order of the two numbers of boxes in `either`, "" if it is open."""
+    pairs_of_images = []
+    for detections in found:
+        if "either" in detections:
+            pairs = detections["either"][counted(detections)]
+            is_finite = pairs.isfinite().all(dim=1)
+            pairs_of_images.append(pairs[is_finite].detach())
+    if not any(map(len, pairs_of_images)):
         return ""
-    numbers = torch.cat(rows).unbind(dim=1)
-    most = math.inf if classes is None else classes
-    whole = [bool(((c == c.round()) & (c >= -1.0) & (c < most)).all()) for c in numbers]
-    share = [bool(((c >= -TOLERANCE) & (c <= 1.0 + TOLERANCE)).all()) for c in numbers]
-    fits = [share[0] and whole[1], share[1] and whole[0]]
-    broken = not any(bool((c == c.round()).all()) for c in numbers)
-    if not any(fits) and all(share) and broken and classes in (1, 2):
-        return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
-    if not any(fits) and classes is not None:
-        return order_in(found)
-    if not any(fits):
+    columns = torch.cat(pairs_of_images).unbind(dim=1)
+    max_classes = math.inf if classes is None else classes
+    are_classes = [_may_be_classes(column, max_classes) for column in columns]
+    are_scores = [_may_be_scores(column) for column in columns]
+    scores_first = are_scores[0] and are_classes[1]
+    labels_first = are_scores[1] and are_classes[0]
+    if not scores_first and not labels_first:
+        has_integers = any(bool((x == x.round()).all()) for x in columns)
+        if all(are_scores) and not has_integers and classes in (1, 2):
+            return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
+        if classes is not None:
+            return order_in(found)
         raise ValueError(
             "expected for each box a score in [0, 1] and the number of a "
             "class, got other numbers"
         )
-    if all(fits):
-        fits = [
-            all(bool((one[:, k].diff() <= 0.0).all()) for one in rows) for k in (0, 1)
-        ]
-    return "" if fits[0] == fits[1] else ORDERS[0] if fits[0] else ORDERS[1]
+    if scores_first and labels_first:
+        scores_first = _is_falling(pairs_of_images, 0)
+        labels_first = _is_falling(pairs_of_images, 1)
+    if scores_first == labels_first:
+        return ""
+    return ORDERS[0] if scores_first else ORDERS[1]
 
 
-# ---- in one tensor, as YOLO's networks give them
-# --------------------------------------------------------------------- It is (A, B) for
-# each picture: "channels first" (places are columns, v8 to v12 and YOLO11) or "channels
-# last" (v5 to v7, YOLOX, RT-DETR). The numbers of a place are a box (middle, width,
-# height), in older ones objectness, with which scores are multiplied, a score of each
-# class, and mask coefficients.
+def _may_be_classes(values: Tensor, max_classes: float) -> bool:
+    """Whether all values are class indices, or -1 for none."""
+    is_integer = values == values.round()
+    return bool((is_integer & (values >= -1.0) & (values < max_classes)).all())
+
+
+def _may_be_scores(values: Tensor) -> bool:
+    """Whether all values are in [0, 1]."""
+    return bool(((values >= -TOLERANCE) & (values <= 1.0 + TOLERANCE)).all())
+
+
+def _is_falling(pairs_of_images: Sequence[Tensor], column: int) -> bool:
+    """Whether a column never rises within any image."""
+    return all(
+        bool((pairs[:, column].diff() <= 0.0).all()) for pairs in pairs_of_images
+    )
+
+
+# ---- one tensor, as YOLO networks return it ----
+#
+# It is (A, B) for each image: "channels first" (boxes are columns: v8 to v12, YOLO11) or
+# "channels last" (boxes are rows: v5 to v7, YOLOX, RT-DETR). The channels of a box are
+# its center, width and height, in older versions objectness, by which the scores are
+# multiplied, a score of each class, and mask coefficients.
 
 
 def head_in(
     returned: Tensor, beside: Collection[int], classes: int, order: str = ""
 ) -> tuple[str, ...]:
-    """Return the orders that an output (A, B) for one picture may have, such as "boxes
-    scores channels first"; what is said of it already narrows them. Sides tell
-    (`beside`: the channels of maps that came with it), and scores, which lie in [0, 1].
-    Raises ValueError where it has none of them; the text says what it seems to be.
+    """Return the orders that the output (A, B) of one image may have.
+
+    The sizes of the output decide, and its scores, which lie in [0, 1].
+
+    Args:
+        returned: the output.
+        beside: numbers of channels of feature maps that came with it, which may be
+            mask coefficients.
+        classes: number of classes.
+        order: one of `HEADS`, with or without a layout, that narrows the orders.
+
+    Returns:
+        Orders such as "boxes scores channels first".
+
+    Raises:
+        ValueError: it has none of them; the message names what it seems to be.
     """
-    found = list[str]()
-    outside = ""
-    for layout, length in zip(LAYOUTS, returned.shape, strict=True):
-        for head, start in HEADS.items():
+    orders = list[str]()
+    problem = ""
+    for layout, n_channels in zip(LAYOUTS, returned.shape, strict=True):
+        for head, first_score in HEADS.items():
             name = f"{head} {layout}"
-            masks = length - start - classes
-            if order not in ("", head, name) or (masks and masks not in beside):
+            n_masks = n_channels - first_score - classes
+            if order not in ("", head, name) or (n_masks and n_masks not in beside):
                 continue
             scores = split(returned, classes, name, multiplied=False)[1].detach()
-            far = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
-            if not bool((far & scores.isfinite()).any()):
-                found.append(name)
-            elif name == _WITH_ANGLE and not bool(far[:, :-1].any()):
-                outside = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
-            else:
-                outside = outside or (
+            is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
+            if not bool((is_outside & scores.isfinite()).any()):
+                orders.append(name)
+            elif name == _WITH_ANGLE and not bool(is_outside[:, :-1].any()):
+                problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
+            elif not problem:
+                problem = (
                     f"scores from {float(scores.min()):.3g} to "
                     f"{float(scores.max()):.3g} if it is read as '{name}'; "
                     "expected probabilities in [0, 1]: apply a sigmoid to them"
                 )
-    if found == [_WITH_ANGLE] and not order:
+    if orders == [_WITH_ANGLE] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
             f"{_UNREAD}; if it has "
             f"objectness, say `task='detection={{order: {_WITH_ANGLE}}}'`"
         )
-    if outside and not found:
-        raise ValueError(f"it has {outside}")
-    if found:
-        return tuple(found)
-    size = min(returned.shape)
-    last = returned.shape[0] >= returned.shape[1]
-    over = {size - 4 - classes, size - 6 if last else 0}
-    advice = "; give the `labels` of the model's classes"
-    if named := [
-        f"`labels={name}`" for start in HEADS.values() for name in sets_of(size - start)
-    ]:
-        advice = f"; {' or '.join(named)} would fit"
-    elif 1 in over:
-        advice = f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
-    elif 32 in over:
-        advice = (
+    if orders:
+        return tuple(orders)
+    if problem:
+        raise ValueError(f"it has {problem}")
+    n_channels = min(returned.shape)
+    is_channels_last = returned.shape[0] >= returned.shape[1]
+    advice = _advise_on_channels(n_channels, classes, may_be_rows=is_channels_last)
+    noun = "classes" if classes > 1 else "class"
+    raise ValueError(
+        f"expected 4 + {classes} or 5 + {classes} numbers of a box for "
+        f"{classes} {noun}, got {n_channels}{advice}"
+    )
+
+
+def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
+    """Return what to do about an output whose number of channels does not fit."""
+    excess_channels = {n_channels - 4 - classes, n_channels - 6 if may_be_rows else 0}
+    fitting = [
+        f"`labels={name}`"
+        for first_score in HEADS.values()
+        for name in sets_of(n_channels - first_score)
+    ]
+    if fitting:
+        return f"; {' or '.join(fitting)} would fit"
+    if 1 in excess_channels:
+        return f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
+    if 32 in excess_channels:
+        return (
             ", as with mask coefficients, and no prototypes (N, 32, h, w) came "
             "beside them"
         )
-    elif any(more > 0 and more % 3 == 0 for more in over):
-        advice = (
+    if any(excess > 0 and excess % 3 == 0 for excess in excess_channels):
+        return (
             f", as pose heads (with keypoints) have it, {_UNREAD}; or give the "
             "`labels` of the model's classes"
         )
-    of = f"{classes} class{'es' * (classes > 1)}"
-    raise ValueError(
-        f"expected 4 + {classes} or 5 + {classes} numbers of a box for "
-        f"{of}, got {size}{advice}"
-    )
+    return "; give the `labels` of the model's classes"
 
 
 def split(
     returned: Tensor, classes: int, order: str, *, multiplied: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Return the boxes (D, 4) and scores (D, classes) of an output (A, B) for one
-    picture; differentiable. Its order has a layout. Unless objectness is `multiplied`
-    with the scores, it is the first of (D, 1 + classes).
+    """Split the output (A, B) of one image into boxes and scores; differentiable.
+
+    Args:
+        returned: the output.
+        classes: number of classes.
+        order: one of `HEADS` with a layout.
+        multiplied: multiply the scores by objectness, if there is any.
+
+    Returns:
+        Boxes (D, 4) and scores (D, classes); (D, 1 + classes), objectness first, if it
+        is not multiplied.
     """
-    places = returned.T if order.endswith(LAYOUTS[0]) else returned
-    scores = places[:, 4 : 4 + classes]
-    if order.startswith("boxes objectness"):
-        objectness = places[:, 4:5]
-        scores = places[:, 5 : 5 + classes]
-        scores = (
-            objectness * scores
-            if multiplied
-            else torch.cat([objectness, scores], dim=1)
-        )
-    return places[:, :4], scores
+    rows = returned.T if order.endswith(LAYOUTS[0]) else returned
+    boxes = rows[:, :4]
+    if not order.startswith("boxes objectness"):
+        return boxes, rows[:, 4 : 4 + classes]
+    objectness = rows[:, 4:5]
+    scores = rows[:, 5 : 5 + classes]
+    if multiplied:
+        return boxes, objectness * scores
+    return boxes, torch.cat([objectness, scores], dim=1)

@@ -1,5 +1,5 @@
-"""The task of a rig of cameras: a task for each picture, and a rule that makes one
-prediction of them.
+"""Judge the images of a rig of cameras: a task for each image, and a rule that combines
+them into one prediction.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ from torch import Tensor
 from advsearch.extend import InputError, Model, Task, models, tasks
 
 RULES = ("any", "all", "mean", "vote")
-"""When the rig is right: in any picture, in all, on average of the losses, or in more
+"""When the rig is right: in any image, in all, on average of the losses, or in more
 than half.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig(tasks.Joined):
-    """Several cameras take pictures of one configuration, and one prediction is made of
-    what a model says of each.
+    """Combine the predictions about the images of several cameras in one configuration.
 
-    Each picture has a truth of its own, such as the box in it. The loss of the rig is
-    the least, the largest or the mean of its pictures' losses, or for `vote` the one
-    that more than half of them are at or below.
+    Each image has its own truth, such as the box in it. The loss of the rig is the
+    smallest, the largest or the mean of the losses of its images, or for `vote` the one that
+    more than half of them are at or below.
 
     Args:
-        task: of each picture: a name, or a mapping with a `name` and options.
+        task: of each image: a name, or a mapping with a `name` and options.
         rule: one of `RULES`.
 
     Raises:
@@ -62,8 +61,8 @@ class Rig(tasks.Joined):
 
     @property
     def of_one_image(self) -> Task:
-        made: Task = self.part
-        return made
+        task: Task = self.part
+        return task
 
     @property
     def title(self) -> str:
@@ -72,7 +71,7 @@ class Rig(tasks.Joined):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Rig:
-        """See `Task.on`. Raises InputError where the scene is seen by one camera."""
+        """See `Task.on`. Raises InputError if there is a single camera."""
         if model.cameras < 2:
             raise InputError(
                 "task rig: expected a rig, got one camera; give it with "
@@ -105,121 +104,125 @@ class Rig(tasks.Joined):
     def after_calibration(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None
     ) -> Rig:
-        return replace(
-            self,
-            part=self.part.after_calibration(
-                output[0][0], None if truth is None else truth[0]
-            ),
-        )
+        """See `Task.after_calibration`: the first camera's image is the clean one."""
+        first_output = output[0][0]
+        first_truth = None if truth is None else truth[0]
+        part = self.part.after_calibration(first_output, first_truth)
+        return replace(self, part=part)
 
     def truth(self, facts: tasks.Facts) -> tasks.Truths:
-        return tuple(
-            self.part.truth(view) for view in facts.views or (facts,) * self.cameras
-        )
+        """Return the truth of each image."""
+        views = facts.views or (facts,) * self.cameras
+        return tuple(self.part.truth(view) for view in views)
 
     def loss(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
-        return self._ruled(self._each("loss", output, truth))
+        """Combine the losses of the images by the rule, (N,)."""
+        return self._combine(self._map_images(self.part.loss, output, truth))
 
     def score(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
-        """See `Task.score`: a target is reached, and a right prediction made, by the
-        rule.
-        """
-        scores = self._each("score", output, truth)
-        return (
-            -self._ruled(-scores)
-            if self.target is not None or self.minimise
-            else self._ruled(scores)
-        )
+        """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
+        scores = self._map_images(self.part.score, output, truth)
+        if self.target is not None or self.minimise:
+            return -self._combine(-scores)
+        return self._combine(scores)
 
-    def _each(
-        self, value: str, output: Sequence[tasks.Outputs], truth: tasks.Truths
+    @staticmethod
+    def _map_images(
+        function: Callable[[Any, tasks.Truth], Tensor],
+        output: Sequence[tasks.Outputs],
+        truth: tasks.Truths,
     ) -> Tensor:
-        """A number of each picture, (N, K)."""
-        of_picture: Callable[[Any, tasks.Truth], Tensor] = getattr(self.part, value)
-        each = [
-            [of_picture(*judged) for judged in zip(pictures, truth, strict=True)]
-            for pictures in output
-        ]
-        return torch.stack([torch.cat(values) for values in each])
+        """Apply the loss or the score to each of K images of each of N rigs, (N, K)."""
+        rows = []
+        for image_outputs in output:
+            values = [
+                function(image_output, image_truth)
+                for image_output, image_truth in zip(image_outputs, truth, strict=True)
+            ]
+            rows.append(torch.cat(values))
+        return torch.stack(rows)
 
-    def _ruled(self, wrong: Tensor) -> Tensor:
-        """How wrong the rig is, (N,), from how wrong it is in each picture, (N, K)."""
+    def _combine(self, values: Tensor) -> Tensor:
+        """Combine losses or scores of images (N, K) by the rule, (N,)."""
         if self.rule == "mean":
-            return wrong.mean(dim=1)
-        place = {"any": 0, "all": wrong.shape[1] - 1, "vote": wrong.shape[1] // 2}[
-            self.rule
-        ]
-        return wrong.sort(dim=1).values[:, place]
+            return values.mean(dim=1)
+        n_images = values.shape[1]
+        rank = {"any": 0, "all": n_images - 1, "vote": n_images // 2}[self.rule]
+        return values.sort(dim=1).values[:, rank]
 
     def predictions(
         self, output: Sequence[tasks.Outputs], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        return [
-            (tasks.all_said(self.part.predictions(picture)[0][0] for picture in each),)
-            for each in output
-        ]
+        """Return the joint prediction of the images of each rig."""
+        predictions_of_rigs = []
+        for image_outputs in output:
+            predictions = [
+                self.part.predictions(image_output)[0][0]
+                for image_output in image_outputs
+            ]
+            predictions_of_rigs.append((tasks.all_said(predictions),))
+        return predictions_of_rigs
 
     def judge(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths
     ) -> list[tasks.Judgement]:
+        """See `Task.judge`; the payload has the judgement of each image."""
         with torch.no_grad():
             margins = (0.0 - self.loss(output, truth)).tolist()
             scores = self.score(output, truth).tolist()
-        judgements = []
-        for pictures, margin, score in zip(output, margins, scores, strict=True):
-            each = [
-                self.part.judge(*judged)[0]
-                for judged in zip(pictures, truth, strict=True)
+        rig_judgements = []
+        for image_outputs, margin, score in zip(output, margins, scores, strict=True):
+            judgements = [
+                self.part.judge(image_output, image_truth)[0]
+                for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
-            margin = math.nan if any(judged.not_a_number for judged in each) else margin
-            kept: list[tasks.JsonValue] = [
+            if any(judgement.not_a_number for judgement in judgements):
+                margin = math.nan
+            image_payloads: list[tasks.JsonValue] = [
                 {
-                    "prediction": judged.prediction.label,
-                    "right": judged.right,
-                    "payload": judged.payload,
+                    "prediction": judgement.prediction.label,
+                    "right": judgement.right,
+                    "payload": judgement.payload,
                 }
-                for judged in each
+                for judgement in judgements
             ]
-            prediction = tasks.all_said(judged.prediction for judged in each)
-            # the picture by which the rule decides; of the mean, the worst one
-            deciding = min(
-                each,
-                key=lambda judged: (
-                    judged.margin
-                    if self.rule == "mean"
-                    else abs(judged.margin - margin)
-                ),
+            prediction = tasks.all_said(
+                judgement.prediction for judgement in judgements
             )
-            judgements.append(
-                tasks.Judgement.of(
-                    score,
-                    margin,
-                    prediction,
-                    {"pictures": kept, **tasks.outcome_in(deciding)},
-                )
+            outcome = tasks.outcome_in(self._deciding(judgements, margin))
+            payload = {"pictures": image_payloads, **outcome}
+            rig_judgements.append(
+                tasks.Judgement.of(score, margin, prediction, payload)
             )
-        return judgements
+        return rig_judgements
+
+    def _deciding(
+        self, judgements: Sequence[tasks.Judgement], margin: float
+    ) -> tasks.Judgement:
+        """Return the judgement that decides by the rule; for the mean, the worst one."""
+        if self.rule == "mean":
+            return min(judgements, key=lambda judgement: judgement.margin)
+        return min(judgements, key=lambda judgement: abs(judgement.margin - margin))
 
     def marks(
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths
     ) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: those of the first picture, which is at the left."""
-
-        def widened(mask: Tensor | None) -> Tensor | None:
-            return (
-                None
-                if mask is None
-                else torch.cat(
-                    [mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1
-                )
+        """See `Task.marks`: those of the first image, which is the leftmost."""
+        marks_of_rigs = []
+        for image_outputs in output:
+            marks = self.part.marks(image_outputs[0], truth[0])[0]
+            marks_of_rigs.append(
+                [
+                    replace(mark, mask=self._pad_to_rig(mark.mask))
+                    for mark in marks
+                    if mark.map is None
+                ]
             )
+        return marks_of_rigs
 
-        each = [self.part.marks(pictures[0], truth[0])[0] for pictures in output]
-        return [
-            [
-                replace(mark, mask=widened(mark.mask))
-                for mark in marks
-                if mark.map is None
-            ]
-            for marks in each
-        ]
+    def _pad_to_rig(self, mask: Tensor | None) -> Tensor | None:
+        """Widen the mask of the first image to all images in a row."""
+        if mask is None:
+            return None
+        other_images = [torch.zeros_like(mask)] * (self.cameras - 1)
+        return torch.cat([mask, *other_images], dim=-1)

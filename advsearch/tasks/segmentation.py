@@ -1,4 +1,4 @@
-"""Semantic segmentation: whether a model gives the object's pixels a right class."""
+"""Judge semantic segmentation: whether the object's pixels get a right class."""
 
 from __future__ import annotations
 
@@ -15,44 +15,51 @@ from advsearch.extend import tasks
 
 EXPECTED = (
     "expected logits (N, classes, height, width), or a mapping with these "
-    "under "
-    "'out' or 'logits'"
+    "under 'out' or 'logits'"
 )
 
-LEAST_ACCURACY = 0.1  # fraction of the object's pixels from which on it is seen in part
+# Minimum fraction of right pixels at which the object is segmented in part.
+LEAST_ACCURACY = 0.1
 
+# Computes the lead (P,) of classes from logits (P, classes).
 Lead = Callable[[Tensor, tasks.Labels], Tensor]
 
 
 @dataclass(frozen=True)
 class Region:
-    """What is to be segmented in a picture, the truth of segmentation: indices of the
-    right classes, and (H, W) bool, the pixels in which the object is seen.
+    """What has to be segmented in an image: the truth of segmentation.
+
+    Attributes:
+        labels: indices of the right classes.
+        mask: (H, W) bool, the pixels in which the object is visible.
     """
 
     labels: tasks.Labels
     mask: Tensor
 
     def at(self, size: tuple[int, int]) -> Tensor:
-        """Return the mask at the size of an output, (h, w) bool: a pixel of which at
-        least half is the object's. Where none is, those that have a part of it.
+        """Resize the mask to the size of an output, (h, w) bool.
+
+        A pixel is the object's if at least half of it is; if there is no such pixel, all
+        that contain a part of the object are.
         """
         if self.mask.shape == size:
             return self.mask
-        shares = F.interpolate(self.mask[None, None].float(), size=size, mode="area")[
-            0, 0
-        ]
-        half = shares >= 0.5
-        return half if bool(half.any()) else shares > 0.0
+        mask = self.mask[None, None].float()
+        fraction = F.interpolate(mask, size=size, mode="area")[0, 0]
+        is_half = fraction >= 0.5
+        return is_half if bool(is_half.any()) else fraction > 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Segmentation(tasks.ClassTask):
-    """A model gives at least `accuracy` of the object's pixels a right class. Pixels
-    beside the object don't count.
+    """Judge whether at least `accuracy` of the object's pixels get a right class.
 
-    Where the object is not seen at all there is nothing to segment, and every prediction is right. Raises InputError:
-    `accuracy` is no share between 0 and 1.
+    Other pixels do not count. If the object is out of view there is nothing to segment, and
+    every prediction is right.
+
+    Raises:
+        InputError: `accuracy` is no fraction between 0 and 1.
     """
 
     name = "segmentation"
@@ -68,8 +75,10 @@ class Segmentation(tasks.ClassTask):
         )
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return the logits (N, classes, h, w) in what a network returned. Raises
-        ValueError: there are none.
+        """Read the logits (N, classes, h, w) from what a network returned.
+
+        Raises:
+            ValueError: there are none.
         """
         if isinstance(returned, Mapping):
             returned = returned.get("out", returned.get("logits"))
@@ -96,16 +105,15 @@ class Segmentation(tasks.ClassTask):
         return self.names(truth.labels)
 
     def loss(self, output: Tensor, truth: Region) -> Tensor:
-        """Return, in logits (N,), the wrong classes' lead at the pixel that decides:
-        over 0 where too few are right. Of the object's pixels in the order of that lead
-        it is the one at which `accuracy` of them is reached.
+        """Compute the lead of wrong classes at the deciding pixel, in logits, (N,).
+
+        It is over 0 if too few pixels are right. Of the object's pixels in the order of that
+        lead, the deciding one is that at which `accuracy` of them is reached.
         """
         return self._deciding(output, truth, tasks.wrong_lead, truth.labels)
 
     def score(self, output: Tensor, truth: Region) -> Tensor:
-        """See `Task.score`; with a target, enough of the object's pixels have to be
-        given that.
-        """
+        """See `Task.score`; with a target, enough of the object's pixels have to get it."""
         if self.target is None:
             return super().score(output, truth)
         return -self._deciding(
@@ -116,135 +124,156 @@ class Segmentation(tasks.ClassTask):
         )
 
     def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
-        """Return the mean over the object's pixels of what is sought: the lead of wrong
-        classes, or of the target's. In logits, (N,). Every pixel has a derivative, and
-        not the deciding one alone as in `loss`.
+        """Compute the mean over the object's pixels of what is sought, in logits, (N,).
+
+        That is the lead of wrong classes, or of the target's. Every pixel has a
+        derivative, not only the deciding one as in `loss`.
         """
-        pixels = self._pixels(output, truth)
+        pixels = self._object_logits(output, truth)
         if pixels is None:
-            return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
-        lead = (
-            tasks.wrong_lead(pixels, truth.labels)
-            if self.target is None
-            else tasks.target_lead(pixels, self.target)
-        )
-        mean = lead.reshape(len(output), -1).mean(dim=1)
-        return -mean if self.minimise else mean
+            return _not_visible(output)
+        if self.target is None:
+            lead = tasks.wrong_lead(pixels, truth.labels)
+        else:
+            lead = tasks.target_lead(pixels, self.target)
+        mean_lead = lead.reshape(len(output), -1).mean(dim=1)
+        return -mean_lead if self.minimise else mean_lead
 
     def _deciding(
         self, output: Tensor, truth: Region, lead: Lead, labels: tasks.Labels
     ) -> Tensor:
-        """The lead at the pixel at which `accuracy` of them is reached, (N,)."""
-        pixels = self._pixels(output, truth)
+        """Compute the lead at the pixel at which `accuracy` of them is reached, (N,)."""
+        pixels = self._object_logits(output, truth)
         if pixels is None:
-            return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
-        values = lead(pixels, labels).reshape(len(output), -1)
-        deciding = values.kthvalue(
-            math.ceil(self.accuracy * values.shape[1]), dim=1
-        ).values
-        return torch.where(values.isfinite().all(dim=1), deciding, math.nan)
+            return _not_visible(output)
+        leads = lead(pixels, labels).reshape(len(output), -1)
+        rank = math.ceil(self.accuracy * leads.shape[1])
+        deciding_lead = leads.kthvalue(rank, dim=1).values
+        return torch.where(leads.isfinite().all(dim=1), deciding_lead, math.nan)
 
     @staticmethod
-    def _pixels(output: Tensor, truth: Region) -> Tensor | None:
-        """The logits of the object's pixels, picture by picture, (N * P, classes); None
-        where it is not seen.
+    def _object_logits(output: Tensor, truth: Region) -> Tensor | None:
+        """Select the logits of the object's pixels, image by image, (N * P, classes).
+
+        None if the object is out of view.
         """
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
-        chosen = output.permute(0, 2, 3, 1)[:, mask]
-        return chosen.reshape(-1, output.shape[1]) if chosen.shape[1] else None
+        selected = output.permute(0, 2, 3, 1)[:, mask]
+        return selected.reshape(-1, output.shape[1]) if selected.shape[1] else None
 
     def predictions(
         self, output: Tensor, count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return the things that most pixels of each picture are given, with the shares
-        that they have.
+        """Return the most frequent classes of the pixels of each image, with their
+        fractions of the image.
         """
-        found = []
-        for one in output.detach():
-            said = one[:, (one.isfinite() | (one == -math.inf)).all(dim=0)].argmax(
-                dim=0
-            )
-            counts = said.bincount(minlength=len(one))
+        predictions_of_images = []
+        for logits in output.detach():
+            is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
+            class_of_pixel = logits[:, is_number].argmax(dim=0)
+            n_classes = len(logits)
+            n_pixels = logits[0].numel()
+            counts = class_of_pixel.bincount(minlength=n_classes)
             counts[list(self.nothing)] = 0
-            shares, indices = counts.topk(min(count, len(one)))
-            rows = zip(indices.tolist(), shares.tolist(), strict=True)
-            listed = tuple(
-                tasks.Prediction(self.name_of(i), i, n / one[0].numel())
-                for i, n in rows
-                if n
+            top_counts, top_classes = counts.topk(min(count, n_classes))
+            predictions = tuple(
+                tasks.Prediction(
+                    self.name_of(class_id), class_id, class_count / n_pixels
+                )
+                for class_id, class_count in zip(
+                    top_classes.tolist(), top_counts.tolist(), strict=True
+                )
+                if class_count
             )
-            found.append(
-                listed
-                or (tasks.Prediction("nothing" if len(said) else tasks.NOT_A_NUMBER),)
-            )
-        return found
+            if not predictions:
+                label = "nothing" if len(class_of_pixel) else tasks.NOT_A_NUMBER
+                predictions = (tasks.Prediction(label),)
+            predictions_of_images.append(predictions)
+        return predictions_of_images
 
     def said(
         self, output: Tensor, truth: Region, margins: Sequence[float]
     ) -> list[tasks.Said]:
-        """See `Task.said`. The prediction is the class of most of the object's pixels;
-        a wrong one where too few are right, and where most of these are background "no
-        bottle", or "bottle in part" from `LEAST_ACCURACY` on. Its probability is the
-        share of the object's pixels that are right. Beside it stand the outcome, shares
-        of the pixels by class, and the overlap.
+        """See `Task.said`: the class of most of the object's pixels.
+
+        If too few are right, it is the most frequent wrong class; if that is background,
+        "no bottle", or "bottle in part" from `LEAST_ACCURACY` on. The probability is the
+        fraction of the object's pixels that are right. The payload has the outcome, the
+        fractions of the pixels by class, and the intersection over union.
         """
-        found: list[tasks.Said] = []
+        results: list[tasks.Said] = []
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
-            pixels = self._pixels(logits[None], truth)
+            pixels = self._object_logits(logits[None], truth)
             if pixels is None:
-                found.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
+                results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
-            right = margin >= 0.0
-            hits = self._correct(logits, truth)
+            is_correct = self._correct(logits, truth)
+            accuracy = float(is_correct[mask].float().mean())
+            iou = float((is_correct & mask).sum() / (is_correct | mask).sum())
             counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
-            first = int(
-                counts.masked_fill(
-                    tasks.members(pixels, truth.labels) != right, -1
-                ).argmax()
+            prediction, outcome = self._describe_object(
+                counts, truth, accuracy, is_right=margin >= 0.0
             )
-            accuracy = float(hits[mask].float().mean())
-            overlap = float((hits & mask).sum() / (hits | mask).sum())
-            said = tasks.Prediction(self.name_of(first), first, accuracy)
-            outcome = tasks.Outcome.FOUND if right else tasks.Outcome.WRONG_CLASS
-            if not right and first in self.nothing:
-                name = self.name_of(truth.labels[0])
-                is_partly_right = accuracy >= LEAST_ACCURACY
-                outcome = (
-                    tasks.Outcome.LOOSE if is_partly_right else tasks.Outcome.MISSED
-                )
-                said = tasks.Prediction(
-                    f"{name} in part" if is_partly_right else f"{tasks.NO}{name}",
-                    None,
-                    accuracy,
-                )
-            shares = {
-                self.name_of(i): round(n / len(pixels), 4)
-                for i, n in enumerate(counts.tolist())
-                if n
+            fraction_by_class = {
+                self.name_of(class_id): round(class_count / len(pixels), 4)
+                for class_id, class_count in enumerate(counts.tolist())
+                if class_count
             }
-            numbers = {"accuracy": round(accuracy, 4), "iou": round(overlap, 4)}
-            found.append(
-                (said, {tasks.OUTCOME: outcome.value, **numbers, "pixels": shares})
-            )
-        return found
+            payload: tasks.JsonValue = {
+                tasks.OUTCOME: outcome.value,
+                "accuracy": round(accuracy, 4),
+                "iou": round(iou, 4),
+                "pixels": fraction_by_class,
+            }
+            results.append((prediction, payload))
+        return results
+
+    def _describe_object(
+        self, counts: Tensor, truth: Region, accuracy: float, *, is_right: bool
+    ) -> tuple[tasks.Prediction, tasks.Outcome]:
+        """Return the prediction about the object, and what becomes of it.
+
+        Args:
+            counts: the object's pixels by class, (classes,).
+            truth: of the image.
+            accuracy: fraction of the object's pixels that are right.
+            is_right: whether enough of them are.
+        """
+        is_right_class = torch.zeros_like(counts, dtype=torch.bool)
+        is_right_class[list(truth.labels)] = True
+        top_class = int(counts.masked_fill(is_right_class != is_right, -1).argmax())
+        if is_right or top_class not in self.nothing:
+            prediction = tasks.Prediction(self.name_of(top_class), top_class, accuracy)
+            outcome = tasks.Outcome.FOUND if is_right else tasks.Outcome.WRONG_CLASS
+            return prediction, outcome
+        name = self.name_of(truth.labels[0])
+        if accuracy >= LEAST_ACCURACY:
+            prediction = tasks.Prediction(f"{name} in part", None, accuracy)
+            return prediction, tasks.Outcome.LOOSE
+        prediction = tasks.Prediction(f"{tasks.NO}{name}", None, accuracy)
+        return prediction, tasks.Outcome.MISSED
 
     @staticmethod
     def _correct(logits: Tensor, truth: Region) -> Tensor:
-        """Where the output (C, h, w) is a right class, (h, w) bool; a tie is right, NaN
-        is not.
+        """Whether the largest of the logits (C, h, w) is that of a right class, (h, w)
+        bool; a tie is right, NaN is not.
         """
-        classes = logits.shape[0]
-        return (
-            tasks.wrong_lead(logits.permute(1, 2, 0).reshape(-1, classes), truth.labels)
-            <= 0.0
-        ).reshape(logits.shape[1:])
+        n_classes = logits.shape[0]
+        pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)
+        is_correct = tasks.wrong_lead(pixels, truth.labels) <= 0.0
+        return is_correct.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: Region) -> list[list[tasks.Mark]]:
-        """See `Task.marks`: the object, and the pixels that are given a right class."""
+        """See `Task.marks`: the object, and the pixels that get a right class."""
         name = " or ".join(self.names(truth.labels))
-        true = tasks.Mark(name, True, mask=truth.mask)
+        true_mark = tasks.Mark(name, True, mask=truth.mask)
         return [
-            [true, tasks.Mark(name, False, mask=self._correct(one, truth))]
-            for one in output.detach()
+            [true_mark, tasks.Mark(name, False, mask=self._correct(logits, truth))]
+            for logits in output.detach()
         ]
+
+
+def _not_visible(output: Tensor) -> Tensor:
+    """Return -1 for each of N outputs, attached to their graph, (N,)."""
+    return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0

@@ -1,15 +1,15 @@
-"""Similarity: which reference pictures a network finds nearest, by the cosine of its
-features.
+"""Judge similarity: which reference images are nearest, by the cosine of features.
 
-With a gallery, one folder of pictures for each name, it is a classification among these
-names. Without, a prediction is right where the picture is still the same thing as the
-clean one to the network.
+With a gallery, one folder of images per name, it is a classification among these names.
+Without, a prediction is right if the network still sees the same thing as in the clean
+image.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,40 +20,51 @@ from torch.nn import functional
 
 from advsearch.extend import InputError, Model, models, stored_files, tasks
 
-MOST = 10_000  # pictures of a gallery, before `scaled`
-# longest side in pixels of a picture as it is kept; larger ones are averaged down
+MOST = 10_000  # maximum number of images in a gallery, before `scaled`
+# Maximum size of a loaded image in pixels; larger ones are averaged down.
 SIDE = 1024
-AT_ONCE = 16  # pictures that a network is shown at once
-# of the squared weights of a linear head, beside a mean cross-entropy in nats
+AT_ONCE = 16  # batch size for a network
+# Weight of the squared weights of a linear head, next to a mean cross-entropy in nats.
 PENALTY = 1e-3
-# most iterations of the fit of a linear head; it usually stands still after a few dozen
+# Maximum number of iterations of the fit; it usually converges after a few dozen.
 ROUNDS = 500
 
 
 @dataclass(frozen=True, eq=False)
 class Gallery:
-    """Reference pictures, embedded."""
+    """Embedded reference images.
 
-    names: tuple[str, ...]  # of the folders, in order
-    owners: Tensor  # (R,) whole numbers, the number of each picture's name
-    paths: tuple[str, ...]  # of each picture, within the folder
-    features: Tensor  # (R, D), of length 1
-    seen_by: tuple[Any, ...] = field(repr=False)  # the network and its preprocessing
-    # weights (names, D) and biases (names,)
+    Attributes:
+        names: of the folders, in order.
+        owners: (R,) int64, the index of each image's name.
+        paths: of each image, relative to the folder.
+        features: (R, D), of length 1.
+        embedder: the network that embedded them, and its preprocessing.
+        head: of `linear`: weights (names, D) and biases (names,).
+    """
+
+    names: tuple[str, ...]
+    owners: Tensor
+    paths: tuple[str, ...]
+    features: Tensor
+    embedder: tuple[Any, ...] = field(repr=False)
     head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
     def cosines(self, features: Tensor) -> Tensor:
-        """Return the cosine (N, R) of features (N, D) of length 1 and each picture."""
+        """Compute the cosines (N, R) between features (N, D) of length 1 and each image."""
         return features @ self.features.to(features).T
 
 
 def folders_of(folder: str) -> list[tuple[str, Path]]:
-    """Return the names in a folder, and the folder of each, in alphabetical order;
-    hidden ones are left out. Raises InputError where it is not there, or does not have
-    two names.
+    """List the names in a folder with their folders, in alphabetical order.
+
+    Hidden folders are left out.
+
+    Raises:
+        InputError: it does not exist, or has fewer than two names.
     """
     root = Path(folder).expanduser()
-    folders = [(entry.name, entry) for entry in _listed(root) if entry.is_dir()]
+    folders = [(entry.name, entry) for entry in _list_visible(root) if entry.is_dir()]
     if len(folders) < 2:
         got = f"only {folders[0][0]}" if folders else "no folder"
         raise InputError(
@@ -65,88 +76,102 @@ def folders_of(folder: str) -> list[tuple[str, Path]]:
 
 
 def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
-    """Return the pictures in a folder, which has one for each name, as a model that
-    returns features sees them; everything is done anew, and the same each time. A head
-    is fitted where it is `linear`.
+    """Embed the reference images in a folder, which has one folder per name.
 
-    A picture is turned upright, its middle is cut to the shape of the model's input,
-    and then it goes the way of a rendered one.
+    An image is turned upright, cropped at its center to the shape of the model's input,
+    and then preprocessed like a rendered one. The result is deterministic.
+
+    Args:
+        folder: with the folders.
+        model: that returns features.
+        linear: fit a linear head on the features.
 
     Raises:
-        InputError: as for `folders_of`; a name without a picture; too many pictures;
+        InputError: as for `folders_of`; a name without an image; too many images;
             features that are not (N, D).
-        FileFormatError: a file that is no picture, or a huge one.
+        FileFormatError: a file that is no image, or a huge one.
     """
-    folders = folders_of(folder)
+    named_folders = folders_of(folder)
     root = Path(folder).expanduser()
-    paths: list[tuple[int, Path]] = []
-    for number, (name, where) in enumerate(folders):
-        pictures = _listed(where)
-        if not pictures:
+    paths: list[Path] = []
+    name_indices: list[int] = []
+    for index, (name, name_folder) in enumerate(named_folders):
+        image_paths = _list_visible(name_folder)
+        if not image_paths:
             raise InputError(
-                f"references: expected pictures of {name} in {where}, got "
+                f"references: expected pictures of {name} in {name_folder}, got "
                 "none; put some there"
             )
-        paths += [(number, picture) for picture in pictures]
-    if len(paths) > stored_files.scaled(MOST):
+        paths += image_paths
+        name_indices += [index] * len(image_paths)
+    limit = stored_files.scaled(MOST)
+    if len(paths) > limit:
         raise stored_files.too_large(
-            root,
-            f"at most {stored_files.scaled(MOST):,} reference pictures",
-            f"{len(paths):,}",
+            root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
         )
-    parts: list[Tensor] = []
-    shown = (
-        _cut(torch.from_numpy(models.upright(path, SIDE)), model.input_size)
-        for _, path in paths
+    features = _embed_images(paths, model)
+    owners = torch.tensor(name_indices)
+    return Gallery(
+        names=tuple(name for name, _ in named_folders),
+        owners=owners,
+        paths=tuple(path.relative_to(root).as_posix() for path in paths),
+        features=features,
+        embedder=(model.module, model.preprocessing),
+        head=fitted(features, owners) if linear else None,
     )
+
+
+def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
+    """Compute the features (R, D) of length 1 of the images in files, in batches."""
+    images = (
+        _crop_center(torch.from_numpy(models.upright(path, SIDE)), model.input_size)
+        for path in paths
+    )
+    batches: list[Tensor] = []
     with torch.no_grad():
-        for _, of_one_size in itertools.groupby(
-            shown, key=lambda picture: picture.shape
-        ):
-            while batch := list(itertools.islice(of_one_size, AT_ONCE)):
-                parts.append(model(torch.stack(batch)))
-                if parts[-1].dim() != 2:
-                    got = tuple(parts[-1].shape)
+        # A batch has images of one size; groupby keeps the order of the files.
+        for _, same_size in itertools.groupby(images, key=lambda image: image.shape):
+            while batch := list(itertools.islice(same_size, AT_ONCE)):
+                batches.append(model(torch.stack(batch)))
+                if batches[-1].dim() != 2:
                     raise InputError(
                         f"model {model.name}: expected features (N, D), "
-                        f"got {got}; use another task"
+                        f"got {tuple(batches[-1].shape)}; use another task"
                     )
-    features = torch.cat(parts)
-    broken = ~features.isfinite().all(dim=1)
-    if bool(broken.any()):
+    features = torch.cat(batches)
+    has_nan = ~features.isfinite().all(dim=1)
+    if bool(has_nan.any()):
+        first = int(has_nan.nonzero()[0])
         raise InputError(
-            f"references: model {model.name} returns for "
-            f"{paths[int(broken.nonzero()[0])][1]} NaN"
+            f"references: model {model.name} returns for {paths[first]} NaN"
         )
-    features = functional.normalize(features, dim=1)
-    owners = torch.tensor([number for number, _ in paths])
-    return Gallery(
-        tuple(name for name, _ in folders),
-        owners,
-        tuple(path.relative_to(root).as_posix() for _, path in paths),
-        features,
-        (model.module, model.preprocessing),
-        fitted(features, owners) if linear else None,
-    )
+    return functional.normalize(features, dim=1)
 
 
 def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (names, D) and biases (names,) of a multinomial logistic
-    regression on features (R, D) and the numbers of their names (R,).
+    """Fit a multinomial logistic regression of names on features.
 
-    Names count alike, however many pictures they have. The loss is convex, so its
-    minimum is the only one; it is sought by L-BFGS from zero in double precision, as
-    Radford et al. 2021 (arXiv 2103.00020, section A.3) fit theirs.
+    Names have equal weights, however many images they have. The loss is convex, so its
+    minimum is unique; it is found by L-BFGS from zero in float64, as Radford et al. 2021
+    (arXiv 2103.00020, section A.3) fit theirs.
+
+    Args:
+        features: (R, D).
+        owners: (R,) int64, the index of each row's name.
+
+    Returns:
+        Weights (names, D) and biases (names,), float32.
     """
-    count = int(owners.max()) + 1
-    shares = 1.0 / (count * torch.bincount(owners, minlength=count).double()[owners])
-    middle = features.double().mean(dim=0)
-    given = features.double() - middle
+    n_names = int(owners.max()) + 1
+    images_per_name = torch.bincount(owners, minlength=n_names).double()
+    image_weights = 1.0 / (n_names * images_per_name[owners])
+    center = features.double().mean(dim=0)
+    centered = features.double() - center
     weights = torch.zeros(
-        count, features.shape[1], dtype=torch.float64, requires_grad=True
+        n_names, features.shape[1], dtype=torch.float64, requires_grad=True
     )
-    biases = torch.zeros(count, dtype=torch.float64, requires_grad=True)
-    search = torch.optim.LBFGS(
+    biases = torch.zeros(n_names, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS(
         [weights, biases],
         max_iter=ROUNDS,
         tolerance_grad=1e-8,
@@ -154,24 +179,27 @@ def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
         line_search_fn="strong_wolfe",
     )
 
-    def loss() -> Tensor:
-        search.zero_grad()
-        each = functional.cross_entropy(
-            functional.linear(given, weights, biases), owners, reduction="none"
-        )
-        value: Tensor = (shares * each).sum() + PENALTY / 2.0 * weights.square().sum()
-        torch.autograd.backward(value, inputs=[weights, biases])
-        return value
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        logits = functional.linear(centered, weights, biases)
+        image_loss = functional.cross_entropy(logits, owners, reduction="none")
+        penalty = PENALTY / 2.0 * weights.square().sum()
+        loss: Tensor = (image_weights * image_loss).sum() + penalty
+        torch.autograd.backward(loss, inputs=[weights, biases])
+        return loss
 
     with torch.enable_grad():
-        search.step(loss)
+        optimizer.step(closure)
     weights = weights.detach()
-    return weights.float(), (biases.detach() - weights @ middle).float()
+    return weights.float(), (biases.detach() - weights @ center).float()
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list_visible(folder: Path) -> list[Path]:
+    """List what is in a folder and not hidden, sorted. Raises InputError: no folder."""
     try:
-        return sorted(one for one in folder.iterdir() if not one.name.startswith("."))
+        return sorted(
+            path for path in folder.iterdir() if not path.name.startswith(".")
+        )
     except OSError as error:
         raise InputError(
             "references: expected a folder with a folder of pictures for each name, "
@@ -180,54 +208,54 @@ def _listed(folder: Path) -> list[Path]:
         ) from None
 
 
-def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the largest middle part of a picture (H, W, 3) that has the shape of the
-    input.
+def _crop_center(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Crop an image (H, W, 3) around its center to the aspect ratio of a size (height,
+    width).
     """
-    height, width = picture.shape[:2]
-    high = min(height, max(1, round(width * size[0] / size[1])))
-    wide = min(width, max(1, round(height * size[1] / size[0])))
-    top = (height - high) // 2
-    left = (width - wide) // 2
-    return picture[top : top + high, left : left + wide]
+    height, width = image.shape[:2]
+    crop_height = min(height, max(1, round(width * size[0] / size[1])))
+    crop_width = min(width, max(1, round(height * size[1] / size[0])))
+    top = (height - crop_height) // 2
+    left = (width - crop_width) // 2
+    return image[top : top + crop_height, left : left + crop_width]
 
 
 METHODS = ("nearest", "linear")  # how features become logits
 
 TEMPERATURE = 0.07
-"""What cosines are divided by to be logits (Wu et al. 2018, arXiv 1805.01978, section 4.1; Caron et al. 2021, arXiv
-2104.14294, section 4.1)."""
+"""Cosines are divided by it to be logits (Wu et al. 2018, arXiv 1805.01978, section 4.1;
+Caron et al. 2021, arXiv 2104.14294, section 4.1).
+"""
 
 ITSELF = "itself"
 ELSE = "something else"
-"""The predictions where there is a threshold."""
+"""The predictions with a threshold."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Similarity(tasks.Classification):
-    """The object is what the nearest reference pictures show, or what the clean picture
-    shows.
+    """Judge whether the object is what the nearest reference images show, or the clean one.
 
-    The output is features (N, D), whatever their length. With `references` the truth is
-    the indices of the right names, and logits (N, names) of them are
+    The output is features (N, D) of any length. With `references` the truth is the indices
+    of the right names, and logits (N, names) are computed from the features by `method`:
 
-    - `nearest`: the mean cosine of the `k` nearest pictures of each name, over
-      `TEMPERATURE`. Each name is judged by pictures of its own, so that one with many
-      has no more votes than one with few, and every name has a gradient. The mean, so
-      that one odd picture decides nothing where `k` is over 1. With 1, the default, a
-      prediction is right exactly where the nearest picture of all is.
+    - `nearest`: the mean cosine of the `k` nearest images of each name, over
+      `TEMPERATURE`. Each name is scored by its own images, so that a name with many has no
+      more votes than one with few, and every name has a gradient. With k = 1, the default, a
+      prediction is right exactly if the nearest image of all is; a larger k lets no single
+      image decide.
     - `linear`: those of a logistic regression on the reference features, of length 1
-    (`fitted`).
+      (`fitted`).
 
-    With `threshold` they are the cosine to the clean picture's features and the
+    With `threshold` the logits are the cosine to the clean image's features and the
     threshold, over `TEMPERATURE`.
 
     Args:
-        references: a folder with a folder of pictures for each name; "" for none.
+        references: a folder with a folder of images for each name; "" for none.
         method: one of `METHODS`.
-        k: how many of the nearest.
-        threshold: cosine from which on a picture is the same as the clean one; None
-            where there are references.
+        k: how many of the nearest images of a name count.
+        threshold: minimum cosine of an image that shows the same as the clean one; None
+            if there are references.
 
     Raises:
         InputError: a value out of range, or options that exclude each other.
@@ -279,9 +307,11 @@ class Similarity(tasks.Classification):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Similarity:
-        """See `Task.on`; references are read and shown to the model, once. Raises
-        InputError, FileFormatError: as for `embedded`; neither references nor a
-        threshold.
+        """See `Task.on`; references are loaded and embedded, unless they are already.
+
+        Raises:
+            InputError: there are neither references nor a threshold; or as for `embedded`.
+            FileFormatError: as for `embedded`.
         """
         if not self.references and self.threshold is None:
             raise InputError(
@@ -296,27 +326,21 @@ class Similarity(tasks.Classification):
                 "target: a `threshold` knows no names; give `references` "
                 "to task similarity"
             )
-        found = super().on(model, target=target, minimise=minimise)
-        seen = self.gallery is not None and self.gallery.seen_by == (
-            model.module,
-            model.preprocessing,
-        )
-        if seen or not self.references:
-            return found
-        return replace(
-            found,
-            gallery=embedded(self.references, model, linear=self.method == "linear"),
-        )
+        task = super().on(model, target=target, minimise=minimise)
+        embedder = (model.module, model.preprocessing)
+        is_embedded = self.gallery is not None and self.gallery.embedder == embedder
+        if is_embedded or not self.references:
+            return task
+        gallery = embedded(self.references, model, linear=self.method == "linear")
+        return replace(task, gallery=gallery)
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        return tuple(
-            name for name, _ in folders_of(self.references)
-        ) if self.references else (ITSELF, ELSE), True
+        if not self.references:
+            return (ITSELF, ELSE), True
+        return tuple(name for name, _ in folders_of(self.references)), True
 
     def right_classes(self, facts: tasks.Facts) -> tasks.Labels:
-        """See `ClassTask.right_classes`; with a threshold the clean picture says what
-        is right.
-        """
+        """See `ClassTask.right_classes`; with a threshold the clean image defines what is right."""
         if self.references:
             return super().right_classes(facts)
         if facts.label is not None:
@@ -333,30 +357,32 @@ class Similarity(tasks.Classification):
     def after_calibration(
         self, output: Tensor, truth: tasks.Labels | None
     ) -> Similarity:
-        return (
-            replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0])
-            if self.calibrates
-            else self
-        )
+        """See `Task.after_calibration`: store the features of the clean image."""
+        if not self.calibrates:
+            return self
+        features = functional.normalize(output.detach().float(), dim=1)
+        return replace(self, clean=features[0])
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return features (count, D): a tensor, the first of a tuple, or the first of
-        `PARTS` that is there. Of `last_hidden_state` that is the first token (CLS); a
-        map is averaged over its positions.
+        """Read features (count, D): a tensor, the first of a tuple, or the first of `PARTS`.
+
+        Of `last_hidden_state` these are of the first token (CLS); a map is averaged over
+        its positions.
+
+        Raises:
+            ValueError: there are none.
         """
-        found = models.pooled(
-            returned[0] if type(returned) in (tuple, list) and returned else returned,
-            token=True,
-        )
-        if found is None or found.dim() != 2 or found.shape[0] != count:
+        is_tuple = type(returned) in (tuple, list) and returned
+        features = models.pooled(returned[0] if is_tuple else returned, token=True)
+        if features is None or features.dim() != 2 or features.shape[0] != count:
             raise ValueError(
                 f"expected features ({count}, D), or what has one of "
                 f"{', '.join(models.PARTS)}"
             )
-        return found.float()
+        return features.float()
 
     def logits(self, output: Tensor) -> Tensor:
-        """Return logits (N, names) of features (N, D); differentiable."""
+        """Compute logits (N, names) of features (N, D); differentiable."""
         features = functional.normalize(output, dim=1)
         if self.gallery is None:
             if self.clean is None or self.threshold is None:
@@ -365,82 +391,87 @@ class Similarity(tasks.Classification):
                     "picture that it was shown first"
                 )
             cosine = features @ self.clean.to(features)
-            scores = torch.stack(
-                [cosine, torch.full_like(cosine, self.threshold)], dim=1
-            )
-        elif self.method == "linear":
+            threshold = torch.full_like(cosine, self.threshold)
+            return torch.stack([cosine, threshold], dim=1) / TEMPERATURE
+        if self.method == "linear":
             assert self.gallery.head is not None
+            weights, biases = self.gallery.head
             return functional.linear(
-                features, *(part.to(features) for part in self.gallery.head)
+                features, weights.to(features), biases.to(features)
             )
-        else:
-            cosines = self.gallery.cosines(features)
-            owners = self.gallery.owners.to(features.device)
-            each = [
-                cosines[:, owners == name] for name in range(len(self.gallery.names))
-            ]
-            nearest = [
-                of_name.topk(min(self.k, of_name.shape[1]), dim=1).values
-                for of_name in each
-            ]
-            scores = torch.stack([of_name.mean(dim=1) for of_name in nearest], dim=1)
-        return scores / TEMPERATURE
+        cosines = self.gallery.cosines(features)
+        owners = self.gallery.owners.to(features.device)
+        name_scores = []
+        for name_index in range(len(self.gallery.names)):
+            name_cosines = cosines[:, owners == name_index]
+            k = min(self.k, name_cosines.shape[1])
+            name_scores.append(name_cosines.topk(k, dim=1).values.mean(dim=1))
+        return torch.stack(name_scores, dim=1) / TEMPERATURE
 
     def as_logits(self, output: Tensor, truth: tasks.Labels) -> Tensor:
         return super().as_logits(self.logits(output), truth)
 
     def judge(self, output: Tensor, truth: tasks.Labels) -> list[tasks.Judgement]:
-        """See `Task.judge`; the payload has the cosine to the clean picture, or what
-        `_ranked` says.
+        """See `Task.judge`; the payload has the cosine to the clean image, or the ranks of
+        the right references (`_rank_references`).
         """
         with torch.no_grad():
-            judged = super().judge(output, truth)
+            judgements = super().judge(output, truth)
             features = functional.normalize(output, dim=1)
+            payloads: list[dict[str, tasks.JsonValue]]
             if self.gallery is not None:
-                kept = self._ranked(
-                    self.gallery, features, self.as_logits(output, truth), truth
-                )
+                logits = self.as_logits(output, truth)
+                payloads = _rank_references(self.gallery, features, logits, truth)
             else:
                 assert self.clean is not None
-                kept = [
-                    {"cosine": round(one, 4)}
-                    for one in (features @ self.clean.to(features)).tolist()
-                ]
+                cosines = (features @ self.clean.to(features)).tolist()
+                payloads = [{"cosine": round(cosine, 4)} for cosine in cosines]
         return [
-            replace(one, payload=payload if math.isfinite(one.margin) else None)
-            for one, payload in zip(judged, kept, strict=True)
+            replace(
+                judgement,
+                payload=payload if math.isfinite(judgement.margin) else None,
+            )
+            for judgement, payload in zip(judgements, payloads, strict=True)
         ]
 
-    def _ranked(
-        self, gallery: Gallery, features: Tensor, logits: Tensor, truth: tasks.Labels
-    ) -> list[dict[str, tasks.JsonValue]]:
-        """Say of each of N pictures where the right one stands. Each has the `rank` of
-        the nearest right reference among all (1 where it is the nearest of all) and its
-        `cosine`; `name_rank`, that of the right name by its logit; and the `nearest`
-        reference of all and its cosine.
-        """
-        cosines = gallery.cosines(features)
-        inside = torch.isin(gallery.owners, torch.tensor(truth)).to(cosines.device)
-        best = cosines[:, inside].amax(dim=1)
-        ranks = 1 + (cosines[:, ~inside] > best[:, None]).sum(dim=1)
-        right = torch.isin(torch.arange(logits.shape[1]), torch.tensor(truth)).to(
-            logits.device
-        )
-        names = 1 + (
-            logits[:, ~right] > logits[:, right].amax(dim=1, keepdim=True)
-        ).sum(dim=1)
-        top, places = cosines.max(dim=1)
-        rows = zip(
-            *(one.tolist() for one in (ranks, best, names, places, top)), strict=True
-        )
-        return [
-            {
-                "rank": rank,
-                "references": len(gallery.paths),
-                "cosine": round(cosine, 4),
-                "name_rank": name_rank,
-                "nearest": gallery.paths[place],
-                "nearest_cosine": round(nearest, 4),
-            }
-            for rank, cosine, name_rank, place, nearest in rows
-        ]
+
+def _rank_references(
+    gallery: Gallery, features: Tensor, logits: Tensor, truth: tasks.Labels
+) -> list[dict[str, tasks.JsonValue]]:
+    """Rank the right reference images and the right name for each of N images.
+
+    Args:
+        gallery: of R references.
+        features: (N, D), of length 1.
+        logits: (N, names).
+        truth: indices of the right names.
+
+    Returns:
+        Payloads with the `rank` of the nearest right reference among all (1 if it is
+        the nearest) and its `cosine`; the `name_rank` of the right name by its logit;
+        and the `nearest` reference and its cosine.
+    """
+    right_names = torch.tensor(truth)
+    cosines = gallery.cosines(features)
+    is_right_image = torch.isin(gallery.owners, right_names).to(cosines.device)
+    right_cosine = cosines[:, is_right_image].amax(dim=1)
+    is_nearer = cosines[:, ~is_right_image] > right_cosine[:, None]
+    image_rank = 1 + is_nearer.sum(dim=1)
+
+    is_right_name = torch.isin(torch.arange(logits.shape[1]), right_names)
+    is_right_name = is_right_name.to(logits.device)
+    right_logit = logits[:, is_right_name].amax(dim=1, keepdim=True)
+    name_rank = 1 + (logits[:, ~is_right_name] > right_logit).sum(dim=1)
+
+    nearest_cosine, nearest_image = cosines.max(dim=1)
+    return [
+        {
+            "rank": int(image_rank[row]),
+            "references": len(gallery.paths),
+            "cosine": round(float(right_cosine[row]), 4),
+            "name_rank": int(name_rank[row]),
+            "nearest": gallery.paths[int(nearest_image[row])],
+            "nearest_cosine": round(float(nearest_cosine[row]), 4),
+        }
+        for row in range(len(features))
+    ]

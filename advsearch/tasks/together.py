@@ -1,6 +1,4 @@
-"""Tasks made of others: several models at once, each with a task of its own; every
-thing in a picture; and the pictures of a rig of cameras.
-"""
+"""Combine tasks: several models with a task each, and every thing in an image."""
 
 from __future__ import annotations
 
@@ -31,49 +29,58 @@ from advsearch.tasks.base import (
     mean,
 )
 
-# what each of several models returns for one picture, or one model for each picture of
-# a rig
+# What each of several models returns for one image, or one model for each image of a
+# rig.
 Outputs = tuple[Any, ...]
 
 
 @final
 class Ensemble:
-    """Asks several models, each of which resizes and normalises for itself; what
-    `Model.module` is of `together`.
-    """
+    """Run several models, each with its own preprocessing: the `Model.module` of `together`."""
 
     def __init__(self, models: Sequence[Model]) -> None:
         self.models = tuple(models)
 
     def __call__(self, images: Tensor) -> list[Any]:
-        """Return the output of each model for pictures (N, H, W, 3) sRGB in [0, 1]."""
+        """Return the output of each model for images (N, H, W, 3), sRGB in [0, 1]."""
         return [model(images) for model in self.models]
 
 
 def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Model:
-    """Return several models as one, whose output is a list with a tuple of the models'
-    outputs for each picture. The size of the pictures is (height, width) in pixels;
-    None for the largest that a model takes.
+    """Combine several models into one.
+
+    Args:
+        models: at least one.
+        size: of the images, (height, width) in pixels; None for the maximum of the
+            models' input sizes.
+
+    Returns:
+        A model whose output is a list with a tuple of the models' outputs for each
+        image.
     """
-    high, wide = (max(model.input_size[side] for model in models) for side in (0, 1))
+    max_height = max(model.input_size[0] for model in models)
+    max_width = max(model.input_size[1] for model in models)
     return Model(
         module=Ensemble(models),
         name=" and ".join(model.name for model in models),
         labels=(),
-        preprocessing=Preprocessing(size or (high, wide), layout="NHWC"),
+        preprocessing=Preprocessing(size or (max_height, max_width), layout="NHWC"),
         differentiable=all(model.differentiable for model in models),
         read=by_picture,
     )
 
 
 def by_picture(returned: list[Any], count: int) -> list[Outputs]:
-    """Return the outputs by picture of `count` pictures, from those by model."""
-    return [tuple(output[k : k + 1] for output in returned) for k in range(count)]
+    """Regroup the outputs of `count` images from model by model to image by image."""
+    return [
+        tuple(output[index : index + 1] for output in returned)
+        for index in range(count)
+    ]
 
 
 def of_each(outputs: Sequence[Outputs]) -> list[Any]:
-    """Return the output of each model for N pictures, from what each of them got."""
-    return [joined(parts) for parts in zip(*outputs, strict=True)]
+    """Regroup the outputs of N images from image by image to model by model."""
+    return [joined(model_outputs) for model_outputs in zip(*outputs, strict=True)]
 
 
 Truths = tuple[Truth, ...]
@@ -81,8 +88,8 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Joined(Task):
-    """A task made of others, which are the `judges`: one for each of its truths in
-    their order, or one for all.
+    """A task made of others, the `judges`: one for each of its truths in order, or one for
+    all.
     """
 
     varies = True
@@ -112,42 +119,44 @@ class Joined(Task):
 
     def truth_names(self, truth: Any) -> tuple[str, ...]:
         truths = truth.values() if isinstance(truth, Mapping) else truth
-        each = zip(cycle(self.judges), truths, strict=False)
-        return _distinct(judge.truth_names(true) for judge, true in each)
+        # A single judge is repeated for all truths.
+        judged_truths = zip(cycle(self.judges), truths, strict=False)
+        return _distinct(judge.truth_names(value) for judge, value in judged_truths)
 
 
-def _distinct(texts: Iterable[Iterable[str]]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(chain.from_iterable(texts)))
+def _distinct(groups: Iterable[Iterable[str]]) -> tuple[str, ...]:
+    """Return the strings of all groups in order, without duplicates."""
+    return tuple(dict.fromkeys(chain.from_iterable(groups)))
 
 
 def outcome_in(judgement: Judgement) -> dict[str, JsonValue]:
-    """Return the outcome that a judgement states, as a part of a payload; empty where
-    it states none.
-    """
+    """Return the outcome of a judgement as a part of a payload; empty if it states none."""
     outcome = get_outcome(judgement.payload)
     return {} if outcome is None else {OUTCOME: outcome.value}
 
 
 def all_said(predictions: Iterable[Prediction]) -> Prediction:
-    """Return several predictions as one, in words."""
+    """Join the labels of several predictions into one prediction."""
     return Prediction("; ".join(prediction.label for prediction in predictions))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Together(Joined):
-    """Several models, each of which judges by a task and labels of its own.
+    """Judge several models, each by its own task and labels.
 
-    A prediction is right where all models are right, and a success where it is one for
-    every model. So the loss is the largest of the models' losses, and the score the
-    least of their scores.
+    A prediction is right if all models are right, and a success if it is one for every
+    model. So the loss is the largest of the models' losses, and the score the smallest of
+    their scores.
     """
 
     name = "ensemble"
     objective = "each"
 
-    parts: tuple[Task, ...]  # of each model, in the order of the outputs of `together`
-    models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)  # that are asked
-    tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)  # the parts on these
+    # One for each model, in the order of the outputs of `together`.
+    parts: tuple[Task, ...]
+    models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)
+    # The `parts` on these models.
+    tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
 
     @property
     def judges(self) -> tuple[Task, ...]:
@@ -164,9 +173,10 @@ class Together(Joined):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> Together:
-        """See `Task.on`; a target is for the tasks that take a label, where some do and
-        some do not. Raises InputError where it is no model of `together`, or one of
-        fewer or more than there are tasks.
+        """See `Task.on`; if only some tasks take a label, the target is theirs.
+
+        Raises:
+            InputError: the model is not from `together`, or has not one model per task.
         """
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
@@ -192,12 +202,13 @@ class Together(Joined):
             self, parts=tuple(part.seeking(objective) for part in self.parts)
         )
 
-    def told(self, one: Task, facts: Facts) -> Facts:
+    def told(self, task: Task, facts: Facts) -> Facts:
         """Return the facts for one of the tasks: without a label that is for others."""
-        return facts if self._takes_label(one) else replace(facts, label=None)
+        return facts if self._takes_label(task) else replace(facts, label=None)
 
-    def _takes_label(self, one: Task) -> bool:
-        return one.labelled or not any(part.labelled for part in self.parts)
+    def _takes_label(self, task: Task) -> bool:
+        """Whether a label is for this task: it takes one, or no task does."""
+        return task.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
         for task in self.tasks:
@@ -206,127 +217,139 @@ class Together(Joined):
     def after_calibration(
         self, output: Sequence[Outputs], truth: Truths | None
     ) -> Together:
-        each = zip(
-            self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True
+        """See `Task.after_calibration`: each task gets the output of its model."""
+        truths = truth or [None] * len(self.tasks)
+        tasks = tuple(
+            task.after_calibration(model_output, task_truth)
+            for task, model_output, task_truth in zip(
+                self.tasks, of_each(output), truths, strict=True
+            )
         )
-        return replace(
-            self, tasks=tuple(task.after_calibration(*shown) for task, *shown in each)
-        )
+        return replace(self, tasks=tasks)
 
     @property
     def ambiguities(self) -> str:
-        pairs = zip(self.models, self.tasks, strict=True)
-        return "; ".join(
-            f"{model.name}: {task.ambiguities}"
-            for model, task in pairs
-            if task.ambiguities
-        )
+        texts = []
+        for model, task in zip(self.models, self.tasks, strict=True):
+            if task.ambiguities:
+                texts.append(f"{model.name}: {task.ambiguities}")
+        return "; ".join(texts)
 
     def truth(self, facts: Facts) -> Truths:
         return tuple(task.truth(facts) for task in self.tasks)
 
     def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack(
-            [task.loss(*judged) for task, *judged in self._each(output, truth)]
-        ).amax(dim=0)
+        """Compute the largest of the models' losses, (N,)."""
+        losses = [
+            task.loss(model_output, task_truth)
+            for task, model_output, task_truth in self._by_task(output, truth)
+        ]
+        return torch.stack(losses).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack(
-            [task.score(*judged) for task, *judged in self._each(output, truth)]
-        ).amin(dim=0)
+        """Compute the smallest of the models' scores, (N,)."""
+        scores = [
+            task.score(model_output, task_truth)
+            for task, model_output, task_truth in self._by_task(output, truth)
+        ]
+        return torch.stack(scores).amin(dim=0)
 
     def predictions(
         self, output: Sequence[Outputs], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        said = [
-            task.predictions(shown)
-            for task, shown in zip(self.tasks, of_each(output), strict=True)
+        """Return the joint prediction of the models about each image."""
+        predictions_of_models = [
+            task.predictions(model_output)
+            for task, model_output in zip(self.tasks, of_each(output), strict=True)
         ]
         return [
-            (all_said(first for first, *_ in each),) for each in zip(*said, strict=True)
+            (all_said(predictions[0] for predictions in image_predictions),)
+            for image_predictions in zip(*predictions_of_models, strict=True)
         ]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        judgements = []
-        for each in zip(
-            *(task.judge(*judged) for task, *judged in self._each(output, truth)),
-            strict=True,
-        ):
-            payloads = {
-                model.name: judged.payload
-                for model, judged in zip(self.models, each, strict=True)
+        """See `Task.judge`; the payload has those of the models by name."""
+        judgements_of_models = [
+            task.judge(model_output, task_truth)
+            for task, model_output, task_truth in self._by_task(output, truth)
+        ]
+        return [
+            self._join_judgements(image_judgements)
+            for image_judgements in zip(*judgements_of_models, strict=True)
+        ]
+
+    def _join_judgements(self, judgements: Sequence[Judgement]) -> Judgement:
+        """Join the models' judgements of one image."""
+        worst = min(judgements, key=lambda judgement: judgement.margin)
+        margin = worst.margin
+        if any(judgement.not_a_number for judgement in judgements):
+            margin = math.nan
+        payload = None
+        if any(judgement.payload is not None for judgement in judgements):
+            payload = {
+                model.name: judgement.payload
+                for model, judgement in zip(self.models, judgements, strict=True)
             }
-            payload = (
-                payloads
-                if any(kept is not None for kept in payloads.values())
-                else None
-            )
-            worst = min(each, key=lambda judged: judged.margin)
-            payload = None if payload is None else {**payload, **outcome_in(worst)}
-            margin = (
-                math.nan
-                if any(judged.not_a_number for judged in each)
-                else min(judged.margin for judged in each)
-            )
-            prediction = all_said(judged.prediction for judged in each)
-            judgements.append(
-                Judgement.of(
-                    min(judged.score for judged in each), margin, prediction, payload
-                )
-            )
-        return judgements
+            payload |= outcome_in(worst)
+        prediction = all_said(judgement.prediction for judgement in judgements)
+        score = min(judgement.score for judgement in judgements)
+        return Judgement.of(score, margin, prediction, payload)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: what is true of the first, maps of all, and what each model
-        says under its name.
+        """See `Task.marks`: the truth of the first model, the maps of all, and the
+        prediction of each model under its name.
         """
-        pictures: list[list[Mark]] = [[] for _ in output]
-        for number, (task, *judged) in enumerate(self._each(output, truth)):
-            for picture, marks in zip(pictures, task.marks(*judged), strict=True):
-                picture += [
+        marks_of_images: list[list[Mark]] = [[] for _ in output]
+        is_first_model = True
+        for model, (task, model_output, task_truth) in zip(
+            self.models, self._by_task(output, truth), strict=True
+        ):
+            model_marks = task.marks(model_output, task_truth)
+            for image_marks, marks in zip(marks_of_images, model_marks, strict=True):
+                image_marks += [
                     mark
                     for mark in marks
-                    if mark.true and (not number or mark.map is not None)
+                    if mark.true and (is_first_model or mark.map is not None)
                 ]
-                name = self.models[number].name
-                picture += [
-                    replace(mark, text=f"{name}: {mark.text}")
+                image_marks += [
+                    replace(mark, text=f"{model.name}: {mark.text}")
                     for mark in marks
                     if not mark.true
                 ]
-        return pictures
+            is_first_model = False
+        return marks_of_images
 
-    def _each(
+    def _by_task(
         self, output: Sequence[Outputs], truth: Truths
     ) -> list[tuple[Any, Any, Any]]:
+        """Return each task with the output of its model and its truth."""
         return list(zip(self.tasks, of_each(output), truth, strict=True))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# One task, asked of the object and of every thing beside it: a prediction is right
-# where it is right about all of them.
+# ---- one task for the object and every other thing ----
 #
-# A search is after a wrong prediction about any of them: loss and score are the largest
-# of the things' own.
+# A prediction is right if it is right about all of them. A search seeks a wrong
+# prediction about any of them: loss and score are the largest over the things.
 
-TruthOfEach = Mapping[str, Truth]  # what is true of each thing, by name
+TruthOfEach = Mapping[str, Truth]  # the truth of each thing, by name
 
 
 @dataclass(frozen=True, kw_only=True)
 class EachThing(Joined):
-    """Made by `each_thing`."""
+    """Judge every thing in an image by one task; created by `each_thing`."""
 
     name = "each thing"
 
-    part: Task  # on its model
+    part: Task  # the task of a single thing, on its model
 
     @property
     def judges(self) -> tuple[Task, ...]:
         return (self.part,)
 
     def after_calibration(self, output: Output, truth: TruthOfEach | None) -> EachThing:
-        first = None if truth is None else next(iter(truth.values()))
-        return replace(self, part=self.part.after_calibration(output, first))
+        """See `Task.after_calibration`: with the truth of the first thing."""
+        first_truth = None if truth is None else next(iter(truth.values()))
+        return replace(self, part=self.part.after_calibration(output, first_truth))
 
     def check(self, facts: Facts) -> None:
         for thing in facts.each.values():
@@ -336,23 +359,26 @@ class EachThing(Joined):
         return {name: self.part.truth(thing) for name, thing in facts.each.items()}
 
     def loss(self, output: Output, truth: TruthOfEach) -> Tensor:
-        return self._largest("loss", output, truth)
+        """Compute the largest loss over the things, (N,)."""
+        return self._max_over_things("loss", output, truth)
 
     def score(self, output: Output, truth: TruthOfEach) -> Tensor:
-        return (
-            -self.loss(output, truth)
-            if self.minimise
-            else self._largest("score", output, truth)
-        )
+        """Compute the largest score over the things, (N,)."""
+        if self.minimise:
+            return -self.loss(output, truth)
+        return self._max_over_things("score", output, truth)
 
     def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
-        """Return that of the thing where it is largest, (N,); of segmentation."""
-        return self._largest("pixel_margin", output, truth)
+        """Compute the largest pixel margin over the things, (N,); for segmentation."""
+        return self._max_over_things("pixel_margin", output, truth)
 
-    def _largest(self, value: str, output: Output, truth: TruthOfEach) -> Tensor:
-        return torch.stack(
-            [getattr(self.part, value)(output, true) for true in truth.values()]
-        ).amax(dim=0)
+    def _max_over_things(
+        self, method: str, output: Output, truth: TruthOfEach
+    ) -> Tensor:
+        """Compute the largest value of a method of the task over the things, (N,)."""
+        function = getattr(self.part, method)
+        values = [function(output, thing_truth) for thing_truth in truth.values()]
+        return torch.stack(values).amax(dim=0)
 
     def predictions(
         self, output: Output, count: int = 1
@@ -362,71 +388,84 @@ class EachThing(Joined):
     def said(
         self, output: Output, truth: TruthOfEach, margins: Sequence[float]
     ) -> list[Said]:
-        """See `Task.said`: the prediction about the thing that is worst, and in the
-        payload what is said of each.
+        """See `Task.said`: the prediction about the worst visible thing.
+
+        The payload is that of the worst thing, with the judgement of each.
         """
-        found: list[Said] = []
-        for judged in zip(
-            *(self.part.judge(output, true) for true in truth.values()), strict=True
-        ):
-            by_name = dict(zip(truth, judged, strict=True))
-            seen = [
+        judgements_of_things = [
+            self.part.judge(output, thing_truth) for thing_truth in truth.values()
+        ]
+        results: list[Said] = []
+        for image_judgements in zip(*judgements_of_things, strict=True):
+            by_name: dict[str, Judgement] = dict(
+                zip(truth, image_judgements, strict=True)
+            )
+            visible = [
                 name
-                for name, thing in by_name.items()
-                if thing.prediction.label != OUT_OF_VIEW
-            ] or list(by_name)
-            worst = min(seen, key=lambda name: by_name[name].margin)
-            payloads: dict[str, Any] = {
-                name: thing.payload if isinstance(thing.payload, dict) else {}
-                for name, thing in by_name.items()
-            }
-            things = {
-                name: {
-                    "right": thing.right,
-                    "margin": thing.margin,
-                    "answer": thing.prediction.label,
-                }
-                | outcome_in(thing)
-                | ({"box": payloads[name]["box"]} if "box" in payloads[name] else {})
-                for name, thing in by_name.items()
-            }
-            average = mean([thing.margin for thing in judged])
-            payload = {
-                **payloads[worst],
+                for name, judgement in by_name.items()
+                if judgement.prediction.label != OUT_OF_VIEW
+            ]
+            worst = min(visible or by_name, key=lambda name: by_name[name].margin)
+            worst_payload = by_name[worst].payload
+            payload: dict[str, JsonValue] = {
+                **(worst_payload if isinstance(worst_payload, dict) else {}),
                 "worst": worst,
-                "mean_margin": average,
-                "things": things,
+                "mean_margin": mean(
+                    [judgement.margin for judgement in image_judgements]
+                ),
+                "things": {
+                    name: _summarize_thing(judgement)
+                    for name, judgement in by_name.items()
+                },
             }
-            found.append((by_name[worst].prediction, payload))
-        return found
+            results.append((by_name[worst].prediction, payload))
+        return results
 
     def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
-        """See `Task.marks`: what is true of each thing, and the prediction once."""
-        each = zip(
-            *(self.part.marks(output, true) for true in truth.values()), strict=True
-        )
-        return [
-            [mark for thing in things for mark in thing if mark.true]
-            + [mark for mark in things[0] if not mark.true]
-            for things in each
+        """See `Task.marks`: the truth of each thing, and the prediction once."""
+        marks_of_things = [
+            self.part.marks(output, thing_truth) for thing_truth in truth.values()
         ]
+        marks_of_images = []
+        for image_marks in zip(*marks_of_things, strict=True):
+            marks = [mark for thing in image_marks for mark in thing if mark.true]
+            marks += [mark for mark in image_marks[0] if not mark.true]
+            marks_of_images.append(marks)
+        return marks_of_images
+
+
+def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
+    """Return what a payload has about one of several things."""
+    summary: dict[str, JsonValue] = {
+        "right": judgement.right,
+        "margin": judgement.margin,
+        "answer": judgement.prediction.label,
+        **outcome_in(judgement),
+    }
+    if isinstance(judgement.payload, dict) and "box" in judgement.payload:
+        summary["box"] = judgement.payload["box"]
+    return summary
 
 
 def each_thing(task: Task) -> EachThing:
-    """Return a task on its model as one that judges every thing. Raises InputError: its
-    models say one thing of a whole picture, or are several.
+    """Return a task on its model as one that judges every thing.
+
+    Raises:
+        InputError: its models make one prediction about the full image, or there are
+            several models.
     """
     if isinstance(task, Together) or task.name not in JUDGES:
         raise InputError(
             f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge "
             "one thing, by its name"
         )
-    kind: Any = type(
-        "EachThing", (EachThing,), {"name": task.name, "objective": task.objective}
+    attributes = {"name": task.name, "objective": task.objective}
+    task_class: Any = type("EachThing", (EachThing,), attributes)
+    result: EachThing = task_class(
+        part=task, minimise=task.minimise, target=task.target
     )
-    made: EachThing = kind(part=task, minimise=task.minimise, target=task.target)
-    return made
+    return result
 
 
 JUDGES: Sequence[str] = ("detection", "segmentation", "depth")
-"""Tasks whose prediction of a picture says something of each thing in it."""
+"""Tasks whose output for an image covers each thing in it."""

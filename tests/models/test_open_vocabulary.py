@@ -253,7 +253,7 @@ def test_what_its_boxes_are_is_known(tmp_path: Path) -> None:
     model = load_model(published(tmp_path, "Owlv2"), labels=NAMES, task="detection")
     task = Detection().on(model)
     tiny: Any = [{"boxes": torch.tensor([[0.2, 0.2, 0.4, 0.9]]), "scores": torch.tensor([[0.9, 0.1, 0.1]])}]
-    assert not task.calibrates and task.after_calibration(tiny, None).seen_unit == "pixels"
+    assert not task.calibrates and task.after_calibration(tiny, None).inferred_unit == "pixels"
     assert Detection(boxes="xywh").on(model).calibrates, "what is said counts, and is compared"
 
 

@@ -402,7 +402,7 @@ class Pixels(nn.Module):
 def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     model = load_model(Pixels(), input_size=(8, 16), read=Detection().reader, labels=NAMES)
     task = Detection().on(model)
-    assert (task.labels, task.named, task.seen_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
+    assert (task.labels, task.named, task.inferred_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
     assert model.differentiable
     output = model(torch.full((8, 16, 3), 0.9))
     at = Place((0,), (4, 8, 12, 24), (32, 32))
@@ -429,7 +429,7 @@ class Listed(nn.Module):
 def test_a_list_of_mappings_needs_names() -> None:
     model = load_model(Listed(), input_size=8, read=Detection().reader, labels=NAMES)
     task = Detection().on(model)
-    assert task.calibrates and task.seen_unit == "" and "unit: pixels" in task.ambiguities, "nothing shows in noise"
+    assert task.calibrates and task.inferred_unit == "" and "unit: pixels" in task.ambiguities, "nothing shows in noise"
     assert len(model(torch.zeros(3, 8, 8, 3))) == 3
     with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Listed"):
         Detection().on(load_model(Listed(), input_size=8, read=Detection().reader))

@@ -102,7 +102,7 @@ def test_scores_and_classes_are_told_apart_and_rows_that_fill_up_are_nothing(for
     task, output = on(Shaped(made, fill))
     (found,) = task.judge(output, TRUTH)
     assert found.right and astuple(found.prediction) == ("cup", 0, pytest.approx(0.8))
-    assert task.seen_unit == "pixels" and not task.ambiguities and not task.doubts
+    assert task.inferred_unit == "pixels" and not task.ambiguities and not task.doubts
     assert [one.label for one in task.predictions(output, 5)[0]] == ["cup", "bowl"]
     nothing = task.judge(load_model(Shaped(made, fill), input_size=100, read=task.reader)(PICTURE * 2.0), TRUTH)
     assert nothing[0].prediction == Prediction("no cup", None, 0.0), "rows that fill up are no answer of NaN"
@@ -113,7 +113,7 @@ def test_one_class_is_all_zeros_and_still_no_score(form: str) -> None:
     task, output = on(Shaped(FORMS[form], classes=(0, 0)))
     assert astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 0, pytest.approx(0.8))
     (said,) = task.remarks
-    assert f"read as `task='detection={{order: {task.seen_order}}}'`" in said
+    assert f"read as `task='detection={{order: {task.inferred_order}}}'`" in said
 
 
 def test_what_the_numbers_leave_open_is_asked_for() -> None:
@@ -125,7 +125,7 @@ def test_what_the_numbers_leave_open_is_asked_for() -> None:
     task, output = on(network, order="boxes scores labels")
     assert [(one.label, one.probability) for one in task.predictions(output, 2)[0]] == [("cup", 1.0), ("bowl", 1.0)]
     task, output = on(Shaped(rows, classes=(0, 1), scores=(1.0, 1.0)))
-    assert task.seen_order == "boxes scores labels", "what suppression leaves comes by falling scores"
+    assert task.inferred_order == "boxes scores labels", "what suppression leaves comes by falling scores"
 
 
 def test_a_silent_model_leaves_all_open() -> None:
@@ -197,7 +197,7 @@ def test_the_unit_is_read_from_boxes_that_count_and_an_odd_form_is_named(
     form: Callable[[Tensor], Tensor], unit: str, doubts: str
 ) -> None:
     task, _ = on(Shaped(lambda b, s, c: (form(b), s, c.long())))
-    assert task.seen_unit == unit and (doubts in task.doubts if doubts else not task.doubts)
+    assert task.inferred_unit == unit and (doubts in task.doubts if doubts else not task.doubts)
     assert [doubts in one and "may be read wrongly" in one for one in task.remarks] == [True] * bool(doubts)
 
 

@@ -76,7 +76,7 @@ def test_the_name_of_nothing_may_be_among_the_names() -> None:
     model = load_model(Bright(of_its_authors), input_size=32, task="detection", labels=[*NAMES, "no object"])
     task = Detection().on(model)
     dark = model(torch.full((32, 32, 3), 0.3))
-    assert task.seen_order == CHOSEN and [one.label for one in task.predictions(dark, 5)[0]][:1] == ["bowl"]
+    assert task.inferred_order == CHOSEN and [one.label for one in task.predictions(dark, 5)[0]][:1] == ["bowl"]
     assert "no object" not in [one.label for one in task.predictions(dark, 5)[0]]
 
 
@@ -100,7 +100,7 @@ def test_other_names_are_refused_and_those_that_fit_are_named() -> None:
     model = load_model(Bright(wide), input_size=32, task="detection", labels=NAMES)
     with pytest.raises(InputError, match=r"expected 3 logits of a box for 3 classes, or 4 .*, got 92; `labels=coco91`"):
         Detection().on(model)
-    assert Detection().on(load_model(model, labels=read_labels("coco91"))).seen_order == CHOSEN
+    assert Detection().on(load_model(model, labels=read_labels("coco91"))).inferred_order == CHOSEN
     with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Bright"):
         Detection().on(load_model(Bright(of_its_authors), input_size=32, task="detection"))
 

@@ -146,7 +146,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     )
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
-    assert task.seen_order == order and task.seen_unit == ("fractions" if "RT-DETR" in form else "pixels")
+    assert task.inferred_order == order and task.inferred_unit == ("fractions" if "RT-DETR" in form else "pixels")
     assert not task.ambiguities and not task.doubts
     said = " ".join(task.remarks)
     assert f"order: {order}" in said and ("masks are left out" in said) is ("masks" in form)

@@ -28,16 +28,15 @@ LEVELS = 0.05
 of the largest: it rounds.
 """
 
-# what is read after the prompt to see that a network which answers freely goes on as it
-# reads
+# Continuation by which a network that answers freely is checked.
 CHECKED = "a coffee mug"
-# weights from which on a run says how many there are, and how long an answer takes
+# Minimum number of weights for a remark on them and on the time of an answer.
 LARGE = 500_000_000
 
 
 def speaks(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, by the name of its architecture, goes on in
-    words after picture and text.
+    """Whether a network of transformers, by its architecture, continues images and texts with
+    text.
     """
     transformers: Any = sys.modules["transformers"]
     names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
@@ -45,27 +44,21 @@ def speaks(architecture: str, network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> models.Source:
-    """Return the source of a classifier of the names that are given, or of free
-    answers. Raises ModelError where the network has an encoder for texts of its own,
-    its processor can't be had, or it goes on otherwise than is read here.
+    """Return the source of a classifier of the given names, or of free answers.
+
+    Raises:
+        ModelError: the network is an encoder-decoder, its processor cannot be loaded,
+            or its own likelihoods differ from those computed here.
+        InputError: fewer than two names, or prompt and name are too long.
     """
     if getattr(loaded.network.config, "is_encoder_decoder", False):
         raise _another(loaded, "reads from an encoder of its own")
-    try:
-        processor = loaded.part("AutoProcessor")
-    except errors.ModelError as error:
-        if importlib.util.find_spec("torchvision") is None:
-            raise errors.ModelError(
-                f"model {loaded.spec}: its processor cannot be loaded, and most of "
-                "such networks need torchvision for "
-                "that, which is not installed: pip install 'advsearch[torchvision]'"
-            ) from error
-        raise
+    processor = _load_processor(loaded)
     purpose = loaded.purpose
     name = loaded.name
-    (free, question) = purpose.in_words(name, "goes on in words")
+    is_free, question = purpose.in_words(name, "goes on in words")
     names = purpose.names
-    if not free and (names is None or len(names) < 2):
+    if not is_free and (names is None or len(names) < 2):
         raise InputError(
             "labels: expected two names at least, such as mug,cup,bowl, of which "
             f"model {name} chooses one, got "
@@ -79,34 +72,18 @@ def source(loaded: Loaded) -> models.Source:
     ):
         reader = _Speaker(loaded, processor, question or models.QUESTION)
         tokens = reader.tokens_of(names or (CHECKED,))
-        most = getattr(
-            loaded.network.config.get_text_config(), "max_position_embeddings", None
-        )
-        length = reader.prompt(reader.side)["input_ids"].shape[1]
-        length += max(purpose.tokens if free else 0, *map(len, tokens))
-        if isinstance(most, int) and length > most:
-            raise InputError(
-                f"prompt: expected picture, prompt and name to have at most {most} "
-                f"tokens for model {name}, "
-                f"got {length}"
-            )
+        max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
+        _check_length(loaded, reader, max_new_tokens)
         named = _Named(reader, tokens)
-        module = _Free(reader, purpose.tokens) if free else named
+        module = _Free(reader, purpose.tokens) if is_free else named
         with torch.no_grad():
             _check(loaded, named)
-            begun = time.perf_counter()
+            start_time = time.perf_counter()
             module(torch.zeros((1, 3, *reader.side)))
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - start_time
     if names is not None:
-        _say_what_begins_another(tokens, names, name)
-    weights = list(loaded.network.parameters())
-    if (count := sum(tensor.numel() for tensor in weights)) >= LARGE:
-        size = sum(tensor.nbytes for tensor in weights)
-        models.warn(
-            f"model {name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, "
-            f"and took {seconds:.2g} s "
-            "to answer one picture here; a gradient takes longer"
-        )
+        _warn_of_prefixes(tokens, names, name)
+    _warn_of_size(loaded, seconds)
     return models.source_of(
         module,
         name,
@@ -117,65 +94,99 @@ def source(loaded: Loaded) -> models.Source:
     )
 
 
-def _say_what_begins_another(
-    tokens: Sequence[Sequence[int]], names: Sequence[str], name: str
+def _load_processor(loaded: Loaded) -> Any:
+    """Load the processor of images and texts; the error names torchvision if it may be
+    missing for it.
+    """
+    try:
+        return loaded.part("AutoProcessor")
+    except errors.ModelError as error:
+        if importlib.util.find_spec("torchvision") is None:
+            raise errors.ModelError(
+                f"model {loaded.spec}: its processor cannot be loaded, and most of "
+                "such networks need torchvision for "
+                "that, which is not installed: pip install 'advsearch[torchvision]'"
+            ) from error
+        raise
+
+
+def _check_length(loaded: Loaded, reader: _Speaker, max_new_tokens: int) -> None:
+    """Raise InputError if image, prompt and answer have too many tokens."""
+    config = loaded.network.config.get_text_config()
+    max_tokens = getattr(config, "max_position_embeddings", None)
+    n_tokens = reader.prompt(reader.side)["input_ids"].shape[1] + max_new_tokens
+    if isinstance(max_tokens, int) and n_tokens > max_tokens:
+        raise InputError(
+            f"prompt: expected picture, prompt and name to have at most {max_tokens} "
+            f"tokens for model {loaded.name}, "
+            f"got {n_tokens}"
+        )
+
+
+def _warn_of_size(loaded: Loaded, seconds: float) -> None:
+    """Warn of a large network, with the seconds that an answer took."""
+    weights = list(loaded.network.parameters())
+    count = sum(tensor.numel() for tensor in weights)
+    if count >= LARGE:
+        size = sum(tensor.nbytes for tensor in weights)
+        models.warn(
+            f"model {loaded.name} has {count / 1e9:.3g} billion weights, "
+            f"{size / 1e9:.3g} GB, and took {seconds:.2g} s "
+            "to answer one picture here; a gradient takes longer"
+        )
+
+
+def _warn_of_prefixes(
+    tokens: Sequence[Sequence[int]], names: Sequence[str], model_name: str
 ) -> None:
-    for (first, short), (second, long) in permutations(enumerate(tokens), 2):
-        if list(long[: len(short)]) == list(short):
+    """Warn of the first name whose tokens are a prefix of another name's."""
+    for (first, prefix), (second, other) in permutations(enumerate(tokens), 2):
+        if list(other[: len(prefix)]) == list(prefix):
             models.warn(
-                f"model {name} reads {names[first]!r} (#{first}) as the beginning of "
-                f"{names[second]!r} "
+                f"model {model_name} reads {names[first]!r} (#{first}) as the "
+                f"beginning of {names[second]!r} "
                 f"(#{second}): whoever says the second has said the first"
             )
             return
 
 
-# ---- the network
-# ----------------------------------------------------------------------------------------------------
+# ---- the network ----
 
 
 class _Speaker(nn.Module):
-    """A network that reads a picture and a question, and goes on; `described` is what
-    `Preprocessing` does before. A processor that is an affine map is measured and left
-    to that; one that cuts a picture into patches or tiles is called itself, which is
-    differentiable where it works with torchvision.
+    """A network that reads an image and a question, and continues with text.
+
+    `described` is its `Preprocessing`. A processor that is an affine map is measured and
+    left to that; one that cuts an image into patches or tiles is called itself, which is
+    differentiable with torchvision.
     """
 
     def __init__(self, loaded: Loaded, processor: Any, question: str) -> None:
         super().__init__()
         self.network = loaded.network
         self.processor = processor
-        taken = inspect.signature(loaded.network.forward).parameters
-        # its older name
-        self.cache = "cache" if "cache" in taken else "past_key_values"
+        parameters = inspect.signature(loaded.network.forward).parameters
+        # `past_key_values` is the older name.
+        self.cache = "cache" if "cache" in parameters else "past_key_values"
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
-        # the question with a place for the picture, as the network was trained on it
+        # The question with a placeholder for the image, as the network was trained on it.
         self.text = f"{getattr(processor, 'image_token', None) or ''}{question}"
         if getattr(processor, "chat_template", None):
             content = [{"type": "image"}, {"type": "text", "text": question}]
             turns = [{"role": "user", "content": content}]
             self.text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        side = (
-            getattr(
-                getattr(loaded.network.config, "vision_config", None),
-                "image_size",
-                None,
-            )
-            or models.SIDE
-        )
-        self.side = (
-            (int(side[0]), int(side[1]))
-            if isinstance(side, (list, tuple))
-            else (int(side), int(side))
-        )
-        self.described = Processing()
+        vision_config = getattr(loaded.network.config, "vision_config", None)
+        size = getattr(vision_config, "image_size", None) or models.SIDE
+        height, width = size if isinstance(size, (list, tuple)) else (size, size)
+        self.side = (int(height), int(width))
+        processing = Processing()
         with suppress(errors.ModelError):  # it is called then
-            self.described = measured(
-                lambda **given: processor(text=[self.text], **given), loaded.spec
+            processing = measured(
+                lambda **options: processor(text=[self.text], **options), loaded.spec
             )
-        self.affine = "mean" in self.described
+        self.affine = "mean" in processing
         if self.affine:
-            self.side = self.described.get("input_size", self.side)
+            self.side = processing.get("input_size", self.side)
         elif importlib.util.find_spec("torchvision") is None:
             raise errors.ModelError(
                 f"model {loaded.spec}: its processor cuts pictures into patches or "
@@ -183,40 +194,40 @@ class _Speaker(nn.Module):
                 "with torchvision only, which is not installed: pip install "
                 "'advsearch[torchvision]'"
             )
-        self.described = Processing(
-            **{**(self.described if self.affine else {}), "input_size": self.side}
-        )
+        else:
+            processing = Processing()
+        self.described = Processing(**{**processing, "input_size": self.side})
         self._check_pixels(loaded.spec)
 
     def _check_pixels(self, spec: str) -> None:
-        """Raise a ModelError where a picture of slopes arrives otherwise than from
-        8-bit values by the processor.
+        """Raise ModelError if the processor treats a floating-point image otherwise than
+        the same image in 8 bits.
         """
         height, width = self.side
-        down = torch.linspace(0, 200, height)[:, None]
-        across = torch.linspace(0, 200, width)
+        vertical = torch.linspace(0, 200, height)[:, None]
+        horizontal = torch.linspace(0, 200, width)
+        # A different gradient in each channel.
         levels = torch.stack(
-            [(down + 0 * across), (across + 0 * down), (down + across) / 4 + 100]
+            [
+                vertical + 0 * horizontal,
+                horizontal + 0 * vertical,
+                (vertical + horizontal) / 4 + 100,
+            ]
         ).round()
-        expected = self._inputs(
-            np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
-        )["pixel_values"]
+        image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
+        expected = self._inputs(image_8bit)["pixel_values"]
         image = levels / 255.0
         if self.affine:
-            mean, std = (
-                image.new_tensor(self.described[key]).view(3, 1, 1)
-                for key in ("mean", "std")
-            )
-            image = (
-                (image if self.described["channels"] == "RGB" else image.flip(0)) - mean
-            ) / std
+            mean = image.new_tensor(self.described["mean"]).view(3, 1, 1)
+            std = image.new_tensor(self.described["std"]).view(3, 1, 1)
+            if self.described["channels"] != "RGB":
+                image = image.flip(0)
+            image = (image - mean) / std
         pixels = self._pixels(image)
-        off = (
-            float((pixels - expected).abs().max())
-            if pixels.shape == expected.shape
-            else float("inf")
-        )
-        if not off <= LEVELS * float(expected.abs().max()):
+        max_error = float("inf")
+        if pixels.shape == expected.shape:
+            max_error = float((pixels - expected).abs().max())
+        if not max_error <= LEVELS * float(expected.abs().max()):
             raise errors.ModelError(
                 f"model {spec}: its processor {type(self.processor).__name__} does "
                 "something else to numbers than to "
@@ -224,82 +235,84 @@ class _Speaker(nn.Module):
                 "and give that from Python"
             )
 
-    def _inputs(
-        self, picture: Any, text: str = "", **options: Any
-    ) -> dict[str, Tensor]:
-        """What the processor makes of a picture and a text, the question's by default,
-        without what is for training.
+    def _inputs(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
+        """Return the network's inputs for an image and a text, by default the question.
+
+        Inputs for training are left out.
         """
         with warnings.catch_warnings():  # of how the library reads arrays
             warnings.simplefilter("ignore")
-            given = self.processor(
-                images=[picture],
+            processed = self.processor(
+                images=[image],
                 text=[text or self.text],
                 return_tensors="pt",
                 **options,
             )
         return {
             key: value
-            for key, value in given.items()
+            for key, value in processed.items()
             if isinstance(value, Tensor) and key != "labels"
         }
 
     def _pixels(self, image: Tensor) -> Tensor:
-        return (
-            image[None]
-            if self.affine
-            else self._inputs(image.float(), do_rescale=False)["pixel_values"]
-        )
+        """Return the network's input of pixel values for an image (3, H, W)."""
+        if self.affine:
+            return image[None]
+        return self._inputs(image.float(), do_rescale=False)["pixel_values"]
 
     def tokens_of(self, names: Sequence[str]) -> list[list[int]]:
-        """Return the tokens of each name where it follows the prompt, with a blank
-        between them unless one is there. They are those that the whole text has more
-        than the prompt; where it does not begin with the prompt's, as a processor may
-        end a text with a line's end, those of the name alone.
+        """Return the tokens of each name after the prompt, with a space between them unless
+        there is one.
+
+        They are the tokens of prompt and name minus those of the prompt. If the text does
+        not begin with the prompt's tokens, as a processor may end a text with a newline,
+        they are those of the name alone.
+
+        Raises:
+            InputError: the network has no token for a name.
         """
         tokenizer = self.processor.tokenizer
         prompt = self.prompt(self.side)["input_ids"][0].tolist()
-        gap = (
-            ""
-            if self.text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids
-            else " "
-        )
-        begun = tokenizer(self.text, verbose=False)["input_ids"]
+        ends_in_space = self.text[-1:].isspace()
+        ends_in_special = prompt[-1] in tokenizer.all_special_ids
+        gap = "" if ends_in_space or ends_in_special else " "
+        text_tokens = tokenizer(self.text, verbose=False)["input_ids"]
         words = spoken(names)
-        # whether what the processor adds stands before or behind
-        grey = np.full((*self.side, 3), 128, np.uint8)
-        processed = self._inputs(grey, f"{self.text}{gap}{words[0]}")["input_ids"][
-            0
-        ].tolist()
-        joined = processed[: len(prompt)] == prompt
-        each: list[list[int]] = []
-        for name in words:
-            whole = tokenizer(f"{self.text}{gap}{name}", verbose=False)["input_ids"]
-            follows = joined and whole[: len(begun)] == begun
-            tokens = (
-                whole[len(begun) :]
-                if follows
-                else tokenizer(name, add_special_tokens=False)["input_ids"]
-            )
+        # Whether the processor adds tokens before the text only, and none behind it.
+        gray_image = np.full((*self.side, 3), 128, np.uint8)
+        inputs = self._inputs(gray_image, f"{self.text}{gap}{words[0]}")
+        starts_with_prompt = inputs["input_ids"][0].tolist()[: len(prompt)] == prompt
+        tokens_of_names: list[list[int]] = []
+        for word in words:
+            all_tokens = tokenizer(f"{self.text}{gap}{word}", verbose=False)[
+                "input_ids"
+            ]
+            starts_with_text = all_tokens[: len(text_tokens)] == text_tokens
+            if starts_with_prompt and starts_with_text:
+                tokens = all_tokens[len(text_tokens) :]
+            else:
+                tokens = tokenizer(word, add_special_tokens=False)["input_ids"]
             if not tokens:
                 raise InputError(
                     "labels: expected names that the network has tokens "
-                    f"for, got {name!r}"
+                    f"for, got {word!r}"
                 )
-            each.append(tokens)
-        return each
+            tokens_of_names.append(tokens)
+        return tokens_of_names
 
     def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
-        """Return what the network is given beside the values of a picture of (height,
-        width) pixels, and grey ones.
+        """Return the network's inputs for a gray image of (height, width) pixels and the
+        question.
         """
         if side not in self._prompts:
             self._prompts[side] = self._inputs(np.full((*side, 3), 128, np.uint8))
         return self._prompts[side]
 
     def given(self, image: Tensor) -> dict[str, Tensor]:
-        """Return what the network is given for a picture (3, H, W). Raises ValueError
-        where it is for pictures of another size.
+        """Return the network's inputs for an image (3, H, W) and the question.
+
+        Raises:
+            ValueError: the processor returns another shape than for a gray image.
         """
         height, width = image.shape[1:]
         prompt = self.prompt((height, width))
@@ -309,13 +322,19 @@ class _Speaker(nn.Module):
             raise ValueError(
                 f"expected values of shape {expected}, got {tuple(pixels.shape)}"
             )
-        placed = next(self.network.parameters())
-        given = {key: value.to(placed.device) for key, value in prompt.items()}
-        return {**given, "pixel_values": pixels.to(placed.device, placed.dtype)}
+        weights = next(self.network.parameters())
+        inputs = {key: value.to(weights.device) for key, value in prompt.items()}
+        inputs["pixel_values"] = pixels.to(weights.device, weights.dtype)
+        return inputs
 
     def begin(self, image: Tensor) -> tuple[Tensor, Any]:
-        """Return the logits (tokens,) float32 of what follows picture and prompt, and
-        the keys and values so far. Raises ValueError where the network keeps none.
+        """Run the network on an image and the prompt.
+
+        Returns:
+            The logits (tokens,) float32 of the next token, and the cache of keys and values.
+
+        Raises:
+            ValueError: the network returns no cache.
         """
         returned = self.network(**self.given(image), use_cache=True)
         past = returned.get(self.cache)
@@ -324,8 +343,9 @@ class _Speaker(nn.Module):
         return returned.logits[0, -1].float(), past
 
     def go_on(self, tokens: Tensor, past: Any) -> Tensor:
-        """Return the logits (N, L, tokens) float32 of what follows each of N x L
-        tokens; `past` is of one picture.
+        """Return the logits (N, L, tokens) float32 of the token after each of N x L tokens.
+
+        `past` is the cache of one image.
         """
         past.batch_repeat_interleave(len(tokens))
         logits: Tensor = self.network(
@@ -335,69 +355,77 @@ class _Speaker(nn.Module):
 
 
 class _Named(nn.Module):
-    """Logits (N, names): the log-likelihood of each name after picture and prompt,
-    summed over its tokens. Picture and prompt are read once. What begins a name (all of
-    its tokens but the last) is read after it, once for all names that begin so, and all
-    such beginnings at once: names of one token need nothing more.
+    """Compute logits (N, names): the log-likelihood of each name after image and prompt.
+
+    It is summed over the tokens of the name. Image and prompt are read once. The stem of a
+    name (all of its tokens but the last) is read after them, once for all names that begin
+    with it, and all stems in one batch: names of one token need no further step.
     """
 
     def __init__(self, reader: _Speaker, tokens: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.reader = reader
-        self.tokens = [list(name) for name in tokens]
-        begun = {tuple(name[:-1]) for name in tokens if len(name) > 1}
-        stems = sorted(
-            stem
-            for stem in begun
-            if not any(other[: len(stem)] == stem for other in begun - {stem})
-        )
-        length = max(map(len, stems), default=0)
-        most = max(map(len, tokens))
-        rows = torch.zeros((len(tokens), most), dtype=torch.long)
+        self.tokens = [list(name_tokens) for name_tokens in tokens]
+        stems = _find_stems(self.tokens)
+        stem_length = max(map(len, stems), default=0)
+        # For each token of a name: the row of likelihoods after the tokens before it, the
+        # token, and whether there is one.
+        rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
         columns = torch.zeros_like(rows)
         counts = torch.zeros_like(rows)
-        for number, name in enumerate(tokens):
-            stem = next(
-                (
-                    k
-                    for k, stem in enumerate(stems)
-                    if stem[: len(name) - 1] == tuple(name[:-1])
-                ),
-                0,
-            )
-            for place, token in enumerate(name):
-                rows[number, place] = 1 + stem * length + place - 1 if place else 0
-                columns[number, place], counts[number, place] = token, 1
-        padded = torch.tensor(
-            [[*stem, *[0] * (length - len(stem))] for stem in stems]
+        for index, name_tokens in enumerate(self.tokens):
+            # Row 0 is after the prompt, the others are after each token of a stem.
+            stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
+            for position, token in enumerate(name_tokens):
+                rows[index, position] = stem_row + position - 1 if position else 0
+                columns[index, position] = token
+                counts[index, position] = 1
+        padded_stems = torch.tensor(
+            [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
         ).long()
-        self._places = padded, rows, columns, counts
+        self._places = padded_stems, rows, columns, counts
 
     def forward(self, images: Tensor) -> Tensor:
+        """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
         stems, rows, columns, counts = (
-            numbers.to(images.device) for numbers in self._places
+            tensor.to(images.device) for tensor in self._places
         )
         scores = []
         for image in images:
-            first, past = self.reader.begin(image)
-            likely = first.log_softmax(dim=-1)[None]
+            logits, past = self.reader.begin(image)
+            likelihoods = logits.log_softmax(dim=-1)[None]
             if len(stems):
-                likely = torch.cat(
-                    [
-                        likely,
-                        self.reader.go_on(stems, past)
-                        .log_softmax(dim=-1)
-                        .flatten(0, 1),
-                    ]
-                )
-            scores.append((likely[rows, columns] * counts).sum(dim=1))
+                stem_logits = self.reader.go_on(stems, past)
+                stem_likelihoods = stem_logits.log_softmax(dim=-1).flatten(0, 1)
+                likelihoods = torch.cat([likelihoods, stem_likelihoods])
+            scores.append((likelihoods[rows, columns] * counts).sum(dim=1))
         return torch.stack(scores)
 
 
-class _Free(nn.Module):
-    """What is said of each picture, `advsearch.tasks.answers.Utterance`: the likeliest
-    token after the other.
+def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
+    """Return the index of the first stem that begins with a prefix; 0 if there is
+    none.
     """
+    for index, stem in enumerate(stems):
+        if list(stem[: len(prefix)]) == list(prefix):
+            return index
+    return 0
+
+
+def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
+    """Return the stems of names, all of their tokens but the last, sorted, without those
+    that are a prefix of another stem.
+    """
+    stems = {tuple(name_tokens[:-1]) for name_tokens in tokens if len(name_tokens) > 1}
+    return sorted(
+        stem
+        for stem in stems
+        if not any(other[: len(stem)] == stem for other in stems - {stem})
+    )
+
+
+class _Free(nn.Module):
+    """Answer freely about each image, `advsearch.tasks.answers.Utterance`: greedy decoding."""
 
     def __init__(self, reader: _Speaker, most: int) -> None:
         super().__init__()
@@ -410,77 +438,75 @@ class _Free(nn.Module):
         }
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
-        said = []
+        """Return the answer about each of images (N, 3, H, W)."""
+        answers = []
         for image in images:
             logits, past = self.reader.begin(image)
             steps = [logits]
             tokens = [int(logits.argmax())]
             while tokens[-1] not in self.ends and len(tokens) < self.most:
-                steps.append(
-                    self.reader.go_on(
-                        logits.new_tensor([tokens[-1:]], dtype=torch.long), past
-                    )[0, -1]
-                )
+                last_token = logits.new_tensor([tokens[-1:]], dtype=torch.long)
+                steps.append(self.reader.go_on(last_token, past)[0, -1])
                 tokens.append(int(steps[-1].argmax()))
             text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
-            said.append(
+            answers.append(
                 {"text": text, "logits": torch.stack(steps), "begins": self.begins}
             )
-        return said
+        return answers
 
     def begins(self, word: str) -> list[int]:
-        """Return the tokens that begin a word, in small letters or with a capital,
-        after a blank or without one.
+        """Return the tokens that may begin a word, in lower case or capitalized, with or
+        without a space before it.
         """
-        first: set[int] = set()
+        first_tokens: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
             tokens = self.tokenizer(form, add_special_tokens=False)["input_ids"]
-            first.update(
-                [token for token in tokens if self.tokenizer.decode([token]).strip()][
-                    :1
-                ]
-            )
-        return sorted(first - {self.tokenizer.unk_token_id})
+            visible = [
+                token for token in tokens if self.tokenizer.decode([token]).strip()
+            ]
+            first_tokens.update(visible[:1])
+        return sorted(first_tokens - {self.tokenizer.unk_token_id})
 
 
 def _check(loaded: Loaded, module: _Named) -> None:
-    """Raise a ModelError where the network itself finds the longest name otherwise
-    likely, read with the prompt.
+    """Compare the likelihood of the longest name with that of the network itself, read
+    with the prompt at once.
+
+    Raises:
+        ModelError: they differ.
     """
-    number, longest = max(
-        enumerate(module.tokens), key=lambda numbered: len(numbered[1])
-    )
-    image = torch.rand(
-        (3, *module.reader.side), generator=torch.Generator().manual_seed(0)
-    )
-    given = module.reader.given(image)
-    name = torch.tensor(longest, device=loaded.network.device)
-    whole = {**given, "input_ids": torch.cat([given["input_ids"], name[None]], dim=1)}
-    for key, value in given.items():
-        if key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
-            # 1 is the picture in most, but what is to be said in PaliGemma, which marks
-            # nothing before
-            kind = (
-                1
-                if key == "attention_mask"
-                or (key == "token_type_ids" and not value.any())
-                else 0
-            )
-            whole[key] = torch.cat([value, torch.full_like(name, kind)[None]], dim=1)
-    logits = loaded.network(**whole).logits
-    if logits.shape[1] != whole["input_ids"].shape[1]:
+    index = max(range(len(module.tokens)), key=lambda k: len(module.tokens[k]))
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand((3, *module.reader.side), generator=generator)
+    prompt = module.reader.given(image)
+    name_tokens = torch.tensor(module.tokens[index], device=loaded.network.device)
+    inputs = dict(prompt)
+    inputs["input_ids"] = torch.cat([prompt["input_ids"], name_tokens[None]], dim=1)
+    for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
+        if key in prompt:
+            # In most networks type 1 is the image, but in PaliGemma, which marks
+            # nothing before, it is the answer.
+            is_answer = key == "token_type_ids" and not prompt[key].any()
+            value = 1 if key == "attention_mask" or is_answer else 0
+            extension = torch.full_like(name_tokens, value)[None]
+            inputs[key] = torch.cat([prompt[key], extension], dim=1)
+    logits = loaded.network(**inputs).logits
+    if logits.shape[1] != inputs["input_ids"].shape[1]:
         raise _another(loaded, "returns logits of another length than the text has")
-    likely = logits[0, -len(name) - 1 : -1].float().log_softmax(dim=-1)
-    own = likely.gather(1, name[:, None]).sum().double()
-    ours = module(image[None])[0, number].double()
-    if not nearly(own, ours, max(1.0, abs(float(own))), loaded.network.dtype):
+    likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
+    expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
+    computed = module(image[None])[0, index].double()
+    size = max(1.0, abs(float(expected)))
+    if not nearly(expected, computed, size, loaded.network.dtype):
         raise _another(
             loaded,
-            f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})",
+            "goes on otherwise after what it has kept "
+            f"({computed:.6g} for {expected:.6g})",
         )
 
 
 def _another(loaded: Loaded, what: str) -> errors.ModelError:
+    """Return the error for a network that is none of those read here."""
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "
         "expected one that goes on with the "

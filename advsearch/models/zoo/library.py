@@ -27,9 +27,10 @@ from advsearch.extend import errors, models
 
 @contextlib.contextmanager
 def reading(spec: str, advice: str) -> Iterator[None]:
-    """Turn what a library raises while it fetches and reads a model's weights into a
-    ModelError, which advises what else its user may give; it never unpickles, and
-    connects to nobody for a model that only a file names.
+    """Turn what a library raises while it loads a model's weights into a ModelError.
+
+    Its message has `advice` on what else the user may give. Nothing is unpickled, and
+    nothing is fetched for a model that only a file names.
     """
     disabled = logging.root.manager.disable
     # of single tries to connect: an error is raised in the end
@@ -87,8 +88,9 @@ class Processing(TypedDict, total=False):
 
 
 def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
-    """Return the image processor of a repository or a folder; None where it has none.
-    It never runs code of its own.
+    """Return the image processor of a repository or a directory; None if it has none.
+
+    Its own code is never run.
     """
     if not any(cached_file(transformers, name, file, where) for file in FILES):
         return None
@@ -100,7 +102,7 @@ def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
 def cached_file(
     transformers: Any, name: str, file: str, where: Mapping[str, Any]
 ) -> str | None:
-    """Return the path of a file of a repository or a folder; None where it has none."""
+    """Return the path of a file of a repository or a directory; None if it has none."""
     path: str | None = transformers.utils.cached_file(
         name, file, _raise_exceptions_for_missing_entries=False, **where
     )
@@ -108,66 +110,69 @@ def cached_file(
 
 
 def measured(processor: Any, spec: str) -> Processing:
-    """Return size, mean, standard deviation and order of channels such that ours is
-    what a processor of transformers does.
+    """Measure size, mean, standard deviation and channel order of a transformers
+    processor.
 
-    Pictures of one colour tell gain and offset of each channel, whatever is resized or
-    cropped: with x in [0, 1], ``gain x + offset = (x - mean) / std``. The size is that
-    of a square picture's output. A processor that does
-    something else to the values of pixels is returned, to be called, if a gradient goes through it. Raises ModelError:
-    no gradient does, or it pads pictures or cuts them into patches.
+    Images of a single color show gain and offset of each channel, whatever is resized
+    or cropped: with x in [0, 1], ``gain x + offset = (x - mean) / std``. The size is
+    that of the output for a square image. A processor that changes pixels otherwise is
+    returned, to be called, if a gradient goes through it.
+
+    Raises:
+        ModelError: no gradient goes through it, or it pads images or cuts them into
+            patches.
     """
 
-    def shown(colour: tuple[int, int, int], side: int = SIDES[0]) -> Array:
-        return _processed(processor, np.full((side, side, 3), colour, np.uint8), spec)
+    def process_color(color: tuple[int, int, int], size: int = SIDES[0]) -> Array:
+        return _processed(processor, np.full((size, size, 3), color, np.uint8), spec)
 
-    black = shown((0, 0, 0))
-    size = Processing()
-    # and not just as large as what it was shown
-    if black.shape == shown((0, 0, 0), SIDES[1]).shape:
-        size["input_size"] = (black.shape[1], black.shape[2])
+    black = process_color((0, 0, 0))
+    processing = Processing()
+    # Unless the output is just as large as the input.
+    if black.shape == process_color((0, 0, 0), SIDES[1]).shape:
+        processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
-    slopes = [
-        shown(colour).mean(axis=(1, 2)) - offset
-        for colour in ((255, 0, 0), (0, 255, 0), (0, 0, 255))
-    ]
-    gains: Array = np.stack(slopes, axis=1)  # what goes in across, what comes out down
+    primaries = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+    # Rows are output channels, columns input channels.
+    gains: Array = np.stack(
+        [process_color(color).mean(axis=(1, 2)) - offset for color in primaries],
+        axis=1,
+    )
     tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
     for level in (51, 128, 255):
-        affine = offset + gains.sum(axis=1) * (level / 255.0)
-        if (
-            np.abs(shown((level, level, level)) - affine[:, None, None]).max()
-            > tolerance
-        ):
+        expected = offset + gains.sum(axis=1) * (level / 255.0)
+        difference = process_color((level, level, level)) - expected[:, None, None]
+        if np.abs(difference).max() > tolerance:
             return _called(
                 processor,
                 spec,
-                size,
+                processing,
                 "changes pixels by something else than a gain and an offset",
             )
-    orders = {"RGB": gains, "BGR": gains[:, ::-1]}
-    diagonal = [
-        name
-        for name, gain in orders.items()
-        if np.abs(gain - np.diag(np.diag(gain))).max() <= tolerance
-    ]
-    if len(diagonal) != 1 or (gain := np.diag(orders[diagonal[0]])).min() <= 0.0:
-        return _called(
-            processor,
-            spec,
-            size,
-            "mixes the channels of a picture, or turns it into its negative",
-        )
-    return Processing(
-        mean=_triple(-offset / gain),
-        std=_triple(1.0 / gain),
-        channels=diagonal[0],
-        **size,
+    diagonal_gains = {
+        channels: np.diag(matrix)
+        for channels, matrix in (("RGB", gains), ("BGR", gains[:, ::-1]))
+        if np.abs(matrix - np.diag(np.diag(matrix))).max() <= tolerance
+    }
+    if len(diagonal_gains) == 1:
+        ((channels, gain),) = diagonal_gains.items()
+        if gain.min() > 0.0:
+            return Processing(
+                mean=_triple(-offset / gain),
+                std=_triple(1.0 / gain),
+                channels=channels,
+                **processing,
+            )
+    return _called(
+        processor,
+        spec,
+        processing,
+        "mixes the channels of a picture, or turns it into its negative",
     )
 
 
 def _processed(processor: Any, picture: Any, spec: str) -> Array:
-    """Return a processor's output (3, h, w) for an 8-bit picture (H, W, 3)."""
+    """Run a processor on an 8-bit image (H, W, 3), and return its output (3, h, w)."""
     values: Array = np.asarray(
         processor(images=picture, return_tensors="np")["pixel_values"], np.float64
     )
@@ -181,69 +186,74 @@ def _processed(processor: Any, picture: Any, spec: str) -> Array:
     return picked
 
 
-def _called(processor: Any, spec: str, size: Processing, what: str) -> Processing:
-    """Return the size that was found, with the processor to be called on a picture of
-    it.
-    """
-    height, width = size.get("input_size", (SIDES[0], SIDES[0]))
-    ends = [
-        _processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec)
-        for level in (0, 255)
-    ]
-    if (ends[0] == ends[1]).all(axis=0).any():
-        raise _other(
-            spec, processor, "pads a square picture, or leaves some of its pixels out"
-        )
-    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    switches = ("do_resize", "do_center_crop")  # a picture has the right size
-    as_it_is = partial(
-        processor,
-        **{name: False for name in switches if getattr(processor, name, None)},
-    )
-    expected = _processed(as_it_is, levels, spec)
-    picture = (
-        (torch.from_numpy(levels).float() / 255.0).movedim(2, 0)[None].requires_grad_()
-    )
+def _called(processor: Any, spec: str, processing: Processing, what: str) -> Processing:
+    """Return the measured size, with the processor to be called on images of it.
 
-    # (N, 3, H, W) in [0, 1]; it is shown numbers up to 255, unrounded
+    Args:
+        processor: that is no gain and offset.
+        spec: of the model, for messages.
+        processing: with the size, if it is fixed.
+        what: the processor does, for messages.
+
+    Raises:
+        ModelError: it ignores pixels, or no gradient goes through it.
+    """
+    height, width = processing.get("input_size", (SIDES[0], SIDES[0]))
+    _check_reads_all_pixels(processor, spec)
+    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    # An image of the right size is neither resized nor cropped.
+    switches = ("do_resize", "do_center_crop")
+    off = {name: False for name in switches if getattr(processor, name, None)}
+    process = partial(processor, **off)
+    expected = _processed(process, levels, spec)
+    image = torch.from_numpy(levels).float() / 255.0
+    images = image.movedim(2, 0)[None].requires_grad_()
+
     def call(images: Tensor) -> Tensor:
-        shown = [
-            as_it_is(images=255.0 * image, return_tensors="pt")["pixel_values"]
+        """Process images (N, 3, H, W) in [0, 1]; values up to 255 stay unrounded."""
+        outputs = [
+            process(images=255.0 * image, return_tensors="pt")["pixel_values"]
             for image in images
         ]
-        return torch.cat(shown).to(images)
+        return torch.cat(outputs).to(images)
 
     try:
         with torch.enable_grad():
-            seen = call(picture)
-            reaches = bool(torch.autograd.grad(seen.square().sum(), picture)[0].any())
-    except (
-        Exception
-    ) as error:  # a processor that works with numpy raises nearly anything
-        pil = getattr(processor, "backend", None) == "pil"
-        advice = (
-            "; with torchvision installed, transformers takes one that may"
-            if pil
-            else ""
-        )
+            output = call(images)
+            gradient = torch.autograd.grad(output.square().sum(), images)[0]
+            has_gradient = bool(gradient.any())
+    except Exception as error:  # a processor with numpy raises nearly anything
+        advice = ""
+        if getattr(processor, "backend", None) == "pil":
+            advice = "; with torchvision installed, transformers takes one that may"
         raise _other(
             spec,
             processor,
             f"{what}, and lets no gradient through "
             f"({models.first_line(error)}){advice}",
         ) from error
-    off = (
-        np.abs(seen.detach().double().numpy() - expected).max()
-        if seen.shape == (1, *expected.shape)
-        else np.inf
-    )
-    if not reaches or not off <= TOLERANCE * np.ptp(expected):
+    error_size = np.inf
+    if output.shape == (1, *expected.shape):
+        error_size = np.abs(output.detach().double().numpy() - expected).max()
+    if not has_gradient or not error_size <= TOLERANCE * np.ptp(expected):
         raise _other(
             spec,
             processor,
             f"{what}, and rounds or does otherwise where a gradient goes through it",
         )
-    return Processing(processor=call, **size)
+    return Processing(processor=call, **processing)
+
+
+def _check_reads_all_pixels(processor: Any, spec: str) -> None:
+    """Raise ModelError if a pixel of the output is the same for black and white."""
+    black, white = (
+        _processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec)
+        for level in (0, 255)
+    )
+    if (black == white).all(axis=0).any():
+        raise _other(
+            spec, processor, "pads a square picture, or leaves some of its pixels out"
+        )
 
 
 def _triple(numbers: Array) -> models.Triple:
@@ -265,8 +275,9 @@ Ask = Callable[[Any, Tensor], Any]  # what asks a network about pictures (N, 3, 
 
 
 class Adapted(nn.Module):
-    """A network of a library, asked as that one's are; `boxes` says that its boxes are
-    corners in pixels.
+    """A network of a library, called as that library calls it.
+
+    `boxes` states that its boxes are corners in pixels.
     """
 
     def __init__(self, network: nn.Module, ask: Ask, *, boxes: bool = False) -> None:
@@ -281,7 +292,16 @@ class Adapted(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A network of transformers, and what comes with it."""
+    """A network of transformers, with what belongs to it.
+
+    Attributes:
+        network: a `PreTrainedModel`.
+        name: of the model.
+        spec: what the user wrote, for messages.
+        processor: of images; None if it has none.
+        part: loads another part by its class, such as "AutoTokenizer".
+        purpose: of the network.
+    """
 
     network: Any  # a `PreTrainedModel`
     name: str
@@ -293,8 +313,8 @@ class Loaded:
 
     @cached_property
     def described(self) -> Processing:
-        """What is done to pictures. Raises ModelError as `measured`; warns where there
-        is no image processor.
+        """The preprocessing of images. Raises ModelError as `measured`; warns if there is no image
+        processor.
         """
         if self.processor is None:
             models.warn(
@@ -308,27 +328,24 @@ class Loaded:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of its classes, as its ``config`` has them; none where transformers
-        only numbers them.
-        """
+        """The names of its classes in its ``config``; none if transformers only numbers them."""
         labels = getattr(self.network.config, "id2label", None) or {}
         names = tuple(str(labels[key]) for key in sorted(labels, key=int))
         return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
 
     def sized(self, config: Any) -> Processing:
-        """Return what is done to pictures, of the size in a part of the network's
-        ``config`` if no other is known.
+        """Return the preprocessing, with the size in a part of the network's ``config`` if
+        it has none.
         """
-        side = getattr(config, "image_size", None)
-        sides = (side, side) if isinstance(side, int) else tuple(side or ())
-        return Processing(
-            **{**({"input_size": sides} if sides else {}), **self.described}
-        )
+        size = getattr(config, "image_size", None)
+        input_size = (size, size) if isinstance(size, int) else tuple(size or ())
+        processing = Processing()
+        if input_size:
+            processing["input_size"] = input_size
+        return Processing(**{**processing, **self.described})
 
     def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> models.Source:
-        """Return the source of the network as `Adapted` asks it, given pictures as it
-        wants them; `fields` go to `Source`.
-        """
+        """Return the source of the network as `Adapted` calls it; `fields` go to `Source`."""
         return models.source_of(
             Adapted(self.network, ask, boxes=boxes),
             self.name,
@@ -346,8 +363,8 @@ class Loaded:
 
 
 def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:
-    """Whether a network's own scores, and those that we work out of its parts in its
-    type, are the same but for rounding, as a share of a size.
+    """Whether a network's own scores and those that we compute from its parts are equal up to
+    rounding in its dtype, relative to a size.
     """
     return bool(
         (own - ours).abs().max() <= max(ROUNDING, 8.0 * torch.finfo(dtype).eps) * size
@@ -355,8 +372,8 @@ def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:
 
 
 def in_pixels(boxes: Tensor, images: Tensor) -> Tensor:
-    """Return boxes (N, K, 4), middle and size as shares of images (N, 3, H, W), as
-    corners x0 y0 x1 y1 in pixels.
+    """Convert boxes (N, K, 4), center and size as fractions of images (N, 3, H, W), to corners
+    x0, y0, x1, y1 in pixels.
     """
     height, width = images.shape[2:]
     middle, size = boxes.split(2, dim=-1)

@@ -25,14 +25,15 @@ from advsearch.models.zoo.library import Adapted, Loaded, reading
 
 TASK = "similarity"  # the task that compares features
 ENDINGS = ("Model", "ModelWithProjection")
-# weights of a first token that stands for the whole picture
+# Names of the weights of a first token that stands for the full image.
 TOKENS = ("cls_token", "class_embedding", "class_token")
 
 
 def gives_features(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, or the class of one, has features of a picture
-    and no head; its architecture is a name such as Dinov2Model or
-    CLIPVisionModelWithProjection. None stands for one that transformers has not.
+    """Whether a network of transformers, or its class, has features of an image and no head.
+
+    Its architecture is a name such as Dinov2Model or CLIPVisionModelWithProjection. None
+    stands for one that transformers does not have.
     """
     if (
         network is None
@@ -48,8 +49,8 @@ def gives_features(architecture: str, network: Any) -> bool:
 
 
 def no_classes(name: str, what: str) -> errors.ModelError:
-    """Return the error for a model that is asked for classes and has features only;
-    `what` it is: "is a Dinov2Model".
+    """Return the error for a classifier that has features only; `what` it is: "is a
+    Dinov2Model".
     """
     return errors.ModelError(
         f"model {name}: {what}, which returns features and has no classes: use "
@@ -61,8 +62,14 @@ def no_classes(name: str, what: str) -> errors.ModelError:
 def source(
     loaded: Loaded, plain: Callable[[Loaded], models.Source] | None = None
 ) -> models.Source:
-    """Return the source of a network that has features: of these where they are
-    compared, else `plain`'s, if it has anything else.
+    """Return the source of a network that has features.
+
+    Args:
+        loaded: the network.
+        plain: returns the source for other tasks; None if it has features only.
+
+    Raises:
+        ModelError: it has no classes, or no features.
     """
     network = loaded.network
     if loaded.purpose.task != TASK:
@@ -74,37 +81,38 @@ def source(
             f"prompt: task {TASK} compares pictures and reads no text; "
             "leave `prompt` out"
         )
-    part = network
+    backbone = network
     config = network.config
     if zero_shot.compares(network):
         zero_shot.check_takes_pictures(network, loaded.spec)
         config = getattr(config, "vision_config", config)
     elif "ForImageClassification" in type(network).__name__:
-        part = (
-            network.base_model
-            if network.base_model is not network
-            else getattr(network, "vision_model", None)
-        )
-        if part is None:
+        backbone = network.base_model
+        if backbone is network:
+            backbone = getattr(network, "vision_model", None)
+        if backbone is None:
             raise errors.ModelError(
                 f"model {loaded.spec}: has no part before its "
                 "head; give its network without one"
             )
-    token = any(word in name for name, _ in part.named_parameters() for word in TOKENS)
+    has_class_token = any(
+        word in name for name, _ in backbone.named_parameters() for word in TOKENS
+    )
 
-    def features(network: Any, images: Tensor) -> Any:
-        returned = (
-            network.get_image_features if zero_shot.compares(network) else network
-        )(pixel_values=images)
-        found = models.pooled(returned, token=token)
-        return returned if found is None else found
+    def compute_features(network: Any, images: Tensor) -> Any:
+        compares = zero_shot.compares(network)
+        encode = network.get_image_features if compares else network
+        returned = encode(pixel_values=images)
+        features = models.pooled(returned, token=has_class_token)
+        return returned if features is None else features
 
-    return replace(loaded, network=part).source(features, **loaded.sized(config))
+    loaded = replace(loaded, network=backbone)
+    return loaded.source(compute_features, **loaded.sized(config))
 
 
 DISPARITY = "relative disparity"
 METRIC = "metric depth"
-"""What their numbers are, by the words of `advsearch.tasks.depth.KINDS`."""
+"""Kinds of values, of `advsearch.tasks.depth.KINDS`."""
 
 BY_FAMILY = {
     "dpt": DISPARITY,
@@ -112,61 +120,64 @@ BY_FAMILY = {
     "zoedepth": METRIC,
     "glpn": METRIC,
 }
-"""Of a network whose ``config`` does not say it, by family: that of the weights that
-are published first.
+"""The kind of a network whose ``config`` does not state it, by family: that of the first
+published weights.
 """
 
 
 def depth_source(loaded: Loaded) -> models.Source:
-    """Return the source of a network that returns how far each pixel is: a mapping with
-    numbers (N, h, w) under what they are.
+    """Return the source of a network that predicts depth: a mapping with values
+    (N, h, w) under their kind.
     """
     config = loaded.network.config
-    said = {"relative": DISPARITY, "metric": METRIC}.get(
-        getattr(config, "depth_estimation_type", ""), ""
-    )
-    kind = said or BY_FAMILY.get(config.model_type, "predicted_depth")
-    framed = (
-        bool(getattr(loaded.processor, "do_pad", False))
-        and config.model_type == "zoedepth"
-    )
+    kind_of_type = {"relative": DISPARITY, "metric": METRIC}
+    kind = kind_of_type.get(getattr(config, "depth_estimation_type", ""), "")
+    if not kind:
+        kind = BY_FAMILY.get(config.model_type, "predicted_depth")
+    is_zoedepth = config.model_type == "zoedepth"
+    is_padded = is_zoedepth and bool(getattr(loaded.processor, "do_pad", False))
 
     def ask(network: Any, images: Tensor) -> dict[str, Tensor]:
-        if not framed:
+        if not is_padded:
             return {kind: network(pixel_values=images).predicted_depth}
-        # ZoeDepth is shown pictures with a mirrored border, which its processor adds
-        # and its post-processing removes
+        # ZoeDepth takes images with a mirrored border, which its processor adds and its
+        # post-processing removes.
         height, width = images.shape[2:]
-        down, across = (int(math.sqrt(side / 2.0) * 3.0) for side in (height, width))
-        wide = functional.pad(images, (across, across, down, down), mode="reflect")
-        shown = functional.interpolate(
-            wide, size=(height, width), mode="bilinear", align_corners=True
+        top = int(math.sqrt(height / 2.0) * 3.0)
+        left = int(math.sqrt(width / 2.0) * 3.0)
+        padded = functional.pad(images, (left, left, top, top), mode="reflect")
+        resized = functional.interpolate(
+            padded, size=(height, width), mode="bilinear", align_corners=True
         )
-        depth = network(pixel_values=shown).predicted_depth[:, None]
-        depth = functional.interpolate(depth, size=wide.shape[2:], mode="bicubic")
-        return {kind: depth[:, 0, down : down + height, across : across + width]}
+        depth = network(pixel_values=resized).predicted_depth[:, None]
+        depth = functional.interpolate(depth, size=padded.shape[2:], mode="bicubic")
+        return {kind: depth[:, 0, top : top + height, left : left + width]}
 
     return loaded.source(ask)
 
 
-MASKS = r"^(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation$|^MaskFormerForInstanceSegmentation$"
-"""The architectures that return masks and their classes, by name."""
+MASKS = (
+    r"^(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation$"
+    r"|^MaskFormerForInstanceSegmentation$"
+)
+"""Pattern of architectures that return masks and their classes."""
 
-# height and width to which transformers brings the masks of every Mask2Former before it
-# adds them up
+# Size to which transformers resizes the masks of every Mask2Former before their sum.
 FINE = (384, 384)
-SENTENCE = "the task is semantic"  # what OneFormer is told to do
+SENTENCE = "the task is semantic"  # the text input of OneFormer
 
 
 def mask_source(loaded: Loaded) -> models.Source:
-    """Return the source of a network that returns masks and their classes: of
-    logarithms of scores (N, classes, H, W) of each pixel of the input. Warns what these
-    are (ModelWarning).
+    """Return the source of a network that returns masks and their classes.
 
-    The score of a class is the sum over queries of the probability that it is a
-    query's, times the probability that the pixel is in that one's mask (Cheng et al.
-    2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are changed where
-    `post_process_semantic_segmentation` of each family changes them.
+    Its output is the logarithms of scores (N, classes, H, W) of each pixel of the input. The
+    score of a class is the sum over queries of the probability that it is a query's, times
+    the probability that the pixel is in that query's mask (Cheng et al. 2021, arXiv
+    2107.06278, section 3.4, "semantic inference"). Masks are resized at the point at which
+    `post_process_semantic_segmentation` of each family resizes them.
+
+    Warns:
+        ModelWarning: what the scores are.
     """
     models.warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its "
@@ -206,16 +217,18 @@ def mask_source(loaded: Loaded) -> models.Source:
     return loaded.source(ask, labels=loaded.names or None)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# ``timm:NAME`` and ``torchvision:NAME``: networks that classify, segment or find
-# objects, and features of timm's.
+# ---- ``timm:NAME`` and ``torchvision:NAME`` ----
 
 
 def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
-    """Return ``timm:NAME[@weights.safetensors]``, with timm's pretrained weights where
-    none are given. Size, normalisation and labels are those of its pretrained weights.
-    Raises ModelError: timm is missing, its weights cannot be had, or those that were
-    given do not fit; UnknownNameError: timm has no network of that name.
+    """Load ``timm:NAME[@weights.safetensors]``, by default with timm's pretrained weights.
+
+    Size, normalization and labels are those of its pretrained weights.
+
+    Raises:
+        ModelError: timm is missing, its weights cannot be loaded, or the given ones do not
+            fit.
+        UnknownNameError: timm has no network of that name.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
     timm = models.library("timm", spec, "timm")
@@ -233,27 +246,26 @@ def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
 def timm_repository(
     spec: str, name: str, revision: str, purpose: models.Purpose
 ) -> models.Source:
-    """Return the network of a repository, or of a folder, that timm has made; `spec` is
-    for messages. Raises ModelError where timm is missing, or it cannot be had.
+    """Load the network of a repository, or of a directory, that timm has saved.
+
+    Raises:
+        ModelError: timm is missing, or the network cannot be loaded; `spec` is for
+            messages.
     """
     timm = models.library("timm", spec, "timm")
-    local = Path(name).is_dir()
-    place = (
-        f"local-dir:{name}"
-        if local
-        else f"hf-hub:{name}{'@' if revision else ''}{revision}"
-    )
+    if Path(name).is_dir():
+        location = f"local-dir:{name}"
+    else:
+        location = f"hf-hub:{name}{'@' if revision else ''}{revision}"
     with reading(
         spec, "Give a folder with config.json and model.safetensors, as timm saves them"
     ):
-        module = timm.create_model(place, pretrained=True)
+        module = timm.create_model(location, pretrained=True)
     return _source(timm, module, name.rstrip("/").rpartition("/")[2], purpose)
 
 
 def of_timm(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
-    """Return the source of a network of timm that is there already; None of any
-    other.
-    """
+    """Return the source of an existing network of timm; None for any other network."""
     timm: Any = sys.modules.get("timm")
     if timm is None or not isinstance(getattr(network, "pretrained_cfg", None), dict):
         return None
@@ -261,9 +273,10 @@ def of_timm(network: nn.Module, purpose: models.Purpose) -> models.Source | None
 
 
 def wrapped_timm(loaded: Loaded) -> models.Source:
-    """Return the source of a network of timm inside a
-    `TimmWrapperForImageClassification` of transformers, whose ``config`` may tell more
-    than timm. There are no labels where transformers only numbers them.
+    """Return the source of a network of timm inside a `TimmWrapperForImageClassification` of
+    transformers, whose ``config`` may have more than timm.
+
+    There are no labels if transformers only numbers them.
     """
     timm = models.library("timm", loaded.spec, "timm")
     network: Any = loaded.network
@@ -281,87 +294,106 @@ def _source(
     described: Mapping[str, Any] | None = None,
     labels: tuple[str, ...] = (),
 ) -> models.Source:
-    """Return the source of a network of timm, which is asked for its classes or for its
-    features. `described` stands for its ``pretrained_cfg``; labels go before timm's.
-    """
-    compared = purpose.task == TASK
-    classes = module.num_classes
-    if classes == 0 and not compared:
-        raise no_classes(name, "is a network without a head (num_classes is 0)")
-    more = {"pretrained_cfg": dict(described)} if described else {}
-    config = timm.data.resolve_model_data_config(module, **more)
-    names = labels or module.pretrained_cfg.get("label_names")
-    if not names and (subset := timm.data.infer_imagenet_subset(module)):
-        names = timm.data.ImageNetInfo(subset).label_descriptions()
-    fitting = not compared and names and (labels or len(names) == classes)
+    """Return the source of a network of timm, for its classes or its features.
 
-    def what_the_head_reads(network: Any, images: Tensor) -> Any:
+    Args:
+        timm: the library.
+        module: the network.
+        name: of the model.
+        purpose: of the network.
+        described: replaces its ``pretrained_cfg``.
+        labels: replace timm's.
+    """
+    needs_features = purpose.task == TASK
+    n_classes = module.num_classes
+    if n_classes == 0 and not needs_features:
+        raise no_classes(name, "is a network without a head (num_classes is 0)")
+    options = {"pretrained_cfg": dict(described)} if described else {}
+    config = timm.data.resolve_model_data_config(module, **options)
+    names = labels or module.pretrained_cfg.get("label_names")
+    if not names:
+        subset = timm.data.infer_imagenet_subset(module)
+        if subset:
+            names = timm.data.ImageNetInfo(subset).label_descriptions()
+    names_fit = names and (labels or len(names) == n_classes)
+
+    def compute_features(network: Any, images: Tensor) -> Any:
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
+    has_head = bool(n_classes)
     return models.source_of(
-        Adapted(module, what_the_head_reads) if compared and classes else module,
+        Adapted(module, compute_features) if needs_features and has_head else module,
         name,
         input_size=tuple(map(int, config["input_size"][1:])),
         mean=tuple(map(float, config["mean"])),
         std=tuple(map(float, config["std"])),
-        labels=tuple(map(str, names)) if fitting else None,
+        labels=tuple(map(str, names)) if names_fit and not needs_features else None,
     )
 
 
 MOST_DETECTED = 4
-"""Most pictures that a detector is given at once: at 800 x 800 each takes a gigabyte or
-two with its derivative.
+"""Maximum batch size of a detector: at 800 x 800 each image takes a gigabyte or two with
+its derivative.
 """
 
 
 def load_torchvision(spec: str) -> models.Source:
-    """Return ``torchvision:NAME[@weights.safetensors]``, with torchvision's default
-    weights where none are given. Size, normalisation and labels are those of the
-    default weights, where torchvision tells them. Its detectors normalise by
-    themselves, and resize too: their size is the one that they would resize a square
-    picture to. Raises ModelError: torchvision is missing or broken, its weights cannot
-    be had, those that were given do not fit, or it is quantised or for videos;
-    UnknownNameError: torchvision has no such network.
+    """Load ``torchvision:NAME[@weights.safetensors]``, by default with torchvision's
+    default weights.
+
+    Size, normalization and labels are those of the default weights, if torchvision has
+    them. Its detectors normalize and resize by themselves: their size is the one to
+    which they would resize a square image.
+
+    Raises:
+        ModelError: torchvision is missing or broken, its weights cannot be loaded, the
+            given ones do not fit, or it is quantized or for videos.
+        UnknownNameError: torchvision has no such network.
     """
     name, weights = models.split_weights(spec.partition(":")[2])
     zoo = models.library("torchvision", spec, "torchvision").models
-    classifies, segments, finds = (
-        zoo.list_models(module=m) for m in (zoo, zoo.segmentation, zoo.detection)
-    )
-    if name not in (*classifies, *segments, *finds):
-        for part, what in NOT_FOR_PICTURES.items():
-            if name in (
-                zoo.list_models(module=getattr(zoo, part)) if hasattr(zoo, part) else ()
-            ):
-                plain = f"torchvision:{name.removeprefix('quantized_')}"
-                raise errors.ModelError(f"model {spec}: {what.format(plain=plain)}")
+    classifiers = zoo.list_models(module=zoo)
+    segmenters = zoo.list_models(module=zoo.segmentation)
+    detectors = zoo.list_models(module=zoo.detection)
+    known_names = (*classifiers, *segmenters, *detectors)
+    if name not in known_names:
+        _check_reads_images(zoo, name, spec)
         raise errors.UnknownNameError(
-            "torchvision network",
-            name,
-            models.near_names(name, (*classifies, *segments, *finds)),
+            "torchvision network", name, models.near_names(name, known_names)
         )
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
-    parts = {} if name in classifies else {"weights_backbone": None}
+    options = {} if name in classifiers else {"weights_backbone": None}
     with reading(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
         module: nn.Module = zoo.get_model(
-            name, weights=None if weights else default, **parts
+            name, weights=None if weights else default, **options
         )
     if weights is not None:
         models.load_weights(module, weights, name)
-    if name in classifies:
+    if name in classifiers:
         return models.source_of(module, name, **_defaults(default, module))
     fields = _defaults(default, None)
-    if name in segments:
+    if name in segmenters:
         return models.source_of(Adapted(module, _scores_by_pixel), name, **fields)
     fields |= {"mean": None, "std": None, "batch_limits": (1, MOST_DETECTED)}
-    inside = getattr(module, "transform", None)  # which would resize a square picture
-    if fixed := getattr(inside, "fixed_size", None):
-        fields["input_size"] = int(fixed[1]), int(fixed[0])
-    elif shortest := getattr(inside, "min_size", None):
-        fields["input_size"] = (
-            int(shortest if isinstance(shortest, int) else shortest[-1]),
-        ) * 2
-    return models.source_of(Adapted(module, _found, boxes=True), name, **fields)
+    # The transform would resize a square image.
+    transform = getattr(module, "transform", None)
+    fixed_size = getattr(transform, "fixed_size", None)
+    min_size = getattr(transform, "min_size", None)
+    if fixed_size:
+        fields["input_size"] = int(fixed_size[1]), int(fixed_size[0])
+    elif min_size:
+        size = int(min_size if isinstance(min_size, int) else min_size[-1])
+        fields["input_size"] = (size, size)
+    return models.source_of(Adapted(module, _detections, boxes=True), name, **fields)
+
+
+def _check_reads_images(zoo: Any, name: str, spec: str) -> None:
+    """Raise ModelError for a network of torchvision that is not for single images."""
+    for module_name, text in NOT_FOR_PICTURES.items():
+        module = getattr(zoo, module_name, None)
+        if module is not None and name in zoo.list_models(module=module):
+            plain = f"torchvision:{name.removeprefix('quantized_')}"
+            raise errors.ModelError(f"model {spec}: {text.format(plain=plain)}")
 
 
 NOT_FOR_PICTURES = {
@@ -375,39 +407,46 @@ NOT_FOR_PICTURES = {
     "made of, or give it from Python and search with a policy without gradients, such "
     "as nes",
 }
-"""What torchvision's other networks are, by its module, and the way on."""
+"""What torchvision's other networks are, by its module, and what to do about them."""
 
 
-def _found(network: Any, images: Tensor) -> Any:
+def _detections(network: Any, images: Tensor) -> Any:
+    """Return the detections of each image (N, 3, H, W)."""
     return network(list(images))
 
 
 def _scores_by_pixel(network: Any, images: Tensor) -> Any:
+    """Return the logits (N, classes, H, W) of a segmenter."""
     return network(images)["out"]
 
 
 def _defaults(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:
-    """Return what default weights tell of a source; the labels of a classifier only if
-    they fit it.
+    """Return the fields of a source that default weights state.
+
+    Args:
+        default: the weights; None if there are none.
+        classifier: the labels must fit its last layer; None for other networks.
     """
     mean, std = models.PRESETS["imagenet"]
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
     if default is None:
         return fields
     transforms = default.transforms()
-    if sides := getattr(transforms, "crop_size", None) or getattr(
-        transforms, "resize_size", None
-    ):
-        fields["input_size"] = int(sides[0]), int(sides[-1])
+    crop_size = getattr(transforms, "crop_size", None)
+    size = crop_size or getattr(transforms, "resize_size", None)
+    if size:
+        fields["input_size"] = int(size[0]), int(size[-1])
     for key in ("mean", "std"):
-        if (numbers := getattr(transforms, key, None)) is not None:
+        numbers = getattr(transforms, key, None)
+        if numbers is not None:
             fields[key] = tuple(map(float, numbers))
     labels = tuple(str(label) for label in default.meta.get("categories", ()))
-    last = (
-        []
-        if classifier is None
-        else [p for p in classifier.parameters() if p.dim() == 1][-1:]
-    )
-    if labels and (classifier is None or (last and last[0].numel() == len(labels))):
+    if labels and (classifier is None or _count_classes(classifier) == len(labels)):
         fields["labels"] = labels
     return fields
+
+
+def _count_classes(classifier: nn.Module) -> int:
+    """Return the size of the last bias of a classifier, 0 if there is none."""
+    biases = [weights for weights in classifier.parameters() if weights.dim() == 1]
+    return biases[-1].numel() if biases else 0

@@ -45,8 +45,8 @@ class Family(NamedTuple):
 
 
 PATIENCE = 5.0
-"""Seconds that the hub has for its first answer. Its client would ask for each file
-again for half a minute.
+"""Timeout in seconds of the hub's first response. Its client would retry each file for
+half a minute.
 """
 
 ADVICE = (
@@ -57,17 +57,18 @@ ADVICE = (
 
 
 def load(spec: str, purpose: models.Purpose) -> models.Source:
-    """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of
-    `NETWORKS`.
+    """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
-    One that reads texts gets its classes from its user (`zero_shot`, `language`).
-    Labels of others are those that they were published with; size, order of channels
-    and normalisation are measured on the image processor (`library.measured`), and
-    where there is none a ModelWarning says so. Code in a repository is never run, and
-    weights are read from safetensors alone. A repository that timm has saved goes to
-    timm. Raises ModelError: transformers is missing, the repository cannot be had or
-    lacks weights, its network is of another kind or larger than the memory, or its
-    processor does what `Preprocessing` can't.
+    One that reads texts gets its classes from the user (`zero_shot`, `language`). Labels of
+    others are those that they were published with; size, channel order and normalization
+    are measured on the image processor (`library.measured`); a ModelWarning reports if there
+    is none. Code in a repository is never run, and weights are read from safetensors alone.
+    A repository that timm has saved goes to timm.
+
+    Raises:
+        ModelError: transformers is missing, the repository cannot be loaded or lacks
+            weights, its network is of another kind or larger than the memory, or its
+            processor does what `Preprocessing` cannot.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = models.library("transformers", spec, "hf")
@@ -118,10 +119,11 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
 
 
 def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
-    """Return the source of a network of transformers that is there already; None of any
-    other. Names come from its ``config``, and what is done to pictures from the
-    repository or folder that it was loaded from; a ModelWarning says where that has no
-    image processor, or can't be read any more.
+    """Return the source of an existing network of transformers; None for any other network.
+
+    Names come from its ``config``, and the preprocessing from the repository or directory
+    that it was loaded from; a ModelWarning reports if that has no image processor, or cannot
+    be read any more.
     """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
@@ -142,6 +144,7 @@ def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | N
 def _part(
     transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str
 ) -> Any:
+    """Load another part of a network's repository by the class that loads it."""
     with reading(
         spec, "Give a repository, or a folder, in which it is beside the network"
     ):
@@ -151,17 +154,23 @@ def _part(
 
 
 def _kind(architecture: str, network: Any, spec: str) -> Family:
-    """Return which of `NETWORKS` an architecture is of, by its name and a network or
-    its class; a ModelError says what it is otherwise.
+    """Return the first of `NETWORKS` that an architecture belongs to.
+
+    Args:
+        architecture: its name.
+        network: of this architecture, or its class.
+        spec: of the model, for messages.
+
+    Raises:
+        ModelError: it belongs to none.
     """
-    for kind in NETWORKS:
-        ours = kind.ours
-        if (
-            re.search(ours, architecture)
-            if isinstance(ours, str)
-            else ours(architecture, network)
-        ):
-            return kind
+    for family in NETWORKS:
+        if isinstance(family.ours, str):
+            matches = bool(re.search(family.ours, architecture))
+        else:
+            matches = family.ours(architecture, network)
+        if matches:
+            return family
     raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has "
         "ForImageClassification, "
@@ -178,6 +187,11 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
 def _config(
     transformers: Any, name: str, spec: str, where: Mapping[str, Any]
 ) -> Mapping[str, Any]:
+    """Return the config of a repository or a directory, as JSON values.
+
+    Raises:
+        ModelError: it is a repository of open_clip, or cannot be found.
+    """
     has = partial(cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
@@ -209,9 +223,7 @@ def _config(
 
 
 def _out_of_reach(name: str) -> bool:
-    """Return whether the hub gives no answer about a repository, not even that there is
-    none.
-    """
+    """Whether the hub does not respond about a repository, not even that there is none."""
     hub = import_module("huggingface_hub")
     try:
         hub.get_hf_file_metadata(hub.hf_hub_url(name, "config.json"), timeout=PATIENCE)
@@ -221,19 +233,19 @@ def _out_of_reach(name: str) -> bool:
 
 
 def _near_folders(name: str) -> str:
-    place = Path(name).expanduser()
-    there = (
-        [folder.name for folder in place.parent.iterdir() if folder.is_dir()]
-        if place.parent.is_dir()
-        else []
-    )
-    return _meant(
-        [str(place.parent / near) for near in models.resembling(place.name, there)]
-    )
+    """Return the question whether a directory with a similar name is meant, "" if there
+    is none.
+    """
+    path = Path(name).expanduser()
+    siblings = []
+    if path.parent.is_dir():
+        siblings = [entry.name for entry in path.parent.iterdir() if entry.is_dir()]
+    similar = models.resembling(path.name, siblings)
+    return _meant([str(path.parent / sibling) for sibling in similar])
 
 
 def _meant(names: Sequence[str]) -> str:
-    """Return the question whether one of these folders or repositories is meant; "" if
+    """Return the question whether one of these directories or repositories is meant, "" if
     there is none.
     """
     specs = [f"'hf:{name}'" for name in names[:3]]
@@ -241,44 +253,47 @@ def _meant(names: Sequence[str]) -> str:
 
 
 def _check_whole(network: Any, report: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and
-    others at each load. A pooler that was never trained is left out: what it would read
-    is the first token, and that is taken then.
+    """Check that all weights come from the files: others would be random.
+
+    An untrained pooler is removed: it would read the first token, which is then used
+    directly.
+
+    Raises:
+        ModelError: weights are missing.
     """
-    lacking = sorted(
-        {
-            *report.get("missing_keys", ()),
-            *(key for key, *_ in report.get("mismatched_keys", ())),
-        }
-    )
-    if (
-        lacking
-        and getattr(network, "pooler", None)
-        and all(str(key).startswith("pooler.") for key in lacking)
-    ):
+    mismatched = [key for key, *_ in report.get("mismatched_keys", ())]
+    missing = sorted({*report.get("missing_keys", ()), *mismatched})
+    if not missing:
+        return
+    is_pooler_only = all(str(key).startswith("pooler.") for key in missing)
+    if getattr(network, "pooler", None) and is_pooler_only:
         network.pooler = None
-    elif lacking:
-        shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
-        raise errors.ModelError(
-            f"model {spec}: its files lack {len(lacking)} of the network's weights "
-            f"({shown}), which would be random. "
-            "Give a repository that was trained for this, not one of its beginnings"
-        )
+        return
+    examples = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
+    raise errors.ModelError(
+        f"model {spec}: its files lack {len(missing)} of the network's weights "
+        f"({examples}), which would be random. "
+        "Give a repository that was trained for this, not one of its beginnings"
+    )
 
 
 def _logits(network: Any, images: Tensor) -> Tensor:
+    """Return the logits of a network."""
     logits: Tensor = network(pixel_values=images).logits
     return logits
 
 
 def _logits_by_pixel(network: Any, images: Tensor) -> Tensor:
+    """Return the logits (N, classes, H, W) of a segmenter, at the size of the images."""
     return interpolate(_logits(network, images), size=images.shape[2:], mode="bilinear")
 
 
 def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, classes) in
-    [0, 1], overlapping ones too. Networks whose last class stands for "nothing" choose
-    one class for each box (Carion et al. 2020); the others judge each class by itself.
+    """Return boxes (N, queries, 4) in pixels, x0, y0, x1, y1, and scores (N, queries, classes)
+    in [0, 1], without suppression.
+
+    Networks whose last class means no object choose one class for each box (Carion et al.
+    2020); the others score each class independently.
     """
     returned = network(pixel_values=images)
     boxes = in_pixels(returned.pred_boxes, images)
@@ -288,16 +303,14 @@ def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], models.Source]:
-    """Return what makes the source of a network whose ``config`` has the names of its
-    classes.
+    """Return the function that makes the source of a network with class names in its
+    ``config``.
     """
     return lambda loaded: loaded.source(ask, boxes=boxes, labels=loaded.names or None)
 
 
 class _OfFrames:
-    """A processor of videos as one of pictures, each of which is a video of one
-    frame.
-    """
+    """A processor of videos as one of images, each of which is a video of one frame."""
 
     def __init__(self, processor: Any) -> None:
         self.processor = processor
@@ -310,7 +323,7 @@ class _OfFrames:
 
 
 def _of_clips(loaded: Loaded) -> models.Source:
-    """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of
+    """Return the source of a network that takes (N, T, 3, H, W): the T frames are the images of
     a rig.
     """
     config = loaded.network.config
@@ -354,40 +367,36 @@ NETWORKS = (
     ),
     Family(outputs.gives_features, None, outputs.source),
 )
-"""Every kind that is read, the particular ones first."""
+"""All families that are read, the specific ones first."""
 
 
-MEMORY = Path("/proc/meminfo")  # where Linux says what is free
+MEMORY = Path("/proc/meminfo")  # Linux's file of memory sizes
 
 
 def check_fits(
     transformers: Any, name: str, where: Mapping[str, Any], spec: str
 ) -> None:
-    """Raise a ModelError where the weights of a repository or a folder are larger than
-    the memory that can be had without anything else being ended, swap included. They
-    are kept in the type in which they are stored. Nothing is checked where the system
-    does not say what is free.
+    """Check that the weights of a repository or a directory fit into the free memory,
+    swap included.
+
+    They keep the dtype in which they are stored. Nothing is checked if the system does
+    not report its free memory.
+
+    Raises:
+        ModelError: they are larger.
     """
-    try:
-        lines = MEMORY.read_text(encoding="ascii").splitlines()
-        kilobytes = {
-            line.partition(":")[0]: int(line.split()[1])
-            for line in lines
-            if len(line.split()) > 1
-        }
-        free = 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
-    except (OSError, ValueError, KeyError):
+    free = _read_free_memory()
+    if free is None:
         return
     size = 0
-    # of several files
-    if index := cached_file(transformers, name, "model.safetensors.index.json", where):
-        size = int(
-            json.loads(Path(index).read_text(encoding="utf-8"))
-            .get("metadata", {})
-            .get("total_size", 0)
-        )
-    elif weights := cached_file(transformers, name, "model.safetensors", where):
-        size = Path(weights).stat().st_size
+    index = cached_file(transformers, name, "model.safetensors.index.json", where)
+    if index:  # of several files
+        metadata = json.loads(Path(index).read_text(encoding="utf-8"))
+        size = int(metadata.get("metadata", {}).get("total_size", 0))
+    else:
+        weights = cached_file(transformers, name, "model.safetensors", where)
+        if weights:
+            size = Path(weights).stat().st_size
     if size > free:
         raise errors.ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} "
@@ -395,3 +404,17 @@ def check_fits(
             "smaller network, one whose weights are stored in bfloat16, or a machine "
             "with more memory"
         )
+
+
+def _read_free_memory() -> int | None:
+    """Return the free memory in bytes, swap included; None if it is unknown."""
+    try:
+        lines = MEMORY.read_text(encoding="ascii").splitlines()
+        kilobytes = {
+            line.partition(":")[0]: int(line.split()[1])
+            for line in lines
+            if len(line.split()) > 1
+        }
+        return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
+    except (OSError, ValueError, KeyError):
+        return None

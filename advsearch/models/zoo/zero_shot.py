@@ -21,16 +21,17 @@ TEXTS = 64  # texts that are embedded at once
 
 
 def compares(network: Any) -> bool:
-    """Whether a network of transformers, or the class of one, has a half for pictures
-    and one for texts.
-    """
+    """Whether a network of transformers, or its class, encodes both images and texts."""
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
 def source(loaded: Loaded) -> models.Source:
-    """Return the source of a classifier of the names that are given. Raises ModelError
-    where the network takes patches in place of pictures, or its scores are other than
-    are worked out here.
+    """Return the source of a classifier of the given names.
+
+    Raises:
+        ModelError: the network takes patches instead of images, or its scores differ
+            from those computed here.
+        InputError: fewer than two names, or prompts without a place for them.
     """
     check_takes_pictures(loaded.network, loaded.spec)
     name = loaded.name
@@ -45,39 +46,39 @@ def source(loaded: Loaded) -> models.Source:
         )
     tokenizer = loaded.part("AutoTokenizer")
     words = spoken(names)
-    alone = hasattr(loaded.network, "logit_bias")
+    has_sigmoid = hasattr(loaded.network, "logit_bias")
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.foreign(f"model {name}: cannot embed the names of `labels`"),
         torch.no_grad(),
     ):
         network: Any = models.sharing_copy(loaded.network).eval()
-        scale = (
-            network.temperature.reciprocal()
-            if hasattr(network, "temperature")
-            else network.logit_scale.exp()
-        )
-        rows = averaged(network, tokenizer, words, prompts)
-        head = nn.Linear(rows.shape[1], len(names))
-        head.weight.copy_(scale.float() * rows)
-        head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
-        compared = _Compared(network, head.to(network.device))
-        made = loaded.with_texts(compared, names, network.dtype)
-        _check(network, compared, tokenizer, texts[0], made)
+        if hasattr(network, "temperature"):
+            scale = network.temperature.reciprocal()
+        else:
+            scale = network.logit_scale.exp()
+        embeddings = averaged(network, tokenizer, words, prompts)
+        head = nn.Linear(embeddings.shape[1], len(names))
+        head.weight.copy_(scale.float() * embeddings)
+        bias = network.logit_bias.float() if has_sigmoid else torch.zeros(())
+        head.bias.copy_(bias)
+        classifier = _Compared(network, head.to(network.device))
+        result = loaded.with_texts(classifier, names, network.dtype)
+        _check(network, classifier, tokenizer, texts[0], result)
     say_what_is_one(tokenizer, texts, names, name)
-    if alone:
+    if has_sigmoid:
         models.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: "
             "the scores that are shown are a "
             f"softmax over the {len(names)} names, and margins are differences of "
             "logits"
         )
-    return made
+    return result
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:
-    """Raise a ModelError for a network that takes patches in place of pictures; `spec`
-    is for the message.
+    """Raise ModelError for a network that takes patches instead of images; `spec` is for the
+    message.
     """
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise errors.ModelError(
@@ -89,90 +90,99 @@ def check_takes_pictures(network: Any, spec: str) -> None:
 
 
 def spoken(names: Sequence[str]) -> list[str]:
-    """Return what stands for each name in a text: of synonyms with commas between them
-    the first, if that is one's.
+    """Return the text of each name: the first of its synonyms separated by commas, if no
+    other name has the same.
     """
-    first = [name.partition(",")[0].strip() or name for name in names]
+    first_synonyms = [name.partition(",")[0].strip() or name for name in names]
     return [
-        short if first.count(short) == 1 else name
-        for short, name in zip(first, names, strict=True)
+        synonym if first_synonyms.count(synonym) == 1 else name
+        for synonym, name in zip(first_synonyms, names, strict=True)
     ]
 
 
 def _encoded(
     network: Any, tokenizer: Any, texts: Sequence[str]
 ) -> Mapping[str, Tensor]:
-    """Return texts as the network was trained on them: SigLIP's are as long as can be,
-    the others' as the longest.
+    """Tokenize texts as the network was trained on them: SigLIP's are padded to the
+    maximum length, others to that of the longest.
+
+    Raises:
+        InputError: a text is too long.
     """
-    most = min(
+    max_tokens = min(
         int(network.config.text_config.max_position_embeddings),
         int(tokenizer.model_max_length),
     )
-    for text, tokens in zip(
-        texts, tokenizer(list(texts), verbose=False)["input_ids"], strict=True
-    ):
-        if len(tokens) > most:
+    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
+    for text, tokens in zip(texts, tokens_of_texts, strict=True):
+        if len(tokens) > max_tokens:
             raise InputError(
-                f"prompt: expected texts of at most {most} tokens, got "
+                f"prompt: expected texts of at most {max_tokens} tokens, got "
                 f"{len(tokens)}: {text[:80]!r}"
             )
-    padding = "max_length" if hasattr(network, "logit_bias") else True
-    given = tokenizer(
+    inputs = tokenizer(
         list(texts),
-        padding=padding,
-        max_length=most,
+        padding="max_length" if hasattr(network, "logit_bias") else True,
+        max_length=max_tokens,
         truncation=True,
         return_tensors="pt",
     )
-    taken = inspect.signature(network.forward).parameters
+    parameters = inspect.signature(network.forward).parameters
     return {
-        key: value.to(network.device) for key, value in given.items() if key in taken
+        key: value.to(network.device)
+        for key, value in inputs.items()
+        if key in parameters
     }
 
 
 def averaged(
     network: Any, tokenizer: Any, words: Sequence[str], prompts: Sequence[str]
 ) -> Tensor:
-    """Return one row (words, features) of length 1 for each word: its text in each
-    prompt, embedded and averaged. They are normalised before and after (Radford et al.
-    2021, arXiv 2103.00020, section 3.1.4).
+    """Embed each word in each prompt, and average over prompts.
+
+    Embeddings are normalized before and after (Radford et al. 2021, arXiv 2103.00020,
+    section 3.1.4).
+
+    Returns:
+        (words, features), rows of length 1.
     """
-    each = []
+    embeddings_of_prompts = []
     for prompt in prompts:
         texts = [prompt.replace("{}", word) for word in words]
-        parts = [
-            _encoded(network, tokenizer, texts[begin : begin + TEXTS])
-            for begin in range(0, len(texts), TEXTS)
-        ]
-        rows = torch.cat([_pooled(network.get_text_features(**part)) for part in parts])
-        each.append(functional.normalize(rows, dim=-1))
-    return functional.normalize(torch.stack(each).mean(dim=0), dim=-1)
+        batches = []
+        for start in range(0, len(texts), TEXTS):
+            inputs = _encoded(network, tokenizer, texts[start : start + TEXTS])
+            batches.append(_pooled(network.get_text_features(**inputs)))
+        embeddings = functional.normalize(torch.cat(batches), dim=-1)
+        embeddings_of_prompts.append(embeddings)
+    mean = torch.stack(embeddings_of_prompts).mean(dim=0)
+    return functional.normalize(mean, dim=-1)
 
 
 def _pooled(returned: Any) -> Tensor:
+    """Return the features (N, D), float32, in an output of an encoder."""
     features: Tensor = getattr(returned, "pooler_output", returned)
     return features.float()
 
 
 class _Compared(nn.Module):
-    """Logits (N, names): the scaled cosine of a picture and each name. The half for
-    texts is left out.
+    """Compute logits (N, names): the scaled cosine of an image and each name.
+
+    The text encoder is left out.
     """
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
         self.network: Any = models.sharing_copy(network)
-        for part in [
-            part for part, _ in self.network.named_children() if part.startswith("text")
-        ]:
-            setattr(self.network, part, None)
+        for child in [name for name, _ in self.network.named_children()]:
+            if child.startswith("text"):
+                setattr(self.network, child, None)
         self.head = head
 
-    def seen(self, images: Tensor) -> Tensor:  # features (N, D) of length 1
-        return functional.normalize(
-            _pooled(self.network.get_image_features(pixel_values=images)), dim=-1
-        )
+    def seen(self, images: Tensor) -> Tensor:
+        """Return the features (N, D) of length 1 of images."""
+        features = _pooled(self.network.get_image_features(pixel_values=images))
+        return functional.normalize(features, dim=-1)
 
     def forward(self, images: Tensor) -> Tensor:
         scores: Tensor = self.head(self.seen(images))
@@ -180,26 +190,31 @@ class _Compared(nn.Module):
 
 
 def _check(
-    network: Any, compared: _Compared, tokenizer: Any, text: str, made: models.Source
+    network: Any,
+    classifier: _Compared,
+    tokenizer: Any,
+    text: str,
+    source: models.Source,
 ) -> None:
-    """Raise a ModelError where the network itself gives a picture of noise and a text
-    another score.
+    """Compare the score of noise and a text with that of the network itself.
+
+    Raises:
+        ModelError: they differ.
     """
-    shape = (1, 3, *(made.input_size or (224, 224)))
-    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(
-        network.device, network.dtype
-    )
-    own = network(
-        **_encoded(network, tokenizer, [text]), pixel_values=noise
-    ).logits_per_image.float()
-    scale = compared.head.weight.norm(dim=-1).max()
-    row = scale * averaged(network, tokenizer, [text], ["{}"])
-    ours = compared.seen(noise) @ row.T + compared.head.bias[0]
-    if own.shape != ours.shape or not nearly(
-        own, ours, max(float(scale), float(own.abs().max())), network.dtype
+    shape = (1, 3, *(source.input_size or (224, 224)))
+    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    noise = noise.to(network.device, network.dtype)
+    inputs = _encoded(network, tokenizer, [text])
+    expected = network(**inputs, pixel_values=noise).logits_per_image.float()
+    scale = classifier.head.weight.norm(dim=-1).max()
+    embedding = scale * averaged(network, tokenizer, [text], ["{}"])
+    computed = classifier.seen(noise) @ embedding.T + classifier.head.bias[0]
+    size = max(float(scale), float(expected.abs().max()))
+    if expected.shape != computed.shape or not nearly(
+        expected, computed, size, network.dtype
     ):
         raise errors.ModelError(
-            f"model {made.name}: is a {type(network).__name__}, whose scores are no "
+            f"model {source.name}: is a {type(network).__name__}, whose scores are no "
             "scaled cosine of a picture and a "
             "text; expected one such as CLIPModel or SiglipModel"
         )
@@ -208,32 +223,31 @@ def _check(
 def say_what_is_one(
     tokenizer: Any, texts: Sequence[str], names: Sequence[str], name: str
 ) -> None:
-    """Warn of names that are the same to the network: in another case, say, or of words
-    that it does not know.
+    """Warn of the first two names with the same tokens: they differ in case, say, or are
+    words that the network does not know.
     """
-    seen: dict[tuple[int, ...], int] = {}
-    for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):
-        first = seen.setdefault(tuple(tokens), number)
-        if first != number:
+    index_of_tokens: dict[tuple[int, ...], int] = {}
+    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
+    for index, tokens in enumerate(tokens_of_texts):
+        first = index_of_tokens.setdefault(tuple(tokens), index)
+        if first != index:
             models.warn(
-                f"model {name} reads {names[first]!r} (#{first}) and {names[number]!r} "
-                f"(#{number}) as the same text: "
+                f"model {name} reads {names[first]!r} (#{first}) and {names[index]!r} "
+                f"(#{index}) as the same text: "
                 "it cannot tell one from the other"
             )
             return
 
 
 Build = Callable[[Loaded, Any, Any, Sequence[str]], Ask]
-"""Makes what asks a detector, of what was loaded, a copy of its network, its tokenizer
-and the words for each name: for boxes (N, K, 4) in pixels, x0 y0 x1 y1, and scores (N,
-K, names) in [0, 1] of each name by itself.
+"""Creates the function that runs a detector, from what was loaded, a copy of its
+network, its tokenizer and the text of each name. It returns boxes (N, K, 4) in pixels,
+x0, y0, x1, y1, and independent scores (N, K, names) in [0, 1].
 """
 
 
 def detector(loaded: Loaded) -> models.Source:
-    """Return the source of a detector of the names that are given, of a network of one
-    of `DETECTORS`.
-    """
+    """Return the source of a detector of the given names, with a network of `DETECTORS`."""
     names = loaded.purpose.named(loaded.name, "finds what it is told to", "detection")
     tokenizer = loaded.part("AutoTokenizer")
     words = spoken(names)
@@ -248,24 +262,24 @@ def detector(loaded: Loaded) -> models.Source:
 
 
 def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> Ask:
-    """Each patch of the picture is one box, compared with the text of each name (Minderer et al. 2022, arXiv
-    2205.06230, section 3). The texts of a name are averaged as CLIP's are. The half of OWL for texts is left out
-    then."""
-    half = getattr(network, network.base_model_prefix)
-    rows = averaged(half, tokenizer, words, models.patterns(loaded.purpose.prompts)).to(
-        network.dtype
-    )
-    half.text_model = half.text_projection = None
+    """Compare each patch of the image, which is one box, with the text of each name
+    (Minderer et al. 2022, arXiv 2205.06230, section 3).
+
+    The texts of a name are averaged as CLIP's are. OWL's text encoder is then removed.
+    """
+    base_model = getattr(network, network.base_model_prefix)
+    prompts = models.patterns(loaded.purpose.prompts)
+    embeddings = averaged(base_model, tokenizer, words, prompts).to(network.dtype)
+    base_model.text_model = None
+    base_model.text_projection = None
 
     def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
         features = network.image_embedder(pixel_values=images)[0]
         patches = features.flatten(1, 2)
-        logits, _ = network.class_predictor(
-            patches, rows.to(patches).expand(len(images), -1, -1)
-        )
-        return in_pixels(
-            network.box_predictor(patches, features), images
-        ), logits.sigmoid()
+        queries = embeddings.to(patches).expand(len(images), -1, -1)
+        logits, _ = network.class_predictor(patches, queries)
+        boxes = network.box_predictor(patches, features)
+        return in_pixels(boxes, images), logits.sigmoid()
 
     return ask
 
@@ -273,15 +287,14 @@ def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> 
 def _grounded(
     loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]
 ) -> Ask:
-    """All names are one text, ``mug. cup. bowl.`` as its processor writes it, and a box
-    has a score of each of its tokens (Liu et al. 2023, arXiv 2303.05499, section 3). A
-    name's is the largest of its own.
+    """Read all names as one text, ``mug. cup. bowl.``, and score boxes by its tokens
+    (Liu et al. 2023, arXiv 2303.05499, section 3).
+
+    The score of a name is the largest of its tokens.
     """
-    name, (prompt, *others) = (
-        loaded.name,
-        models.patterns(loaded.purpose.prompts or ("{}",)),
-    )
-    if others:
+    name = loaded.name
+    prompt, *other_prompts = models.patterns(loaded.purpose.prompts or ("{}",))
+    if other_prompts:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several "
             "prompts can't be averaged; give one, "
@@ -291,36 +304,43 @@ def _grounded(
     tokens = torch.tensor(
         tokenizer(text, verbose=False)["input_ids"], device=network.device
     )
-    most = network.config.max_text_len
-    if len(tokens) > most:
+    max_tokens = network.config.max_text_len
+    if len(tokens) > max_tokens:
         raise InputError(
-            f"labels: model {name} reads a text of at most {most} tokens, and the "
-            f"names take {len(tokens)}; give fewer"
+            f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
+            f"the names take {len(tokens)}; give fewer"
         )
-    marks = torch.isin(tokens, network.model.special_tokens)
-    # which of the gaps between marks a token is in
-    between = marks.cumsum(dim=0)[~marks]
-    own = [(~marks).nonzero().flatten()[between == gap] for gap in between.unique()]
-    if len(own) != len(words):
+    token_index = _find_token_runs(tokens, network.model.special_tokens)
+    if len(token_index) != len(words):
         raise InputError(
             f"labels: model {name} reads the names as one text with full stops between "
             "them, in which these "
-            f"{len(words)} are {len(own)}; leave . and ? out of names and prompt"
+            f"{len(words)} are {len(token_index)}; leave . and ? out of names and "
+            "prompt"
         )
-    longest = max(map(len, own))  # (names, most): a shorter one's first is there again
-    places = torch.stack(
-        [torch.cat([run, run[:1].expand(longest - len(run))]) for run in own]
-    )
 
     def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
         returned = network(
             pixel_values=images, input_ids=tokens.expand(len(images), -1)
         )
-        return in_pixels(returned.pred_boxes, images), returned.logits[
-            ..., places
-        ].amax(dim=-1).sigmoid()
+        name_logits = returned.logits[..., token_index].amax(dim=-1)
+        return in_pixels(returned.pred_boxes, images), name_logits.sigmoid()
 
     return ask
+
+
+def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
+    """Return the indices of the tokens between separators, (runs, longest).
+
+    A shorter run is padded with its first index.
+    """
+    is_separator = torch.isin(tokens, separators)
+    run_of_token = is_separator.cumsum(dim=0)[~is_separator]
+    token_index = (~is_separator).nonzero().flatten()
+    runs = [token_index[run_of_token == run] for run in run_of_token.unique()]
+    longest = max(map(len, runs), default=0)
+    padded = [torch.cat([run, run[:1].expand(longest - len(run))]) for run in runs]
+    return torch.stack(padded) if padded else token_index.new_zeros((0, 0))
 
 
 DETECTORS: dict[str, Build] = {
@@ -329,4 +349,4 @@ DETECTORS: dict[str, Build] = {
     "GroundingDinoForObjectDetection": _grounded,
     "MMGroundingDinoForObjectDetection": _grounded,
 }
-"""What makes a detector of a network, by the name of its architecture."""
+"""Builders of detectors by architecture."""
