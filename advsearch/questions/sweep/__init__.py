@@ -1,6 +1,4 @@
-"""Measure how often the model is right over a grid or a random sample of
-configurations.
-"""
+"""Measure how often a model is right over a grid or a sample of configurations."""
 
 from __future__ import annotations
 
