@@ -648,7 +648,7 @@ def _run_in_directory(
         RunDirectory.of(config, resumed) as run,
         executor_for(config, WORKER, progress) as executor,
     ):
-        functions = {
+        functions: dict[str, Callable[..., Any] | None] = {
             f"metric {name}": function for name, function in job.metrics.items()
         }
         functions["task"] = function_of(job.tasks[0])

@@ -210,7 +210,7 @@ class Predictions:
         by_arm = (2, -1, len(models))
         right = self.right.reshape(by_arm)
         outcome = self.outcome.reshape(by_arm)
-        both_counted: npt.NDArray[np.bool_] = self.counted.reshape(by_arm).all(axis=0)
+        both_counted = np.asarray(self.counted.reshape(by_arm).all(axis=0))
         pairs = list[PairedRates]()
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])

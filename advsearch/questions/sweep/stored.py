@@ -51,7 +51,10 @@ class StoredSweep:
     def read_rows(self) -> pd.DataFrame:
         """Read the rows, by ascending `step`.
 
-        Raises FileFormatError if they cannot be read. `runs.tables.read_sweep` describes the columns and the attributes of the frame.
+        `runs.tables.read_sweep` describes the columns and the attributes of the frame.
+
+        Raises:
+            FileFormatError: they cannot be read.
         """
         rows = read_sweep(self.folder, is_drawn=self.summary.sampler is not None)
         return rows.sort_values("step", ignore_index=True)
