@@ -45,8 +45,8 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
         factor = lux / scene_lux
         traced = verifier.journal.traced
-        traced_there = Shared(in_light(problem, factor), traced.executor, factor)
-        journal = replace(verifier.journal, traced=traced_there)
+        traced_in_light = Shared(in_light(problem, factor), traced.executor, factor)
+        journal = replace(verifier.journal, traced=traced_in_light)
         verification = verify(
             replace(verifier, journal=journal).evaluate_all,
             problem.domain,
@@ -102,9 +102,9 @@ def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
     return find_problem
 
 
-def in_light(problem: Problem, times: float) -> Problem:
+def in_light(problem: Problem, factor: float) -> Problem:
     """Return the problem with its ambient light multiplied by a factor."""
-    controls = [control.in_light(times) for control in problem.space.controls]
+    controls = [control.in_light(factor) for control in problem.space.controls]
     space = replace(problem.space, controls=tuple(controls))
     renderer = problem.renderer.like()
     renderer.space = space

@@ -148,14 +148,14 @@ def parts_in(run: Path) -> AttackParts:
 
 
 def controls_given(
-    config: AttackConfig, searched: Controls, drawn: Controls
+    config: AttackConfig, searched: Controls, random: Controls
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """Return the searched controls and those that vary by chance, with their settings.
 
     Args:
         config: settings of the run; only a search has a budget.
         searched: names, settings or instances.
-        drawn: likewise.
+        random: likewise.
 
     Raises:
         InputError: a searched control has a distribution.
@@ -171,7 +171,7 @@ def controls_given(
                     "likely each is; give a range, or put it into `over`, under which "
                     "it varies by chance"
                 )
-    return controls, naming.given_to(config, drawn, are_searched=False)
+    return controls, naming.given_to(config, random, are_searched=False)
 
 
 def task_and_objective(
@@ -187,15 +187,15 @@ def task_and_objective(
     Raises:
         InputError: the objective does not fit the task or the goal.
     """
-    made_task = make_task(task)
-    chosen = made_task.objective if objective is None else objective
+    new_task = make_task(task)
+    chosen = new_task.objective if objective is None else objective
     check_objective(
         chosen,
-        made_task.name,
+        new_task.name,
         targeted=config.target is not None,
         minimise=config.minimise,
     )
-    return made_task, chosen
+    return new_task, chosen
 
 
 def models_as_one(
@@ -270,24 +270,24 @@ def problem_of(
     return problem_on(parts_of(config, scene, model), differentiated=differentiated)
 
 
-def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
+def problem_on(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     """Make the problem of an attack: what renders and evaluates configurations.
 
     Warnings are added to those of loading the model.
 
     Args:
-        job: the parts of the attack.
+        parts: the parts of the attack.
         differentiated: whether derivatives are needed.
 
     Raises:
         InputError: the parts do not fit together.
     """
-    config = job.config
-    model, warnings = job.loaded
-    task, facts = _bind_task(job)
+    config = parts.config
+    model, warnings = parts.loaded
+    task, facts = _bind_task(parts)
     resolution = config.resolution or model.input_size
-    description = framed(job.scene.description, resolution)
-    space = make_space((*job.controls, *job.over), description)
+    description = framed(parts.scene.description, resolution)
+    space = make_space((*parts.controls, *parts.over), description)
     renderer = loading.make_renderer(
         description,
         space,
@@ -301,12 +301,12 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
     )
     features_seed = seeds.stream(config.seed, "clean features")
     objective, note = judging.objective_for(
-        job.objective, task, model, renderer, features_seed, config.ensemble
+        parts.objective, task, model, renderer, features_seed, config.ensemble
     )
     if note:
         warnings.append(note)
     if config.printable:
-        searched_space = make_space(job.controls, description)
+        searched_space = make_space(parts.controls, description)
         # raises where nothing can be printed
         judging.print_terms(searched_space, searched_space.start)
     problem = Problem(
@@ -318,11 +318,11 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
         objective,
         next_count(config.pixel_sampler, config.search_spp),
         config.seed,
-        searched=len(job.controls),
+        searched=len(parts.controls),
         aovs=aovs_of(config.aov),
-        metrics=job.metrics,
+        metrics=parts.metrics,
     )
-    for name in asked_by(job.objective):
+    for name in asked_by(parts.objective):
         # raises where the objective needs what there is not
         problem.asked(problem.whole(problem.domain.start))(name)
     problem.steps, problem.draws = search_size(config, problem)
@@ -330,28 +330,28 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
 
 
 def _bind_task(
-    job: AttackParts, *, shows: bool = True
+    parts: AttackParts, *, shows: bool = True
 ) -> tuple[Task, Callable[[Described, Looked], Facts]]:
     """Bind the task of an attack to its model.
 
     Args:
-        job: the parts of the attack.
+        parts: the parts of the attack.
         shows: whether a clean image is rendered for a task that needs one.
 
     Returns:
         The task, and the function that gives it the ground truth of a configuration.
     """
-    config = job.config
-    model, warnings = job.loaded
-    task = job.task
-    if isinstance(job.objective, str):
-        task = task.seeking(job.objective)
+    config = parts.config
+    model, warnings = parts.loaded
+    task = parts.task
+    if isinstance(parts.objective, str):
+        task = task.seeking(parts.objective)
     task = judging.task_for(task, model).on(
         model, target=config.target, minimise=config.minimise
     )
     facts = partial(
         facts_about,
-        job.scene.description,
+        parts.scene.description,
         config.object,
         config.label,
         judge=config.judge,
@@ -365,12 +365,12 @@ def _bind_task(
         known = facts(dict)
         if ensemble is not None:
             known = ensemble.told(member, known)
-        judging.check_truth(member, network, job.scene, known, config.image_settings)
+        judging.check_truth(member, network, parts.scene, known, config.image_settings)
         if shows:
             member = judging.calibrate_task(
                 member,
                 network,
-                [job.scene],
+                [parts.scene],
                 config.label,
                 config.judge,
                 config.image_settings,

@@ -182,25 +182,25 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
     ]
 
 
-def failures_text(known: DifferentFailures) -> str:
+def failures_text(failures: DifferentFailures) -> str:
     """Return where different failures were found, and how many hold."""
-    where = f"{known.found} of {words.count(known.seen, 'draw')}"
-    if known.places is not None:
+    where = f"{failures.found} of {words.count(failures.seen, 'draw')}"
+    if failures.places is not None:
         where = (
-            f"{known.found} of {known.places} cells over "
-            f"{' and '.join(known.over)} ({known.seen} were seen)"
+            f"{failures.found} of {failures.places} cells over "
+            f"{' and '.join(failures.over)} ({failures.seen} were seen)"
         )
-    if known.share is not None:
+    if failures.share is not None:
         where += (
-            f"; of all configurations {words.interval_text(known.share.interval)} fail "
+            f"; of all configurations {words.interval_text(failures.share.interval)} fail "
             "in one render (95 % interval)"
         )
-        if known.share.estimate is not None:
-            where += f", {words.percent(known.share.estimate)} by the estimate"
-    if not known.tried:
+        if failures.share.estimate is not None:
+            where += f", {words.percent(failures.share.estimate)} by the estimate"
+    if not failures.tried:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return (
-        f"claimed in {where}; with fresh renders {known.held} of the {known.tried} "
+        f"claimed in {where}; with fresh renders {failures.held} of the {failures.tried} "
         "that were tried hold"
     )
 

@@ -121,14 +121,14 @@ def attack(
             "policy: expected a name, a mapping with a `name` and options, or an "
             f"instance, got {told(policy)}"
         )
-    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    session_controls = [*loading.only_here(controls), *loading.only_here(over)]
     are_named = all(
         isinstance(named, (str, Path)) for named in (scene, *several(model))
     )
     if (
         not are_named
         or callable(objective)
-        or own_controls
+        or session_controls
         or isinstance(task, OwnTask)
     ):
         naming.check_not_spread(options)
@@ -167,14 +167,14 @@ def attack(
     )
     if isinstance(policy, Policy) and not is_named(policy, _make_policy):
         only_here.append(PythonOnly("policy", policy.name))
-    only_here += [PythonOnly("control", name) for name in own_controls]
+    only_here += [PythonOnly("control", name) for name in session_controls]
     only_here += [
         PythonOnly("metric", name) for name in judging.only_here(config.metrics)
     ]
     config = config.with_only_here(only_here)
     _check_single(config)
 
-    searched, drawn = controls_given(config, controls, over)
+    searched, random_controls = controls_given(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
     loaded_task, objective = task_and_objective(
@@ -196,7 +196,7 @@ def attack(
             loaded=models_as_one(model, config, loaded_task),
             task=loaded_task,
             controls=searched,
-            over=drawn,
+            over=random_controls,
             objective=objective,
             policy=policy,
             keep=run is not None,

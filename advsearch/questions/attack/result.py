@@ -372,7 +372,7 @@ def write_pictures(
     run: RunDirectory,
     problem: Problem,
     findings: Findings,
-    shown: Mapping[str, KeptPicture],
+    scene_images: Mapping[str, KeptPicture],
 ) -> None:
     """Save the images of an attack: of both scenes, of trials, and of the search.
 
@@ -380,11 +380,11 @@ def write_pictures(
         run: where they are saved.
         problem: of the attack.
         findings: of the attack.
-        shown: those of the scenes, `clean` and `adversarial`.
+        scene_images: those of the scenes, `clean` and `adversarial`.
     """
-    for name, image in shown.items():
+    for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
-    difference = files.difference(shown["clean"].picture, shown["adversarial"].picture)
+    difference = files.difference(scene_images["clean"].picture, scene_images["adversarial"].picture)
     run.save_image("difference", difference)
     verification = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
@@ -400,7 +400,7 @@ def write_pictures(
                 verification.u,
             )
     if findings.frames:
-        last_frame = shown["adversarial"].picture
+        last_frame = scene_images["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:
             # The other frames have the conditions as the scene comes.
             u = problem.domain.project(findings.search.best_u)
@@ -642,7 +642,7 @@ def _render_frames(
 def write_drive(
     run: RunDirectory,
     name: str,
-    pictures: Sequence[npt.NDArray[np.float32]],
+    images: Sequence[npt.NDArray[np.float32]],
     seconds: float,
 ) -> None:
     """Save frames as an animation, NAME.webp, and some side by side, NAME.png.
@@ -650,10 +650,10 @@ def write_drive(
     Args:
         run: where they are saved.
         name: of the files.
-        pictures: (h, w, 3) in sRGB.
+        images: (h, w, 3) in sRGB.
         seconds: from the first frame to the last.
     """
-    frames = [Image.fromarray(files.to_8bit(picture)) for picture in pictures]
+    frames = [Image.fromarray(files.to_8bit(picture)) for picture in images]
     stream = io.BytesIO()
     milliseconds = max(MIN_FRAME_MILLISECONDS, round(1000.0 * seconds / len(frames)))
     frames[0].save(
@@ -674,12 +674,12 @@ def write_drive(
     run.save_image(name, np.concatenate(strip, axis=1))
 
 
-def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+def evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
     """Return indices of evenly spaced frames, the first and the last among them.
 
     Args:
         count: of all frames.
-        most: of the indices.
+        max_count: of the indices.
     """
-    indices = np.linspace(0, count - 1, min(count, most)).round()
+    indices = np.linspace(0, count - 1, min(count, max_count)).round()
     return np.unique(indices.astype(np.int64))

@@ -258,17 +258,17 @@ class StudyRun:
         warnings: of these, each sentence once.
     """
 
-    def __init__(self, asked: RunContext[AttackConfig]) -> None:
-        self.context = asked
-        self.run = asked.run
-        self.progress = asked.progress
-        config = asked.config
+    def __init__(self, context: RunContext[AttackConfig]) -> None:
+        self.context = context
+        self.run = context.run
+        self.progress = context.progress
+        config = context.config
         self.warnings = _find_label_warnings(config)
         for text in self.warnings:
             self.progress.message(text)
         self.chains = chains_of(config)
         self.names: list[str] = []
-        with asked.until_interrupted():
+        with context.until_interrupted():
             share(config, self.chains, self.run.path, self.progress)
 
     @property
@@ -346,7 +346,7 @@ def _find_label_warnings(config: AttackConfig) -> list[str]:
     return one_label_for_several(models, config.label, labels)
 
 
-def curve(asked: RunContext[AttackConfig]) -> CurveResult:
+def curve(context: RunContext[AttackConfig]) -> CurveResult:
     """Measure robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips
@@ -354,9 +354,9 @@ def curve(asked: RunContext[AttackConfig]) -> CurveResult:
     attacked again. An object that is wrong as it is counts as not robust at any
     epsilon, and is counted apart from those that were found.
     """
-    study = StudyRun(asked)
+    study = StudyRun(context)
     rows = [_attack_object(study, chain) for chain in study.chains]
-    epsilons: list[float | None] = [*sorted(asked.config.epsilons)] or [None]
+    epsilons: list[float | None] = [*sorted(context.config.epsilons)] or [None]
     points = [_compute_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 
@@ -437,7 +437,7 @@ def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> Curve
 MIN_TRIAL_SPP = 64
 
 
-def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
+def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     """Attack several models, and try every adversarial scene on each of them.
 
     Trial k has the same seed for every scene and every model, and none that a search or
@@ -445,13 +445,13 @@ def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
     size the same configuration is rendered anew. A success needs the model to be right
     on the clean scene with the same seed, as everywhere.
     """
-    config = asked.config
+    config = context.config
     names = different(config.models, "model")
-    asked.progress.stage(LOADING)
+    context.progress.stage(LOADING)
     for name in names:
         check_from_config(_with_model(config, name))
 
-    study = StudyRun(asked)
+    study = StudyRun(context)
     summaries = {attack.of: study.attack(attack) for (attack,) in study.chains}
     attacked = {
         name: summary for name, summary in summaries.items() if summary is not None
@@ -466,7 +466,7 @@ def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
             if summary.sample_count
         ]
         spp = config.verify_spp or max([MIN_TRIAL_SPP, *sample_counts])
-        with asked.until_interrupted():
+        with context.until_interrupted():
             _try_on_models(study, names, spp, configurations, models, cells)
     rows = [
         MatrixRow(

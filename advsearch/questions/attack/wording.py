@@ -427,8 +427,8 @@ def _sample_count_text(summary: AttackSummary) -> str:
         return ""
     reason = "that more would not change it is not shown"
     if samples.converged:
-        kept = "rate about where it is" if summary.over else "margin on its side"
-        reason = f"more would leave the {kept}"
+        stable = "rate about where it is" if summary.over else "margin on its side"
+        reason = f"more would leave the {stable}"
     return f"{samples.spp} a pixel in the verification; {reason}"
 
 

@@ -23,10 +23,10 @@ from advsearch.questions.sweep.summary import SweepSummary
     claims=claims,
     page=page,
 )
-def sweep(asked: RunContext[SweepConfig]) -> SweepSummary:
+def sweep(context: RunContext[SweepConfig]) -> SweepSummary:
     """Measure how often the model is right."""
     from advsearch.questions.sweep.carry_out import sweep_from_config  # imports torch
 
     return sweep_from_config(
-        asked.config, progress=asked.progress, resumed=asked.resumed
+        context.config, progress=context.progress, resumed=context.resumed
     ).summary

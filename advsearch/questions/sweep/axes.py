@@ -209,7 +209,7 @@ def _check_scalar(
         )
 
 
-def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
+def axis_values(where: str, parameter: Parameter, raw_values: Any) -> tuple[Number, ...]:
     """Parse and check the values of an axis.
 
     ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
@@ -219,15 +219,15 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
     Args:
         where: how messages name the axis.
         parameter: what varies.
-        given: a string, a value, or a list.
+        raw_values: a string, a value, or a list.
 
     Raises:
         InputError: they are no values of the parameter, or not different.
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
-    values: Sequence[Any] = given if isinstance(given, (list, tuple)) else [given]
-    if isinstance(given, str) and ":" in given and not parameter.options:
-        values = _parse_range(where, given, is_angle)
+    values: Sequence[Any] = raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
+    if isinstance(raw_values, str) and ":" in raw_values and not parameter.options:
+        values = _parse_range(where, raw_values, is_angle)
     if not values:
         raise InputError(
             f"{where}: expected at least one value, got none; write "
@@ -348,15 +348,15 @@ def on_grid(
     """
     control_by_name = {control.name: control for control in controls}
     for instance in dict.fromkeys(axis.instance for axis in axes):
-        own_axes = [axis for axis in axes if axis.instance == instance]
+        instance_axes = [axis for axis in axes if axis.instance == instance]
         sampled = control_by_name.get(instance)
         if sampled is None:
-            control_type: Any = CONTROLS[own_axes[0].control]
+            control_type: Any = CONTROLS[instance_axes[0].control]
             settings = dict[str, object]()
         else:
             control_type = type(sampled)
             settings = _sampled_settings(sampled, scene)
-        for axis in own_axes:
+        for axis in instance_axes:
             settings[axis.parameter.name] = {"choices": list(axis.values)}
         control_by_name[instance] = control_type(name=instance, **settings)
     return tuple(control_by_name.values())
@@ -422,13 +422,13 @@ class Drawn:
         return sorted({bound for part in self.parts for bound in part})
 
 
-def parts_of_ranges(pictures: int) -> int:
+def parts_of_ranges(n_images: int) -> int:
     """Return into how many parts tables and figures cut the range of a parameter.
 
     Args:
-        pictures: images of the full sweep.
+        n_images: images of the full sweep.
     """
-    parts = math.isqrt(pictures // MIN_CELL_DRAWS)
+    parts = math.isqrt(n_images // MIN_CELL_DRAWS)
     return min(max(MIN_RANGE_PARTS, parts), MAX_RANGE_PARTS)
 
 

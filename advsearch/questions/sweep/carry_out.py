@@ -404,7 +404,7 @@ def sweep_from_config(
 
 def _add_adversarial_arm(
     config: SweepConfig,
-    places: Sequence[NamedScene],
+    named_scenes: Sequence[NamedScene],
     sampled: Sequence[Control],
     axes: Sequence[Axis],
 ) -> tuple[NamedScene, ...]:
@@ -414,7 +414,7 @@ def _add_adversarial_arm(
 
     Args:
         config: the settings.
-        places: the scenes.
+        named_scenes: the scenes.
         sampled: controls that are sampled.
         axes: of the grid.
 
@@ -422,7 +422,7 @@ def _add_adversarial_arm(
         InputError: the attack has no adversarial configuration, or what it sets varies.
     """
     if config.adversarial_of is None:
-        return tuple(places)
+        return tuple(named_scenes)
     directory = find_run(config.adversarial_of)
     summary = attack_of(directory)
     attack_config = AttackConfig.from_yaml(directory / CONFIG)
@@ -447,8 +447,8 @@ def _add_adversarial_arm(
     name = directory.resolve().name
     if name == CLEAN:
         name = f"{name}'s"
-    clean = [replace(place, held=held, beside_clean=CLEAN) for place in places]
-    adversarial = [replace(place, u=u, beside_clean=name) for place in clean]
+    clean = [replace(named_scene, held=held, beside_clean=CLEAN) for named_scene in named_scenes]
+    adversarial = [replace(named_scene, u=u, beside_clean=name) for named_scene in clean]
     return (*clean, *adversarial)
 
 
@@ -464,8 +464,8 @@ def _as_list(value: Any) -> list[Any]:
 
 def job_of(config: SweepConfig) -> Job:
     """Load everything that a configuration names."""
-    places = _places(config)
-    job = _make_job(config, places, config.models, config.task, config.controls)
+    named_scenes = _places(config)
+    job = _make_job(config, named_scenes, config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
 
 
@@ -487,7 +487,7 @@ def row_parameters(config: SweepConfig) -> set[str]:
 
 def _make_job(
     config: SweepConfig,
-    places: Sequence[NamedScene],
+    named_scenes: Sequence[NamedScene],
     models: Sequence[AnyModel],
     task: AnyTask,
     controls: Controls,
@@ -496,7 +496,7 @@ def _make_job(
 
     Args:
         config: the settings.
-        places: the clean scenes.
+        named_scenes: the clean scenes.
         models: names, files or modules.
         task: of all models.
         controls: which are sampled.
@@ -518,29 +518,29 @@ def _make_job(
             "chance; add `controls=pose`, say, or "
             "leave `samples` out"
         )
-    if not axes and not sampled and len(places) * len(models) == 1:
+    if not axes and not sampled and len(named_scenes) * len(models) == 1:
         raise InputError(
             "grid: expected something that varies, got nothing; add an axis such as "
             "`grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
         )
-    places = _add_adversarial_arm(config, places, sampled, axes)
-    check_scenes(places, sampled, axes)
-    axes = _with_camera_units(axes, places)
-    networks, tasks, warnings = _load_models_and_tasks(config, places, models, task)
-    warnings += _find_scene_notes(places, sampled, axes)
-    job = Job(config, places, networks, tasks, sampled, axes, aovs_of(config.aov))
-    for place in places:
-        warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
+    named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
+    check_scenes(named_scenes, sampled, axes)
+    axes = _with_camera_units(axes, named_scenes)
+    networks, tasks, warnings = _load_models_and_tasks(config, named_scenes, models, task)
+    warnings += _find_scene_notes(named_scenes, sampled, axes)
+    job = Job(config, named_scenes, networks, tasks, sampled, axes, aovs_of(config.aov))
+    for named_scene in named_scenes:
+        warnings += job.space(named_scene, job.sizes[0]).notes(named_scene.scene.description)
     return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _with_camera_units(
-    axes: Sequence[Axis], places: Sequence[NamedScene]
+    axes: Sequence[Axis], named_scenes: Sequence[NamedScene]
 ) -> tuple[Axis, ...]:
     """Return the axes, those of cameras in metres if all objects have a size."""
     are_sized = all(
-        place.scene.description.object.metres is not None for place in places
+        named_scene.scene.description.object.metres is not None for named_scene in named_scenes
     )
     return tuple(
         replace(axis, parameter=measured_in(axis.parameter, are_sized))
@@ -552,7 +552,7 @@ def _with_camera_units(
 
 def _load_models_and_tasks(
     config: SweepConfig,
-    places: Sequence[NamedScene],
+    named_scenes: Sequence[NamedScene],
     models: Sequence[AnyModel],
     task: AnyTask,
 ) -> tuple[tuple[Model, ...], tuple[Task, ...], list[str]]:
@@ -566,7 +566,7 @@ def _load_models_and_tasks(
     networks, warnings = load_models(models, shared_task, config)
     # A file or a function may return a model that has the name of another one.
     _check_different([network.name for network in networks])
-    scenes = [place.scene for place in places]
+    scenes = [named_scene.scene for named_scene in named_scenes]
     tasks = tuple(
         judging.calibrate_task(
             shared_task.on(network),
@@ -581,18 +581,18 @@ def _load_models_and_tasks(
     warnings += [remark for network_task in tasks for remark in network_task.remarks]
     if config.judge == ALL:
         tasks = tuple(map(each_thing, tasks))
-    labels = {place.object: place.scene.description.object.label for place in places}
+    labels = {named_scene.object: named_scene.scene.description.object.label for named_scene in named_scenes}
     warnings += judging.one_label_for_several(networks, config.label, labels)
     return networks, tasks, warnings
 
 
 def _find_scene_notes(
-    places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+    named_scenes: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
 ) -> list[str]:
     """Return the notes on the scenes, with the environments that controls choose."""
     notes = list[str]()
-    for place in places:
-        description = place.scene.description
+    for named_scene in named_scenes:
+        description = named_scene.scene.description
         for control in on_grid(controls, axes, description):
             if control.kind == ENVIRONMENT:
                 description = control.prepare(description)

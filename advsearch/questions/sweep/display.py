@@ -678,25 +678,25 @@ def rate_text(summary: SweepSummary) -> str:
     )
 
 
-def drive_title(one: DriveRates) -> str:
+def drive_title(rates: DriveRates) -> str:
     """Return how many drives there are, of how many frames, and the model."""
-    repeats = f", {one.repeats} times each with other noise" if one.repeats > 1 else ""
+    repeats = f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
     title = (
-        f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} "
-        f"s{repeats}, {one.model}"
+        f"{count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
+        f"s{repeats}, {rates.model}"
     )
-    return title if one.answer is None else f"{title}, with {one.answer}"
+    return title if rates.answer is None else f"{title}, with {rates.answer}"
 
 
-def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
+def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     """Return the rates over drives: name, mean, 95 % interval and worst drive."""
-    tracks = one.tracks
-    never = f", never in {one.never_seen}" if one.never_seen else ""
+    tracks = drive_rates.tracks
+    never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
     rates: list[tuple[str, OverDrives | None, str, str]] = [
-        ("frames in which it is right", one.right, " %", ""),
-        ("first right at a distance of", one.first_seen, f" {one.unit}", never),
-        ("longest gap", one.longest_gap, " s", ""),
-        ("changes a second", one.flicker, "", ""),
+        ("frames in which it is right", drive_rates.right, " %", ""),
+        ("first right at a distance of", drive_rates.first_seen, f" {drive_rates.unit}", never),
+        ("longest gap", drive_rates.longest_gap, " s", ""),
+        ("changes a second", drive_rates.flicker, "", ""),
     ]
     if tracks is not None:
         rates += [
@@ -894,21 +894,21 @@ def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
     return tuple(counts.get(Outcome.LOOSE.value, 0) for counts in outcomes)
 
 
-def distance_sentence(found: SeenFrom) -> str:
+def distance_sentence(estimate: SeenFrom) -> str:
     """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
 
     Dips, which contradict it, and loose boxes follow.
     """
-    unit = "m" if found.unit == "metres" else found.unit
-    distance = None if found.distance is None else f"{found.distance:.3g}"
-    interval = _interval_clause(found, unit)
-    dips = _dips_sentences(found, unit)
-    loose = _loose_sentence(found, unit)
-    farthest = f"{found.distances[-1]:.3g} {unit}"
-    if not found.is_monotone:
+    unit = "m" if estimate.unit == "metres" else estimate.unit
+    distance = None if estimate.distance is None else f"{estimate.distance:.3g}"
+    interval = _interval_clause(estimate, unit)
+    dips = _dips_sentences(estimate, unit)
+    loose = _loose_sentence(estimate, unit)
+    farthest = f"{estimate.distances[-1]:.3g} {unit}"
+    if not estimate.is_monotone:
         if distance is not None:
             beyond = f"Beyond that the share falls below a half at {distance} {unit}"
-        elif found.everywhere:
+        elif estimate.everywhere:
             beyond = (
                 "Beyond that it is right in at least half of the pictures, up to "
                 f"{farthest}"
@@ -918,23 +918,23 @@ def distance_sentence(found: SeenFrom) -> str:
         return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
     if distance is not None:
         sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
-    elif found.everywhere:
+    elif estimate.everywhere:
         sentence = (
             "Seen in at least half of the pictures up to the farthest distance, "
             f"{farthest}; {interval}."
         )
     else:
         sentence = (
-            f"Not seen in half of the pictures, even from {found.distances[0]:.3g} "
+            f"Not seen in half of the pictures, even from {estimate.distances[0]:.3g} "
             f"{unit}; {interval}."
         )
     return " ".join(filter(None, [sentence, *dips, loose]))
 
 
-def _interval_clause(found: SeenFrom, unit: str) -> str:
+def _interval_clause(estimate: SeenFrom, unit: str) -> str:
     """Return the interval of the detection distance."""
-    low = None if found.low is None else f"{found.low:.3g}"
-    high = None if found.high is None else f"{found.high:.3g}"
+    low = None if estimate.low is None else f"{estimate.low:.3g}"
+    high = None if estimate.high is None else f"{estimate.high:.3g}"
     if low and high:
         bounds = f"{low} to {high} {unit}"
     elif low:
@@ -944,24 +944,24 @@ def _interval_clause(found: SeenFrom, unit: str) -> str:
     else:
         bounds = "no bound"
     clause = f"{bounds} with 95 % confidence"
-    if found.lacking is not None:
-        clause += f" (that takes at least {found.lacking} pictures at each distance)"
+    if estimate.lacking is not None:
+        clause += f" (that takes at least {estimate.lacking} pictures at each distance)"
     return clause
 
 
-def _dips_sentences(found: SeenFrom, unit: str) -> list[str]:
+def _dips_sentences(estimate: SeenFrom, unit: str) -> list[str]:
     """Return where an object is detected less often than beyond.
 
     All dips that are not chance, or else the deepest of those that may be.
     """
-    proven = [dip for dip in found.dips if dip.is_shown]
+    proven = [dip for dip in estimate.dips if dip.is_shown]
     if proven:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in proven)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    until = found.distances[-1] if found.everywhere else found.distance or 0.0
+    until = estimate.distances[-1] if estimate.everywhere else estimate.distance or 0.0
     below_half = [
         dip
-        for dip in found.dips
+        for dip in estimate.dips
         if dip.seen[0] < HALF * dip.seen[1]
         # a rise beyond the estimate counts too
         and (dip.distance < until or dip.beyond[0] >= HALF * dip.beyond[1])
@@ -980,17 +980,17 @@ def _dip_clause(dip: Dip, unit: str) -> str:
     return f"{at_dip}, {beyond} (p = {dip.p:.2g})"
 
 
-def _loose_sentence(found: SeenFrom, unit: str) -> str:
+def _loose_sentence(estimate: SeenFrom, unit: str) -> str:
     """Return in how many images a loose box is on the object, by distance.
 
     Empty if there is none.
     """
-    if not sum(found.loose):
+    if not sum(estimate.loose):
         return ""
     clauses = [
         f"{n_loose} of {n_images} at {distance:.3g} {unit}"
         for distance, n_loose, n_images in zip(
-            found.distances, found.loose, found.counts, strict=True
+            estimate.distances, estimate.loose, estimate.counts, strict=True
         )
         if n_loose
     ]
@@ -1000,11 +1000,11 @@ def _loose_sentence(found: SeenFrom, unit: str) -> str:
     )
 
 
-def distance_axes(found: SeenFrom, axes: Any) -> None:
+def distance_axes(estimate: SeenFrom, axes: Any) -> None:
     """Draw the fraction of detections over the distance on matplotlib axes."""
-    low, high = zip(*found.intervals, strict=True)
+    low, high = zip(*estimate.intervals, strict=True)
     axes.fill_between(
-        found.distances,
+        estimate.distances,
         low,
         high,
         color=BLUE,
@@ -1012,16 +1012,16 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
         linewidth=0,
         label="95 % interval",
     )
-    axes.plot(found.distances, found.shares, color=BLUE, marker="o", label="seen in")
-    if any(found.loose):
+    axes.plot(estimate.distances, estimate.shares, color=BLUE, marker="o", label="seen in")
+    if any(estimate.loose):
         with_loose = [
             fraction + n_loose / n_images
             for fraction, n_loose, n_images in zip(
-                found.shares, found.loose, found.counts, strict=True
+                estimate.shares, estimate.loose, estimate.counts, strict=True
             )
         ]
         axes.plot(
-            found.distances,
+            estimate.distances,
             with_loose,
             color=GREY,
             marker=".",
@@ -1029,10 +1029,10 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
             label="or in a loose box",
         )
     axes.axhline(HALF, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
-    if found.distance is not None:
-        axes.axvline(found.distance, color=GREY, linewidth=1)
+    if estimate.distance is not None:
+        axes.axvline(estimate.distance, color=GREY, linewidth=1)
     axes.set(
-        xlabel=f"distance ({found.unit})",
+        xlabel=f"distance ({estimate.unit})",
         ylabel="share of pictures",
         ylim=(-0.02, 1.02),
     )

@@ -48,7 +48,7 @@ Flags = npt.NDArray[np.int8]
 
 
 def with_frames(
-    config: SweepConfig, drawn: tuple[Control, ...]
+    config: SweepConfig, sampled: tuple[Control, ...]
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
 
@@ -57,12 +57,12 @@ def with_frames(
 
     Args:
         config: with a `path`.
-        drawn: the controls that are sampled.
+        sampled: the controls that are sampled.
     """
-    travelling: Any = next((control for control in drawn if control.travels), None)
+    travelling: Any = next((control for control in sampled if control.travels), None)
     if travelling is None:
         (travelling,) = given_to(config, {"path": {}})
-        drawn = (*drawn, travelling)
+        sampled = (*sampled, travelling)
     time_name = f"{travelling.name}.time"
     path_name = f"{travelling.name}.{Control.WAY}"
     seconds = travelling.seconds
@@ -82,7 +82,7 @@ def with_frames(
     if paths and config.samples is None and is_path_free:
         # Nothing is sampled, so every path is swept.
         grid = {path_name: list(paths), **grid}
-    return drawn, grid
+    return sampled, grid
 
 
 def time_axis(axes: Sequence[Axis]) -> int | None:
@@ -222,10 +222,10 @@ class Drives:
         """Return the names of the right classes by scene and model, of detectors."""
         job = self._job
         right_names: dict[tuple[int, int], Collection[str]] = {}
-        for scene, place in enumerate(job.places):
+        for scene, named_scene in enumerate(job.places):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.right_classes(job.facts(place, {}))
+                    classes = task.right_classes(job.facts(named_scene, {}))
                     right_names[scene, model] = task.names(classes)
         return right_names
 
@@ -247,12 +247,12 @@ class Drives:
         without a complete drive are left out.
         """
         rates = list[DriveRates]()
-        places = self._job.places
-        for answer in dict.fromkeys(place.beside_clean for place in places):
+        named_scenes = self._job.places
+        for answer in dict.fromkeys(named_scene.beside_clean for named_scene in named_scenes):
             scenes = [
                 scene
-                for scene, place in enumerate(places)
-                if place.beside_clean == answer
+                for scene, named_scene in enumerate(named_scenes)
+                if named_scene.beside_clean == answer
             ]
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
@@ -286,7 +286,7 @@ class Drives:
             repeats=math.ceil(n_rows / n_drives),
             frames=n_frames,
             seconds=seconds,
-            right=over_drives(right_fraction, min, drive=drive),
+            right=over_drives(right_fraction, min, drive_of_value=drive),
             longest_gap=over_drives(
                 longest_gap, max, (0.0, n_frames * self._frame_interval), drive
             ),
@@ -377,8 +377,8 @@ class Drives:
         seconds_bounds = (0.0, n_frames * self._frame_interval)
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
-            lost=over_drives(lost, max, drive=drive),
-            loose=over_drives(lost - lost_loosely, max, drive=drive),
+            lost=over_drives(lost, max, drive_of_value=drive),
+            loose=over_drives(lost - lost_loosely, max, drive_of_value=drive),
             switches=over_drives(switches, max, (0.0, n_frames - 1.0), drive),
             longest_gap=over_drives(
                 longest_gap * self._frame_interval, max, seconds_bounds, drive
@@ -430,8 +430,8 @@ def _finite_or_none(value: float) -> float | None:
 def over_drives(
     values: npt.NDArray[np.float64],
     worst: Callable[[list[float]], float],
-    ends: tuple[float, float] | None = (0.0, 1.0),
-    drive: npt.NDArray[np.int64] | None = None,
+    bounds: tuple[float, float] | None = (0.0, 1.0),
+    drive_of_value: npt.NDArray[np.int64] | None = None,
 ) -> OverDrives:
     """Compute the mean of a value over drives, its 95 % interval, and the worst value.
 
@@ -440,15 +440,15 @@ def over_drives(
     Args:
         values: (n,).
         worst: selects the worst of them: `min` or `max`.
-        ends: bounds of the values whatever a model predicts, from the plan.
-        drive: (n,) the drive of each value; values of one differ in noise alone, so
+        bounds: bounds of the values whatever a model predicts, from the plan.
+        drive_of_value: (n,) the drive of each value; values of one differ in noise alone, so
             that their mean is the drive's. None: each has a drive of its own.
     """
     means = values
-    if drive is not None:
-        means = per_unit(values, drive) / per_unit(np.ones(len(values)), drive)
+    if drive_of_value is not None:
+        means = per_unit(values, drive_of_value) / per_unit(np.ones(len(values)), drive_of_value)
     interval = None
-    if ends is not None and len(means) > 1:
-        interval = mean_interval(means, *ends)
+    if bounds is not None and len(means) > 1:
+        interval = mean_interval(means, *bounds)
     worst_value = worst(values.tolist())
     return OverDrives(mean=float(means.mean()), interval=interval, worst=worst_value)

@@ -153,10 +153,10 @@ class Job:
         """
         if scene not in self._points_by_scene:
             self._points_by_scene.clear()
-            place = self.places[scene]
+            named_scene = self.places[scene]
             sizes = dict.fromkeys(self.sizes)
             self._points_by_scene[scene] = {
-                size: self.points(self.space(place, size)) for size in sizes
+                size: self.points(self.space(named_scene, size)) for size in sizes
             }
         return self._points_by_scene[scene]
 
@@ -217,9 +217,9 @@ class Job:
             environment: what lights the scene instead of its own environment.
             values: of the controls.
         """
-        place = self.places[scene]
-        held_names = {control.name for control in place.held}
-        names = place.names
+        named_scene = self.places[scene]
+        held_names = {control.name for control in named_scene.held}
+        names = named_scene.names
         if environment is not None:
             names["environment"] = environment
         names["model"] = self.models[model].name
@@ -232,36 +232,36 @@ class Job:
                 row_values[name] = value
         return row_values
 
-    def space(self, place: NamedScene, size: ImageSize) -> Space:
+    def space(self, named_scene: NamedScene, size: ImageSize) -> Space:
         """Bind the controls, those of the grid as choices, to a scene.
 
         Args:
-            place: the scene.
+            named_scene: the scene.
             size: (height, width) of the images.
 
         Raises:
             InputError: the adversarial configuration does not fit the scene, or a
                 sampled parameter was set.
         """
-        description = framed(place.scene.description, size)
-        controls = (*place.held, *on_grid(self.controls, self.axes, description))
+        description = framed(named_scene.scene.description, size)
+        controls = (*named_scene.held, *on_grid(self.controls, self.axes, description))
         if not controls:
             return Space((), None)
         space = make_space(controls, description)
-        if place.held:
-            held_controls = space.controls[: len(place.held)]
+        if named_scene.held:
+            held_controls = space.controls[: len(named_scene.held)]
             start = torch.cat([control.start for control in held_controls])
-            if place.u is not None and len(place.u) != len(start):
+            if named_scene.u is not None and len(named_scene.u) != len(start):
                 raise InputError(
                     "adversarial_of: the adversarial configuration of "
-                    f"{place.beside_clean} has {len(place.u)} "
-                    f"numbers, and {place.object} takes {len(start)}: it is another "
+                    f"{named_scene.beside_clean} has {len(named_scene.u)} "
+                    f"numbers, and {named_scene.object} takes {len(start)}: it is another "
                     "object, or it has changed since; "
                     "do the run again"
                 )
-            space = space.holding(start if place.u is None else place.u)
+            space = space.holding(start if named_scene.u is None else named_scene.u)
         for group in space.groups:
-            if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            if group.setting in named_scene.scene.description.given - {ENVIRONMENT}:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
                     f"and `set` {group.setting} fixes "
@@ -286,11 +286,11 @@ class Job:
             len(self.places),
         )
 
-    def facts(self, place: NamedScene, values: Mapping[str, Value]) -> Facts:
+    def facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
         """Return what a task needs to know of a scene whose controls have `values`."""
         return facts_about(
-            place.scene.description,
-            place.object,
+            named_scene.scene.description,
+            named_scene.object,
             self.config.label,
             lambda: values,
             judge=self.config.judge,
@@ -298,7 +298,7 @@ class Job:
 
 
 def check_scenes(
-    places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+    named_scenes: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
 ) -> None:
     """Check that nothing that the scenes fix is varied too.
 
@@ -307,7 +307,7 @@ def check_scenes(
             environment beside several environments.
     """
     fixed_settings = {
-        name for place in places for name in place.scene.description.given
+        name for named_scene in named_scenes for name in named_scene.scene.description.given
     }
     environment_choices = list[str]()
     for axis in axes:
@@ -324,7 +324,7 @@ def check_scenes(
             is_varied = parameter.name in control.settings()
             if control.setting(parameter) == ENVIRONMENT and is_varied:
                 environment_choices.append(f"`controls` {control.name}")
-    environments = list(dict.fromkeys(place.environment for place in places))
+    environments = list(dict.fromkeys(named_scene.environment for named_scene in named_scenes))
     if len(environments) > 1 and environment_choices:
         raise InputError(
             f"`environment={','.join(environments)}` and {environment_choices[0]} both "
@@ -355,16 +355,16 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
         InputError: controls sample other numbers in one scene than in another.
     """
     points_of_scene = list[tuple[NamedScene, Points]]()
-    for scene, place in enumerate(job.places):
-        points_of_scene += [(place, points) for points in job.bound(scene).values()]
-        facts = job.facts(place, {})
+    for scene, named_scene in enumerate(job.places):
+        points_of_scene += [(named_scene, points) for points in job.bound(scene).values()]
+        facts = job.facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(task, model, place.scene, facts, job.config.image_settings)
+            check_truth(task, model, named_scene.scene, facts, job.config.image_settings)
     first_points = points_of_scene[0][1]
-    for place, points in points_of_scene:
+    for named_scene, points in points_of_scene:
         if points.drawn_numbers != first_points.drawn_numbers:
             raise InputError(
-                f"`object` {place.object}: its controls draw other numbers than those "
+                f"`object` {named_scene.object}: its controls draw other numbers than those "
                 f"of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
@@ -396,7 +396,7 @@ class SweptScene:
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        place = job.places[number]
+        named_scene = job.places[number]
         config = job.config
         self.number = number
         self.job = job
@@ -406,8 +406,8 @@ class SweptScene:
         self.renderers = {size: self._make_renderer(size) for size in self.points}
         facts = partial(
             facts_about,
-            place.scene.description,
-            place.object,
+            named_scene.scene.description,
+            named_scene.object,
             config.label,
             judge=config.judge,
         )

@@ -356,7 +356,7 @@ class Sweep:
         scene, image_in_scene = np.divmod(image, self.per_scene)
         axes = list[SweptAxis]()
         for name in ("object", "environment", "answer"):
-            scene_values = [place.names.get(name, "") for place in job.places]
+            scene_values = [named_scene.names.get(name, "") for named_scene in job.places]
             values = list(dict.fromkeys(scene_values))
             index_of_scene = np.array([values.index(value) for value in scene_values])
             axes.append(SweptAxis(name, "", values, index_of_scene[scene]))
@@ -538,9 +538,9 @@ class Sweep:
         renderer = next(iter(self._scenes.scene.renderers.values()))
         formation = Formation.of(renderer.formation)
         if len(self.job.places) <= MAX_LISTED_GAINS:
-            for place in self.job.places:
-                description = framed(place.scene.description, self.job.sizes[0])
-                gains[f"{place.object}, {place.environment}"] = description.gain
+            for named_scene in self.job.places:
+                description = framed(named_scene.scene.description, self.job.sizes[0])
+                gains[f"{named_scene.object}, {named_scene.environment}"] = description.gain
         if len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains

@@ -117,14 +117,14 @@ class Groups:
         digits = self._all_axes.digits(number)
         return self._between.index(self._select(digits, False))
 
-    def member(self, number: int, place: int) -> int:
+    def member(self, number: int, index: int) -> int:
         """Return the number of another image of the group of an image.
 
         Args:
             number: of the image.
-            place: index of the other one in the group.
+            index: index of the other one in the group.
         """
-        within_digits = iter(self._within.digits(place))
+        within_digits = iter(self._within.digits(index))
         digits = self._all_axes.digits(number)
         return self._all_axes.index(
             [
@@ -411,18 +411,18 @@ class PredictedSweep:
             self.points.units.frames,
         )
 
-    def pictures(self, asked: Mapping[int, Query]) -> dict[int, SweptPicture]:
+    def pictures(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptPicture]:
         """Render or predict images.
 
         Args:
-            asked: the queries by the number of the image in the scene.
+            query_of_image: the queries by the number of the image in the scene.
 
         Returns:
             The images by their numbers.
         """
         images: dict[int, SweptPicture] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
-        for number, query in asked.items():
+        for number, query in query_of_image.items():
             predictor = None
             if self.refusal is None:
                 group = self._groups.group(number)
@@ -434,7 +434,7 @@ class PredictedSweep:
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            predicted = predictor.pictures([asked[number].u for number in numbers])
+            predicted = predictor.pictures([query_of_image[number].u for number in numbers])
             for number, image in zip(numbers, predicted, strict=True):
                 n_traced = self._count_traced(number)
                 images[number] = SweptPicture(image, self.method.samples, n_traced)
@@ -549,14 +549,14 @@ class PredictedSweep:
         )
 
 
-def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
+def combined(all_summaries: Sequence[LinearTransport | None]) -> LinearTransport | None:
     """Combine what predicted the images of several scenes.
 
     Returns:
         The worst error, the largest memory, and all seconds; None if nothing moves in
         any scene.
     """
-    summaries = [summary for summary in found if summary is not None]
+    summaries = [summary for summary in all_summaries if summary is not None]
     used = [summary for summary in summaries if summary.used]
     if not used:
         return summaries[-1] if summaries else None

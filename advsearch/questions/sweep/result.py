@@ -102,7 +102,7 @@ def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
 
 
 def rate(
-    correct: int, seen: int, interval: tuple[float, float] | None = None
+    correct: int, n_predictions: int, interval: tuple[float, float] | None = None
 ) -> CountedPredictions:
     """Return the accuracy of independent predictions with its 95 % interval.
 
@@ -110,18 +110,18 @@ def rate(
 
     Args:
         correct: right predictions.
-        seen: predictions.
+        n_predictions: predictions.
         interval: by default that of Clopper and Pearson.
     """
-    if not seen:
+    if not n_predictions:
         return CountedPredictions(
-            configurations=seen, correct=correct, accuracy=None, interval=None
+            configurations=n_predictions, correct=correct, accuracy=None, interval=None
         )
     return CountedPredictions(
-        configurations=seen,
+        configurations=n_predictions,
         correct=correct,
-        accuracy=correct / seen,
-        interval=interval or clopper_pearson(correct, seen),
+        accuracy=correct / n_predictions,
+        interval=interval or clopper_pearson(correct, n_predictions),
     )
 
 
@@ -136,29 +136,29 @@ class Predictions:
         outcome: (n,) of a detector, indices among `OUTCOMES`.
     """
 
-    def __init__(self, total: int) -> None:
-        self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self.right: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self.hidden: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self._wrong: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self.margin = np.full(total, np.nan)
-        self.outcome = np.full(total, UNKNOWN_OUTCOME, np.uint8)
-        self._label_index = np.zeros(total, np.uint32)
+    def __init__(self, n_rows: int) -> None:
+        self.seen: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.margin = np.full(n_rows, np.nan)
+        self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
+        self._label_index = np.zeros(n_rows, np.uint32)
         self._index_by_label = dict[str, int]()
 
-    def add(self, number: int, said: Judgement) -> None:
+    def add(self, row: int, judgement: Judgement) -> None:
         """Add the judgement of a row; one that was there before is replaced."""
-        label = said.prediction.label
-        self.seen[number] = True
-        self.right[number] = said.right
-        self._wrong[number] = said.success
-        self.margin[number] = said.margin
-        self.hidden[number] = label == OUT_OF_VIEW
-        outcome = get_outcome(said.payload)
+        label = judgement.prediction.label
+        self.seen[row] = True
+        self.right[row] = judgement.right
+        self._wrong[row] = judgement.success
+        self.margin[row] = judgement.margin
+        self.hidden[row] = label == OUT_OF_VIEW
+        outcome = get_outcome(judgement.payload)
         if outcome is not None:
-            self.outcome[number] = OUTCOMES.index(outcome)
+            self.outcome[row] = OUTCOMES.index(outcome)
         n_labels = len(self._index_by_label)
-        self._label_index[number] = self._index_by_label.setdefault(label, n_labels)
+        self._label_index[row] = self._index_by_label.setdefault(label, n_labels)
 
     @property
     def counted(self) -> npt.NDArray[np.bool_]:

@@ -328,17 +328,17 @@ class SurfaceCounts:
         self, part: int, tally: PartCounts, compared: pd.DataFrame
     ) -> SurfacePart:
         """Return the counts and the comparison of one part, as the summary has them."""
-        n_seen = int(tally.seen[part])
-        n_seen_wrong = int(tally.wrong[part])
-        n_hidden = tally.pictures - n_seen
-        n_hidden_wrong = tally.failures - n_seen_wrong
+        n_visible = int(tally.seen[part])
+        n_visible_wrong = int(tally.wrong[part])
+        n_hidden = tally.pictures - n_visible
+        n_hidden_wrong = tally.failures - n_visible_wrong
         u, v = self.parts.at[part].tolist()
         return SurfacePart(
             face=int(self.parts.face[part]),
             u=u,
             v=v,
             place=self.parts.place[part].tolist(),
-            seen=rate(n_seen - n_seen_wrong, n_seen),
+            seen=rate(n_visible - n_visible_wrong, n_visible),
             hidden=rate(n_hidden - n_hidden_wrong, n_hidden),
             difference=float(compared.difference[part]),
             interval=(float(compared.low[part]), float(compared.high[part])),
@@ -364,7 +364,7 @@ def map_surface(
     """
     job = scenes.job
     wrong = _read_wrong(scenes, rows)
-    assets = {place.object: place.scene.description.object for place in job.places}
+    assets = {named_scene.object: named_scene.scene.description.object for named_scene in job.places}
     counts = _make_counts(scenes, assets, wrong)
     for scene, wrong_in_scene in enumerate(wrong):
         scene_counts = counts[job.places[scene].object]
@@ -404,7 +404,7 @@ def _make_counts(
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
-        has_object = [place.object == name for place in job.places]
+        has_object = [named_scene.object == name for named_scene in job.places]
         part_counts = list[PartCounts]()
         for model in range(n_models):
             stream = object_index * n_models + model
