@@ -384,7 +384,9 @@ def write_pictures(
     """
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
-    difference = files.difference(scene_images["clean"].picture, scene_images["adversarial"].picture)
+    difference = files.difference(
+        scene_images["clean"].picture, scene_images["adversarial"].picture
+    )
     run.save_image("difference", difference)
     verification = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"

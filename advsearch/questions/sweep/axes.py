@@ -209,7 +209,9 @@ def _check_scalar(
         )
 
 
-def axis_values(where: str, parameter: Parameter, raw_values: Any) -> tuple[Number, ...]:
+def axis_values(
+    where: str, parameter: Parameter, raw_values: Any
+) -> tuple[Number, ...]:
     """Parse and check the values of an axis.
 
     ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
@@ -225,7 +227,9 @@ def axis_values(where: str, parameter: Parameter, raw_values: Any) -> tuple[Numb
         InputError: they are no values of the parameter, or not different.
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
-    values: Sequence[Any] = raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
+    values: Sequence[Any] = (
+        raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
+    )
     if isinstance(raw_values, str) and ":" in raw_values and not parameter.options:
         values = _parse_range(where, raw_values, is_angle)
     if not values:

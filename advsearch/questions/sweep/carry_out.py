@@ -447,8 +447,13 @@ def _add_adversarial_arm(
     name = directory.resolve().name
     if name == CLEAN:
         name = f"{name}'s"
-    clean = [replace(named_scene, held=held, beside_clean=CLEAN) for named_scene in named_scenes]
-    adversarial = [replace(named_scene, u=u, beside_clean=name) for named_scene in clean]
+    clean = [
+        replace(named_scene, held=held, beside_clean=CLEAN)
+        for named_scene in named_scenes
+    ]
+    adversarial = [
+        replace(named_scene, u=u, beside_clean=name) for named_scene in clean
+    ]
     return (*clean, *adversarial)
 
 
@@ -527,11 +532,15 @@ def _make_job(
     named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
     check_scenes(named_scenes, sampled, axes)
     axes = _with_camera_units(axes, named_scenes)
-    networks, tasks, warnings = _load_models_and_tasks(config, named_scenes, models, task)
+    networks, tasks, warnings = _load_models_and_tasks(
+        config, named_scenes, models, task
+    )
     warnings += _find_scene_notes(named_scenes, sampled, axes)
     job = Job(config, named_scenes, networks, tasks, sampled, axes, aovs_of(config.aov))
     for named_scene in named_scenes:
-        warnings += job.space(named_scene, job.sizes[0]).notes(named_scene.scene.description)
+        warnings += job.space(named_scene, job.sizes[0]).notes(
+            named_scene.scene.description
+        )
     return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
@@ -540,7 +549,8 @@ def _with_camera_units(
 ) -> tuple[Axis, ...]:
     """Return the axes, those of cameras in metres if all objects have a size."""
     are_sized = all(
-        named_scene.scene.description.object.metres is not None for named_scene in named_scenes
+        named_scene.scene.description.object.metres is not None
+        for named_scene in named_scenes
     )
     return tuple(
         replace(axis, parameter=measured_in(axis.parameter, are_sized))
@@ -581,13 +591,18 @@ def _load_models_and_tasks(
     warnings += [remark for network_task in tasks for remark in network_task.remarks]
     if config.judge == ALL:
         tasks = tuple(map(each_thing, tasks))
-    labels = {named_scene.object: named_scene.scene.description.object.label for named_scene in named_scenes}
+    labels = {
+        named_scene.object: named_scene.scene.description.object.label
+        for named_scene in named_scenes
+    }
     warnings += judging.one_label_for_several(networks, config.label, labels)
     return networks, tasks, warnings
 
 
 def _find_scene_notes(
-    named_scenes: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
 ) -> list[str]:
     """Return the notes on the scenes, with the environments that controls choose."""
     notes = list[str]()

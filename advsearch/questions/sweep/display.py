@@ -680,7 +680,9 @@ def rate_text(summary: SweepSummary) -> str:
 
 def drive_title(rates: DriveRates) -> str:
     """Return how many drives there are, of how many frames, and the model."""
-    repeats = f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
+    repeats = (
+        f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
+    )
     title = (
         f"{count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
         f"s{repeats}, {rates.model}"
@@ -694,7 +696,12 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, " %", ""),
-        ("first right at a distance of", drive_rates.first_seen, f" {drive_rates.unit}", never),
+        (
+            "first right at a distance of",
+            drive_rates.first_seen,
+            f" {drive_rates.unit}",
+            never,
+        ),
         ("longest gap", drive_rates.longest_gap, " s", ""),
         ("changes a second", drive_rates.flicker, "", ""),
     ]
@@ -1012,7 +1019,9 @@ def distance_axes(estimate: SeenFrom, axes: Any) -> None:
         linewidth=0,
         label="95 % interval",
     )
-    axes.plot(estimate.distances, estimate.shares, color=BLUE, marker="o", label="seen in")
+    axes.plot(
+        estimate.distances, estimate.shares, color=BLUE, marker="o", label="seen in"
+    )
     if any(estimate.loose):
         with_loose = [
             fraction + n_loose / n_images

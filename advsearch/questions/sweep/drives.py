@@ -248,7 +248,9 @@ class Drives:
         """
         rates = list[DriveRates]()
         named_scenes = self._job.places
-        for answer in dict.fromkeys(named_scene.beside_clean for named_scene in named_scenes):
+        for answer in dict.fromkeys(
+            named_scene.beside_clean for named_scene in named_scenes
+        ):
             scenes = [
                 scene
                 for scene, named_scene in enumerate(named_scenes)
@@ -446,7 +448,9 @@ def over_drives(
     """
     means = values
     if drive_of_value is not None:
-        means = per_unit(values, drive_of_value) / per_unit(np.ones(len(values)), drive_of_value)
+        means = per_unit(values, drive_of_value) / per_unit(
+            np.ones(len(values)), drive_of_value
+        )
     interval = None
     if bounds is not None and len(means) > 1:
         interval = mean_interval(means, *bounds)

@@ -298,7 +298,9 @@ class Job:
 
 
 def check_scenes(
-    named_scenes: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
 ) -> None:
     """Check that nothing that the scenes fix is varied too.
 
@@ -307,7 +309,9 @@ def check_scenes(
             environment beside several environments.
     """
     fixed_settings = {
-        name for named_scene in named_scenes for name in named_scene.scene.description.given
+        name
+        for named_scene in named_scenes
+        for name in named_scene.scene.description.given
     }
     environment_choices = list[str]()
     for axis in axes:
@@ -324,7 +328,9 @@ def check_scenes(
             is_varied = parameter.name in control.settings()
             if control.setting(parameter) == ENVIRONMENT and is_varied:
                 environment_choices.append(f"`controls` {control.name}")
-    environments = list(dict.fromkeys(named_scene.environment for named_scene in named_scenes))
+    environments = list(
+        dict.fromkeys(named_scene.environment for named_scene in named_scenes)
+    )
     if len(environments) > 1 and environment_choices:
         raise InputError(
             f"`environment={','.join(environments)}` and {environment_choices[0]} both "
@@ -356,10 +362,14 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     """
     points_of_scene = list[tuple[NamedScene, Points]]()
     for scene, named_scene in enumerate(job.places):
-        points_of_scene += [(named_scene, points) for points in job.bound(scene).values()]
+        points_of_scene += [
+            (named_scene, points) for points in job.bound(scene).values()
+        ]
         facts = job.facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(task, model, named_scene.scene, facts, job.config.image_settings)
+            check_truth(
+                task, model, named_scene.scene, facts, job.config.image_settings
+            )
     first_points = points_of_scene[0][1]
     for named_scene, points in points_of_scene:
         if points.drawn_numbers != first_points.drawn_numbers:

@@ -356,7 +356,9 @@ class Sweep:
         scene, image_in_scene = np.divmod(image, self.per_scene)
         axes = list[SweptAxis]()
         for name in ("object", "environment", "answer"):
-            scene_values = [named_scene.names.get(name, "") for named_scene in job.places]
+            scene_values = [
+                named_scene.names.get(name, "") for named_scene in job.places
+            ]
             values = list(dict.fromkeys(scene_values))
             index_of_scene = np.array([values.index(value) for value in scene_values])
             axes.append(SweptAxis(name, "", values, index_of_scene[scene]))
@@ -540,7 +542,9 @@ class Sweep:
         if len(self.job.places) <= MAX_LISTED_GAINS:
             for named_scene in self.job.places:
                 description = framed(named_scene.scene.description, self.job.sizes[0])
-                gains[f"{named_scene.object}, {named_scene.environment}"] = description.gain
+                gains[f"{named_scene.object}, {named_scene.environment}"] = (
+                    description.gain
+                )
         if len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains

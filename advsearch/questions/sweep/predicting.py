@@ -434,7 +434,9 @@ class PredictedSweep:
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            predicted = predictor.pictures([query_of_image[number].u for number in numbers])
+            predicted = predictor.pictures(
+                [query_of_image[number].u for number in numbers]
+            )
             for number, image in zip(numbers, predicted, strict=True):
                 n_traced = self._count_traced(number)
                 images[number] = SweptPicture(image, self.method.samples, n_traced)

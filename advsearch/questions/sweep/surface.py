@@ -364,7 +364,10 @@ def map_surface(
     """
     job = scenes.job
     wrong = _read_wrong(scenes, rows)
-    assets = {named_scene.object: named_scene.scene.description.object for named_scene in job.places}
+    assets = {
+        named_scene.object: named_scene.scene.description.object
+        for named_scene in job.places
+    }
     counts = _make_counts(scenes, assets, wrong)
     for scene, wrong_in_scene in enumerate(wrong):
         scene_counts = counts[job.places[scene].object]
