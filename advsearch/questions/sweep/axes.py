@@ -725,25 +725,27 @@ class Points:
         coordinates = u.split(self.space.sizes, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
             if _is_described_by_base(control):
-                for name, unit, column in self._describe_columns(
-                    control, control_u, indices
-                ):
-                    for row, value in zip(rows, column, strict=True):
+                columns = self._describe_columns(control, control_u, indices)
+                for name, unit, values in columns:
+                    for row, value in zip(rows, values, strict=True):
                         row[name] = {"value": value, "unit": unit}
                 continue
-            axes = [
-                (axis_index, axis)
-                for axis_index, axis in self._axes.values()
-                if axis.instance == control.name
-            ]
             for image, row in enumerate(rows):
-                axis_points = [
-                    (axis, int(indices[index][image])) for index, axis in axes
-                ]
+                axis_points = self._find_axis_points(control, indices, image)
                 row |= self._describe_control(
                     control, u[image], control_u[image], axis_points
                 )
         return rows
+
+    def _find_axis_points(
+        self, control: Control, indices: Sequence[NDArray[np.intp]], image: int
+    ) -> list[tuple[Axis, int]]:
+        """Return the axes of a control, with the index of the value in an image."""
+        return [
+            (axis, int(indices[axis_index][image]))
+            for axis_index, axis in self._axes.values()
+            if axis.instance == control.name
+        ]
 
     def _describe_control(
         self,
@@ -805,16 +807,19 @@ class Points:
             unit = _stored_unit(parameter)
             for component, column in enumerate(columns):
                 if isinstance(spec, OneOf):
-                    count = len(spec.values)
-                    values = [
-                        spec.values[min(count - 1, int(share * count))]
-                        for share in column.tolist()
-                    ]
-                    yield name, unit, values
-                else:
-                    suffix = f".{component}" if parameter.shape else ""
-                    values = spec.at(column, log=parameter.log).tolist()
-                    yield name + suffix, unit, values
+                    yield name, unit, _select_options(spec, column)
+                    continue
+                suffix = f".{component}" if parameter.shape else ""
+                yield name + suffix, unit, spec.at(column, log=parameter.log).tolist()
+
+
+def _select_options(spec: OneOf, column: Tensor) -> list[Any]:
+    """Return the options that coordinates (n,) in [0, 1] stand for."""
+    count = len(spec.values)
+    return [
+        spec.values[min(count - 1, int(coordinate * count))]
+        for coordinate in column.tolist()
+    ]
 
 
 def _is_described_by_base(control: Control) -> bool:

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advsearch.errors import InputError
 from advsearch.options import Outcome
@@ -840,8 +841,6 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     Raises:
         InputError: there are fewer than two distances.
     """
-    from scipy.special import bdtr, bdtrc  # takes a tenth of a second
-
     if len(rows) < 2:
         raise InputError(
             "detection distance: expected at least two distances, got "
@@ -849,41 +848,70 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
         )
     rows = sorted(rows, key=_center_distance)
     distances = tuple(_center_distance(row) for row in rows)
-    distance = np.array(distances)
     k = np.array([row.correct for row in rows])
     n = np.array([row.configurations for row in rows])
     # of a binomial test on each side, at one of the distances
     significance = 0.025 / len(rows)
-    is_above_half = bdtrc(k - 1.0, n, HALF) < significance
-    is_below_half = bdtr(k * 1.0, n, HALF) < significance
-    low = max(distance[is_above_half], default=None)
-    is_beyond_low = distance > (low or 0.0)
-    high = min(distance[is_below_half & is_beyond_low], default=None)
+    low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
     # The line is fitted beyond the last dip that is not chance.
     first = max(
         (distances.index(dip.distance) + 1 for dip in dips if dip.is_shown), default=0
     )
     falling = _fit_falling(k[first:], n[first:])
-    estimate = None
-    if falling[0] >= HALF > falling[-1]:
-        log_distance = np.log(distance[first:])
-        estimate = float(np.exp(np.interp(-HALF, -falling, log_distance)))
     min_images = math.floor(-math.log2(significance)) + 1
     return SeenFrom(
         unit=rows[0].unit,
         distances=distances,
         shares=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
-        distance=estimate,
-        low=None if low is None else float(low),
-        high=None if high is None else float(high),
+        distance=_find_crossing(np.array(distances[first:]), falling),
+        low=low,
+        high=high,
         lacking=None if (n >= min_images).any() else min_images,
         loose=_count_loose(rows),
         counts=tuple(n.tolist()),
         dips=dips,
         everywhere=bool(falling[-1] >= HALF),
     )
+
+
+def _bound_distance(
+    distance: NDArray[np.float64],
+    k: NDArray[np.int64],
+    n: NDArray[np.int64],
+    significance: float,
+) -> tuple[float | None, float | None]:
+    """Return the bounds of the detection distance; None if images do not bound it.
+
+    Args:
+        distance: (m,) ascending.
+        k: (m,) images that are right.
+        n: (m,) images.
+        significance: of a one-sided binomial test of one half.
+    """
+    from scipy.special import bdtr, bdtrc  # takes a tenth of a second
+
+    is_above_half = bdtrc(k - 1.0, n, HALF) < significance
+    is_below_half = bdtr(k * 1.0, n, HALF) < significance
+    low = max(distance[is_above_half], default=None)
+    is_beyond_low = distance > (low or 0.0)
+    high = min(distance[is_below_half & is_beyond_low], default=None)
+    return None if low is None else float(low), None if high is None else float(high)
+
+
+def _find_crossing(
+    distance: NDArray[np.float64], falling: NDArray[np.float64]
+) -> float | None:
+    """Return where a falling line crosses one half; None if it does not.
+
+    Args:
+        distance: (m,) ascending; the line is linear in its logarithm.
+        falling: (m,) the line.
+    """
+    if not falling[0] >= HALF > falling[-1]:
+        return None
+    return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
 
 
 def _center_distance(row: AxisRow) -> float:

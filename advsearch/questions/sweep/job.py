@@ -374,21 +374,31 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     for named_scene, points in points_of_scene:
         if points.drawn_numbers != first_points.drawn_numbers:
             raise InputError(
-                f"`object` {named_scene.object}: its controls draw other numbers than those "
-                f"of {job.places[0].object}; sweep "
+                f"`object` {named_scene.object}: its controls draw other numbers than "
+                f"those of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
-    n_parts = first_points.parts
-    range_fractions = tuple([k / n_parts, (k + 1) / n_parts] for k in range(n_parts))
-    sampled = list[Drawn]()
-    for versions in zip(*(points.drawn for _, points in points_of_scene), strict=True):
-        number = versions[0]
-        if any(version.parts != number.parts for version in versions):
-            number = replace(
-                number, unit="of its range", parts=range_fractions, settled=False
-            )
-        sampled.append(number)
+    sampled = [
+        _merge_versions(versions, first_points.parts)
+        for versions in zip(
+            *(points.drawn for _, points in points_of_scene), strict=True
+        )
+    ]
     return first_points, tuple(sampled)
+
+
+def _merge_versions(versions: Sequence[Drawn], n_parts: int) -> Drawn:
+    """Return a sampled number as the table of all scenes shows it.
+
+    Args:
+        versions: the number in each scene.
+        n_parts: into which its range is cut.
+    """
+    number = versions[0]
+    if all(version.parts == number.parts for version in versions):
+        return number
+    fractions = tuple([k / n_parts, (k + 1) / n_parts] for k in range(n_parts))
+    return replace(number, unit="of its range", parts=fractions, settled=False)
 
 
 class SweptScene:

@@ -351,26 +351,14 @@ class Sweep:
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
         """
-        job = self.job
         image, model = np.divmod(rows, self.models)
         scene, image_in_scene = np.divmod(image, self.per_scene)
-        axes = list[SweptAxis]()
-        for name in ("object", "environment", "answer"):
-            scene_values = [
-                named_scene.names.get(name, "") for named_scene in job.places
-            ]
-            values = list(dict.fromkeys(scene_values))
-            index_of_scene = np.array([values.index(value) for value in scene_values])
-            axes.append(SweptAxis(name, "", values, index_of_scene[scene]))
-        model_names = [network.name for network in job.models]
-        axes.append(SweptAxis("model", "", model_names, model))
-        if job.axes:
-            grid_point = image_in_scene // job.samples
-            grid_indices = np.unravel_index(grid_point, self.points.grid.sizes)
-            axes += [
-                SweptAxis(axis.name, axis.unit, axis.values, index, "grid")
-                for axis, index in zip(job.axes, grid_indices, strict=True)
-            ]
+        model_names = [network.name for network in self.job.models]
+        axes = [
+            *self._scene_axes(scene),
+            SweptAxis("model", "", model_names, model),
+            *self._grid_axes(image_in_scene),
+        ]
         if self._sampled_numbers and len(rows):
             parts = self._find_parts(image)
             axes += [
@@ -378,6 +366,27 @@ class Sweep:
                 for number, index in zip(self._sampled_numbers, parts.T, strict=True)
             ]
         return [axis for axis in axes if len(axis.values) > 1]
+
+    def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[SweptAxis]:
+        """Yield the axes over scenes; `scene` (n,) has the scene of each row."""
+        for name in ("object", "environment", "answer"):
+            scene_values = [
+                named_scene.names.get(name, "") for named_scene in self.job.places
+            ]
+            values = list(dict.fromkeys(scene_values))
+            index_of_scene = np.array([values.index(value) for value in scene_values])
+            yield SweptAxis(name, "", values, index_of_scene[scene])
+
+    def _grid_axes(self, image: npt.NDArray[np.int64]) -> list[SweptAxis]:
+        """Return the axes of the grid; `image` (n,) is numbered in the scene."""
+        if not self.job.axes:
+            return []
+        grid_point = image // self.job.samples
+        indices = np.unravel_index(grid_point, self.points.grid.sizes)
+        return [
+            SweptAxis(axis.name, axis.unit, axis.values, index, "grid")
+            for axis, index in zip(self.job.axes, indices, strict=True)
+        ]
 
     def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in, (n, k).

@@ -214,30 +214,47 @@ class Predictions:
         pairs = list[PairedRates]()
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
-            if not len(images):
-                continue
-            clean_right, adversarial_right = right[:, images, model]
-            clean_outcome, adversarial_outcome = outcome[:, images, model]
-            draws = units.draw(images)
-            difference, interval, _ = paired_by_unit(
-                clean_right, adversarial_right, draws
-            )
-            pairs.append(
-                PairedRates(
-                    model=name,
-                    clean=counted_by_unit(clean_right, draws, clean_outcome),
-                    answer=counted_by_unit(
-                        adversarial_right, draws, adversarial_outcome
-                    ),
-                    both=int((clean_right & adversarial_right).sum()),
-                    clean_only=int((clean_right & ~adversarial_right).sum()),
-                    answer_only=int((~clean_right & adversarial_right).sum()),
-                    neither=int((~clean_right & ~adversarial_right).sum()),
-                    difference=difference,
-                    interval=interval,
+            if len(images):
+                draws = units.draw(images)
+                pairs.append(
+                    _compare_pairs(
+                        name,
+                        right[:, images, model],
+                        outcome[:, images, model],
+                        np.asarray(draws),
+                    )
                 )
-            )
         return pairs
+
+
+def _compare_pairs(
+    model: str,
+    right: npt.NDArray[np.bool_],
+    outcome: npt.NDArray[np.uint8],
+    draws: npt.NDArray[np.int64],
+) -> PairedRates:
+    """Compare the predictions of a model without and with an adversarial scene.
+
+    Args:
+        model: its name.
+        right: (2, n) whether each is right, first without.
+        outcome: (2, n) indices among `OUTCOMES`.
+        draws: (n,) the draw of each pair.
+    """
+    clean, adversarial = right
+    clean_outcome, adversarial_outcome = outcome
+    difference, interval, _ = paired_by_unit(clean, adversarial, draws)
+    return PairedRates(
+        model=model,
+        clean=counted_by_unit(clean, draws, clean_outcome),
+        answer=counted_by_unit(adversarial, draws, adversarial_outcome),
+        both=int((clean & adversarial).sum()),
+        clean_only=int((clean & ~adversarial).sum()),
+        answer_only=int((~clean & adversarial).sum()),
+        neither=int((~clean & ~adversarial).sum()),
+        difference=difference,
+        interval=interval,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -400,27 +400,43 @@ def _make_counts(
         wrong: from `_read_wrong`.
     """
     job = scenes.job
-    n_models = len(job.models)
     units = scenes.open(0).points[job.sizes[0]].units
     image_numbers = np.arange(wrong[..., 0].size)
     draws = np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
+    n_models = len(job.models)
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
         has_object = [named_scene.object == name for named_scene in job.places]
-        part_counts = list[PartCounts]()
-        for model in range(n_models):
-            stream = object_index * n_models + model
-            seed = seeds.stream(job.config.seed, "surface", stream)
-            model_wrong = wrong[has_object][..., model]
-            permuted = exchange(model_wrong.ravel(), draws[has_object].ravel(), seed)
-            n_known = int((model_wrong >= 0).sum())
-            n_failures = int((model_wrong >= 1).sum())
-            part_counts.append(
-                PartCounts(parts.count, n_known, n_failures, seed, permuted)
+        model_seeds = [
+            seeds.stream(job.config.seed, "surface", object_index * n_models + model)
+            for model in range(n_models)
+        ]
+        part_counts = [
+            _make_part_counts(
+                parts, wrong[has_object][..., model], draws[has_object], seed
             )
+            for model, seed in enumerate(model_seeds)
+        ]
         counts[name] = SurfaceCounts(parts, part_counts)
     return counts
+
+
+def _make_part_counts(
+    parts: SurfaceParts, wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
+) -> PartCounts:
+    """Create the counts of one object and one model, before any image is added.
+
+    Args:
+        parts: of the object.
+        wrong: (scenes, images) 1, 0 or UNKNOWN.
+        draws: (scenes, images) the draw of each image.
+        seed: of the permutations.
+    """
+    permuted = exchange(wrong.ravel(), draws.ravel(), seed)
+    n_known = int((wrong >= 0).sum())
+    n_failures = int((wrong >= 1).sum())
+    return PartCounts(parts.count, n_known, n_failures, seed, permuted)
 
 
 def _count_scene(
@@ -512,24 +528,16 @@ def _write_map(
         "models": np.array(models),
     }
     for number, (name, object_counts) in enumerate(counts.items()):
-        kinds = object_counts.parts.kinds
-        views = tuple(_render_views(assets[name], object_counts.parts))
         comparisons = [
-            {kind: association(tally, parts, LEAST) for kind, parts in kinds.items()}
+            _compare_kinds(tally, object_counts.parts)
             for tally in object_counts.tallies
         ]
-        arrays |= {
-            f"{array_name}_{number}": array
-            for array_name, array in _stored_arrays(object_counts, comparisons).items()
-        }
+        for array_name, array in _stored_arrays(object_counts, comparisons).items():
+            arrays[f"{array_name}_{number}"] = array
+        panels += _make_panels(assets[name], object_counts, comparisons, name, models)
         for model, tally, frames in zip(
             models, object_counts.tallies, comparisons, strict=True
         ):
-            title = f"{short_name(name)}, {short_name(model)}"
-            grey = _grey_colors(object_counts.parts, tally, frames["cell"])
-            cells = frames["cell"]
-            difference = cells.difference.where(cells.significant).to_numpy()
-            panels.append(Panel(title, grey, difference, views))
             tables += [
                 object_counts.table(name, model, tally, kind, frame)
                 for kind, frame in frames.items()
@@ -537,12 +545,50 @@ def _write_map(
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     write_bytes(run.path / COUNTS_FILE, stream.getvalue())
-    panels = panels[:MAX_PANELS]
+    _save_figure(panels[:MAX_PANELS], run)
+    return SurfaceMap(file=COUNTS_FILE, cells=CELLS, least=LEAST, tables=tables)
+
+
+def _compare_kinds(counts: PartCounts, parts: SurfaceParts) -> dict[str, pd.DataFrame]:
+    """Compare the predictions of a model by the parts of each kind."""
+    return {
+        kind: association(counts, part_slice, LEAST)
+        for kind, part_slice in parts.kinds.items()
+    }
+
+
+def _make_panels(
+    asset: ObjectAsset,
+    counts: SurfaceCounts,
+    comparisons: Sequence[Mapping[str, pd.DataFrame]],
+    object_name: str,
+    models: Sequence[str],
+) -> Iterator[Panel]:
+    """Yield what the figure shows of an object, for each model.
+
+    Args:
+        asset: the object.
+        counts: of it.
+        comparisons: from `_compare_kinds`, for each model.
+        object_name: its name.
+        models: their names.
+    """
+    views = tuple(_render_views(asset, counts.parts))
+    for model, tally, frames in zip(models, counts.tallies, comparisons, strict=True):
+        cells = frames["cell"]
+        yield Panel(
+            f"{short_name(object_name)}, {short_name(model)}",
+            _grey_colors(counts.parts, tally, cells),
+            cells.difference.where(cells.significant).to_numpy(),
+            views,
+        )
+
+
+def _save_figure(panels: Sequence[Panel], run: RunDirectory) -> None:
     size = (10.0, 0.5 + 3.6 * len(panels))
     figures = drawn(partial(_draw, panels), size, kinds=("png",))
     for suffix, data in figures.items():
         write_bytes(run.path / "images" / f"surface.{suffix}", data)
-    return SurfaceMap(file=COUNTS_FILE, cells=CELLS, least=LEAST, tables=tables)
 
 
 def _stored_arrays(
