@@ -46,7 +46,7 @@ where there are enough.
 # numbers of a group up to which Sobol points are used; larger ones (a texture) are
 # sampled pseudo-randomly
 MAX_SOBOL_SIZE = 64
-MAX_SHOWN_COMPONENTS = 4  # of a parameter, up to which the table shows them
+MAX_TABLE_COMPONENTS = 4  # of a parameter, up to which the table shows them
 MAX_CACHED_DESCRIPTIONS = 4096  # of controls at points of the grid
 Float64Array = NDArray[np.float64]
 # settings that take several values by themselves, and how
@@ -559,7 +559,7 @@ class Points:
             columns = slice(begin, begin + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            is_short = block.size <= MAX_SHOWN_COMPONENTS and block.norm != "l2"
+            is_short = block.size <= MAX_TABLE_COMPONENTS and block.norm != "l2"
             if is_short and control.slots:
                 yield from self._describe_sampled(
                     control, group.parameter, coordinates, begin

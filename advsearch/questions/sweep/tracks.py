@@ -115,8 +115,8 @@ class ConstantVelocity:
             _Track(next(self._numbers), box, np.zeros(4)) for box in new_boxes
         ]
         visible = [*sure_tracks, *unsure_tracks, *new_tracks]
-        waiting_on = [track for track in waiting if track.missed <= self.patience]
-        self._tracks = [*visible, *waiting_on]
+        still_waiting = [track for track in waiting if track.missed <= self.patience]
+        self._tracks = [*visible, *still_waiting]
         return [(track.number, track.box) for track in visible]
 
     def _assign(
