@@ -266,53 +266,63 @@ class Drives:
         self, drives: _CompleteDrives, model: int, answer: str
     ) -> DriveRates:
         """Compute the rates of one model over drives; `answer` may be empty."""
-        seconds = self.seconds
         n_frames = len(self.times)
-        n_rows = len(drives.flags)
-        is_right = drives.flags == 1
-        right_fraction = _right_fraction(drives.flags)
-        longest_gap = self._longest_gaps(drives.flags)
-        flicker = self._changes_per_second(drives.flags)
-        has_right = np.asarray(is_right.any(axis=1))
-        first_distance = drives.distance[np.arange(n_rows), is_right.argmax(axis=1)]
+        first_distance = _first_right_distance(drives)
+        each = self._describe_drives(drives, first_distance)
+        has_right = np.asarray((drives.flags == 1).any(axis=1))
 
         # Rows of one draw differ in noise alone: they are one drive.
         first_images = drives.steps[:, 0] // len(self._job.models)
         drive = np.asarray(self._units.draw(first_images))
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
+        max_gap = n_frames * self._frame_interval
+        max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
             model=self._job.models[model].name,
             answer=answer or None,
             drives=n_drives,
-            repeats=math.ceil(n_rows / n_drives),
+            repeats=math.ceil(len(drives.flags) / n_drives),
             frames=n_frames,
-            seconds=seconds,
-            right=over_drives(right_fraction, min, drive_of_value=drive),
+            seconds=self.seconds,
+            right=over_drives(_right_fraction(drives.flags), min, drive_of_value=drive),
             longest_gap=over_drives(
-                longest_gap, max, (0.0, n_frames * self._frame_interval), drive
+                self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
             ),
             first_seen=self._first_seen(first_distance[has_right], drive[has_right]),
             unit=self._distance_unit,
             never_seen=n_drives - n_right_drives,
-            flicker=over_drives(flicker, max, (0.0, (n_frames - 1) / seconds), drive),
+            flicker=over_drives(
+                self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
+            ),
             tracks=self._compute_track_rates(model, drives.steps, drive),
-            each=[
-                OneDrive(
-                    row=step,
-                    path=self._path_of_step.get(step),
-                    right=float(right_fraction[index]),
-                    first_seen=_finite_or_none(first_distance[index])
-                    if has_right[index]
-                    else None,
-                    longest_gap=float(longest_gap[index]),
-                    flicker=float(flicker[index]),
-                )
-                for index, step in enumerate(
-                    drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
-                )
-            ],
+            each=each,
         )
+
+    def _describe_drives(
+        self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
+    ) -> list[OneDrive]:
+        """Return the values of the first drives, each by itself.
+
+        Args:
+            drives: n of them.
+            first_distance: (n,) at the first right frame; NaN if there is none.
+        """
+        right_fraction = _right_fraction(drives.flags)
+        longest_gap = self._longest_gaps(drives.flags)
+        flicker = self._changes_per_second(drives.flags)
+        first_steps = drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
+        return [
+            OneDrive(
+                row=step,
+                path=self._path_of_step.get(step),
+                right=float(right_fraction[index]),
+                first_seen=_finite_or_none(first_distance[index]),
+                longest_gap=float(longest_gap[index]),
+                flicker=float(flicker[index]),
+            )
+            for index, step in enumerate(first_steps)
+        ]
 
     @property
     def _frame_interval(self) -> float:
@@ -416,6 +426,14 @@ def longest(flags: npt.NDArray[np.bool_]) -> int:
     changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
     return int((bounds[1::2] - bounds[::2]).max(initial=0))
+
+
+def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
+    """Return the distance (n,) at the first right frame; NaN if there is none."""
+    is_right = drives.flags == 1
+    first_frame = is_right.argmax(axis=1)
+    distance = drives.distance[np.arange(len(first_frame)), first_frame]
+    return np.where(is_right.any(axis=1), distance, np.nan)
 
 
 def _right_fraction(flags: Flags) -> npt.NDArray[np.float64]:

@@ -173,34 +173,51 @@ class Job:
         scene = numbers.start // self.per_scene
         images_before = scene * self.per_scene
         first_in_scene = numbers.start - images_before
-        queries: dict[int, Query] = {}
+        queries = list[Query]()
         for size, points in self.bound(scene).items():
             u = points.configurations(first_in_scene, len(numbers), images_before)
             descriptions = points.values(u, first_in_scene)
-            models = [
-                model
-                for model, model_size in enumerate(self.sizes)
-                if model_size == size
-            ]
             for number, configuration, values in zip(
                 numbers, u, descriptions, strict=True
             ):
-                seed = self.seeds(points.noise(number))
-                environment = points.space.lit_by(values)
-                for model in models:
-                    step = number * len(self.models) + model
-                    queries[step] = Query(
-                        configuration.clone(),
-                        seed,
-                        KIND,
-                        step,
-                        spp=self.spp,
-                        drawn=False,
-                        values=self._row_values(scene, model, environment, values),
-                        sought=False,
-                        keep=self.config.keep_pictures != "none",
-                    )
-        return [(str(scene), None, queries[step]) for step in sorted(queries)]
+                queries += [
+                    self._make_query(number, model, points, configuration, values)
+                    for model, model_size in enumerate(self.sizes)
+                    if model_size == size
+                ]
+        queries.sort(key=lambda query: query.number)
+        return [(str(scene), None, query) for query in queries]
+
+    def _make_query(
+        self,
+        number: int,
+        model: int,
+        points: Points,
+        u: Tensor,
+        values: Mapping[str, Value],
+    ) -> Query:
+        """Return the query of a model about an image.
+
+        Args:
+            number: of the image in the sweep.
+            model: its index.
+            points: of the scene.
+            u: (d,) the configuration.
+            values: of the controls.
+        """
+        scene = number // self.per_scene
+        environment = points.space.lit_by(values)
+        return Query(
+            u.clone(),
+            self.seeds(points.noise(number)),
+            KIND,
+            number * len(self.models) + model,
+            spp=self.spp,
+            drawn=False,
+            values=self._row_values(scene, model, environment, values),
+            sought=False,
+            keep=self.config.keep_pictures != "none",
+        )
 
     def _row_values(
         self,
@@ -477,8 +494,7 @@ class SweptScene:
         """
         begin = time.perf_counter()
         not_finite_before = self.not_finite
-        job = self.job
-        n_models = len(job.models)
+        n_models = len(self.job.models)
         images = {size: self._make_images(size, queries) for size in self.points}
         judgements = self._judge(queries, images)
         wrong_images = {
@@ -490,10 +506,10 @@ class SweptScene:
         evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, n_models)
-            image = images[job.sizes[model]][number]
+            image = images[self.job.sizes[model]][number]
             evaluation = Evaluation.of(
                 judgements[query.number],
-                cost=image.traced * job.first_of_size[model],
+                cost=image.traced * self.job.first_of_size[model],
                 predicted=image.predicted,
                 seconds=seconds,
             )
@@ -501,10 +517,10 @@ class SweptScene:
                 is_wrong = number in wrong_images
                 evaluation = self._attach_images(evaluation, query, image, is_wrong)
             evaluations.append(evaluation)
-        # What concerns the batch as a whole stands in its last evaluation.
+        # What concerns the batch stands in its last evaluation.
         evaluations[-1] = replace(
             evaluations[-1],
-            light=[images.summary() for images in self.predicted.values()],
+            light=[predictor.summary() for predictor in self.predicted.values()],
             non_finite=max(0, self.not_finite - not_finite_before),
         )
         return evaluations

@@ -115,9 +115,9 @@ def association(counts: PartCounts, part_slice: slice, min_images: int) -> pd.Da
         fraction of wrong predictions where the part is visible, less that where it is
         not; `low` and `high`: bounds of its 95 % interval, for the part by itself, NaN
         where images share a draw; `p`: probability that any part stands out as far by
-        chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`; `strength`: the bound
-        that is nearer to 0, without its sign, 0 if the interval contains 0. Without an
-        interval `strength` is the absolute difference.
+        chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`; `strength`:
+        the bound that is nearer to 0, without its sign, 0 if the interval contains 0.
+        Without an interval `strength` is the absolute difference.
     """
     seen = counts.seen[part_slice]
     wrong = counts.wrong[part_slice]
@@ -457,8 +457,7 @@ def _count_scene(
     """
     job = scenes.job
     swept_scene = scenes.open(scene)
-    n_images = len(wrong)
-    n_models = len(job.models)
+    n_images, n_models = wrong.shape
     for batch in batches(0, n_images, BATCH_SIZE):
         for size in dict.fromkeys(job.sizes):
             models = [model for model in range(n_models) if job.sizes[model] == size]
@@ -469,13 +468,15 @@ def _count_scene(
             renderer = swept_scene.renderers[size]
             for number, u in zip(batch, configurations, strict=True):
                 surfaces = renderer.surfaces(u, rays_per_pixel)
-                known = {
-                    model: bool(wrong[number, model])
-                    for model in models
-                    if wrong[number, model] != UNKNOWN
-                }
-                counts.add(surfaces, known)
+                counts.add(surfaces, _select_known(wrong[number], models))
         progress.advance(len(batch) * n_models)
+
+
+def _select_known(
+    wrong: npt.NDArray[np.int8], models: Sequence[int]
+) -> dict[int, bool]:
+    """Return which of some models are wrong, from (models,), if that is known."""
+    return {model: bool(wrong[model]) for model in models if wrong[model] != UNKNOWN}
 
 
 def exchange(
@@ -640,6 +641,10 @@ WHITE = (1.0, 1.0, 1.0)
 """Grey where the difference may be chance, darker where too few images show the part or
 too few do not; white outside of charts.
 """
+GREY_LABELS = {
+    NOT_SIGNIFICANT_GREY: "not told from chance",
+    NOT_COMPARED_GREY: "too few pictures with or without it",
+}
 N_VIEW_ROWS = 2  # of the views of an object
 
 
@@ -705,14 +710,9 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
     """
     import matplotlib as mpl  # takes long to import
 
-    max_difference = max(
-        (float(np.nanmax(np.abs(panel.difference), initial=0.0)) for panel in panels),
-        default=0.0,
-    )
-    # rounded up to 10 %
-    scale_limit = max(ceil(10.0 * max_difference - 1e-9) / 10.0, 0.1)
+    limit = _find_scale_limit(panels)
     scale = mpl.cm.ScalarMappable(
-        mpl.colors.Normalize(-scale_limit, scale_limit), mpl.colormaps[COLORMAP]
+        mpl.colors.Normalize(-limit, limit), mpl.colormaps[COLORMAP]
     )
     axes = figure.subplots(len(panels), 2, squeeze=False, width_ratios=(1.0, 1.55))
     for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
@@ -733,15 +733,20 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
     bar.set_label(
         "share of wrong predictions where it is seen,\nless that where it is not"
     )
-    labels = {
-        NOT_SIGNIFICANT_GREY: "not told from chance",
-        NOT_COMPARED_GREY: "too few pictures with or without it",
-    }
-    marks = [
+    patches = [
         mpl.patches.Patch(facecolor=color, label=label)
-        for color, label in labels.items()
+        for color, label in GREY_LABELS.items()
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=2)
+    figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _find_scale_limit(panels: Sequence[Panel]) -> float:
+    """Return the largest difference of all panels, rounded up to 10 %."""
+    max_difference = max(
+        (float(np.nanmax(np.abs(panel.difference), initial=0.0)) for panel in panels),
+        default=0.0,
+    )
+    return max(ceil(10.0 * max_difference - 1e-9) / 10.0, 0.1)
 
 
 def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) -> None:
