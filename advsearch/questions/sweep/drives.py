@@ -289,7 +289,9 @@ class Drives:
             longest_gap=over_drives(
                 self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
             ),
-            first_seen=self._first_seen(first_distance[has_right], drive[has_right]),
+            first_seen=self._first_detection(
+                first_distance[has_right], drive[has_right]
+            ),
             unit=self._distance_unit,
             never_seen=n_drives - n_right_drives,
             flicker=over_drives(
@@ -342,7 +344,7 @@ class Drives:
         is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
         return np.asarray(is_change.sum(axis=1) / self.seconds)
 
-    def _first_seen(
+    def _first_detection(
         self, distance: npt.NDArray[np.float64], drive: npt.NDArray[np.int64]
     ) -> OverDrives | None:
         """Return the mean distance at the first right frame.
