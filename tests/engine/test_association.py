@@ -50,7 +50,7 @@ def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
         angle, width = random.random(40), 0.4
         for picture, failed in zip(angle, wrong, strict=True):  # neighbours are seen together
             counts.add(np.flatnonzero((np.arange(60) / 60 - picture) % 1.0 < width), bool(failed))
-        told += bool(association(counts, slice(0, 60), 5).told.any())
+        told += bool(association(counts, slice(0, 60), 5).significant.any())
     assert told <= 8  # 3 on average; 9 or more once in 200
 
 
@@ -59,7 +59,7 @@ def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compare
     for number in range(24):
         counts.add(np.array([0, *([1] if number < 12 else [])]), number < 12)
     found = association(counts, slice(0, 3), 5)
-    assert found.compared.tolist() == [False, True, False] and found.told.tolist() == [False, True, False]
+    assert found.compared.tolist() == [False, True, False] and found.significant.tolist() == [False, True, False]
     assert found.difference[1] == 1.0 and found.low[1] == found.strength[1] > 0.6 and np.isnan(found.p[0])
     assert association(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + SHARINGS)]
 
@@ -88,6 +88,6 @@ def test_parts_that_some_drives_show_are_told_from_chance_by_drive() -> None:
         for seen, failed in zip(shows, wrong, strict=True):
             counts.add(np.flatnonzero(seen), bool(failed))
         found = association(counts, slice(0, 8), 5)
-        told += bool(found.told.any())
+        told += bool(found.significant.any())
         assert np.isnan(found.low).all() and (found.strength[found.compared] >= 0.0).all()
     assert told <= 6

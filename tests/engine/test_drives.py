@@ -258,7 +258,7 @@ def test_the_mean_distance_at_first_sight_takes_its_range_from_the_plan_or_has_n
         covered += interval[0] <= 9.6 <= interval[1]
     assert covered >= 0.94 * runs
     assert over_drives(np.array([4.0, 5.0, 6.0]), min, None).interval is None, "of no known range there is none"
-    assert Drives._distances is None, "never from the sample"
+    assert Drives._distance_bounds is None, "never from the sample"
 
 
 REPEATED: dict[str, Any] = {**DRIVE, "samples": 6}

@@ -20,7 +20,7 @@ from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.display import failures_part, failures_text
 from advsearch.questions.attack.outcome import described_failures
-from advsearch.questions.attack.stages import TRIED, check_failures
+from advsearch.questions.attack.stages import MAX_TRIED_FAILURES, check_failures
 from advsearch.questions.attack.summary import DifferentFailures
 from samples import attack, make_run, written_page
 from stand_ins import StandInProblem
@@ -79,11 +79,11 @@ def test_each_is_tried_until_it_is_clear_and_a_lucky_one_does_not_hold() -> None
 
 
 def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
-    told = described(checked(failures(*[0.95] * (TRIED + 3))))
-    assert told.tried == TRIED
-    assert [one.holds for one in told.listed[TRIED:]] == [None] * 3
-    assert failures_text(told).endswith(f"with fresh renders {TRIED} of the {TRIED} that were tried hold")
-    assert len(failures_part(told).rows) == TRIED + 3 and len(failures_part(told, tried=True).rows) == TRIED
+    told = described(checked(failures(*[0.95] * (MAX_TRIED_FAILURES + 3))))
+    assert told.tried == MAX_TRIED_FAILURES
+    assert [one.holds for one in told.listed[MAX_TRIED_FAILURES:]] == [None] * 3
+    assert failures_text(told).endswith(f"with fresh renders {MAX_TRIED_FAILURES} of the {MAX_TRIED_FAILURES} that were tried hold")
+    assert len(failures_part(told).rows) == MAX_TRIED_FAILURES + 3 and len(failures_part(told, tried=True).rows) == MAX_TRIED_FAILURES
     assert failures_part(told).rows[-1][2] == "not tried"
 
 

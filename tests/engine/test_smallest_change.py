@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, SearchResult
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.questions.attack.stages import CONFIRMED, find_smallest
+from advsearch.questions.attack.stages import MIN_CONFIRMING_TRIALS, find_smallest
 
 DOMAIN = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
 
@@ -59,7 +59,7 @@ def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
     findings = finding(trial)
     assert findings.smallest.closed and findings.smallest.confirmed
     last = [f"check {findings.smallest.checks - one}" for one in (1, 2)]
-    assert sum(tried[kind] for kind in last) == CONFIRMED
+    assert sum(tried[kind] for kind in last) == MIN_CONFIRMING_TRIALS
     assert {tried[kind] for kind in tried if kind not in last} == {6, 2}
 
 

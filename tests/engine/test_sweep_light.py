@@ -24,7 +24,7 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 @pytest.fixture(autouse=True)
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here, and the first two views of a comparison decide."""
-    monkeypatch.setattr(predicting, "PAYS", 0.2)
+    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.2)
     for name in ("BOUND", "MARGIN"):
         monkeypatch.setattr(acceptance, name, 50.0)
 

@@ -40,7 +40,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     monkeypatch.setattr(texels, "GROUND", 24)
     for name, value in {"SIDE": 32, "GATHERED": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
-    monkeypatch.setattr(predicting, "PAYS", 0.0)
+    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 0.0)
     for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
         monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
@@ -185,7 +185,7 @@ def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> No
 
 @pytest.mark.medium
 def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predicting, "PAYS", 2.0)
+    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 2.0)
     told = swept(grid=GRID, resolution=128).summary.transport
     assert told == LinearTransport(
         used=False, reason="light on surfaces pays where 106 pictures differ in the camera alone; here 8 do"

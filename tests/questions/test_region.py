@@ -31,7 +31,7 @@ def coarse() -> Iterator[None]:
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
             (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (boxes, "MAX_PROBED", 20),
-            (predicting, "pays_from", lambda *_: 1),
+            (predicting, "find_break_even", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
@@ -88,7 +88,7 @@ def test_what_is_rendered_says_why(
     more: dict[str, Any], reason: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is said where that was asked for, or where more moves than a camera."""
-    monkeypatch.setattr(predicting, "pays_from", lambda *_: 999)
+    monkeypatch.setattr(predicting, "find_break_even", lambda *_: 999)
     config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
     result = region.run(config)
     assert "products" not in result.renders

@@ -31,12 +31,12 @@ sweep_page = import_module("advsearch.questions.sweep.page")  # the room has a f
 def test_a_file_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = make_sweep(tmp_path / "run", keep="all")
     assert "pictures that were kept" not in (run / "report.html").read_text()
-    monkeypatch.setattr(sweep_page, "MOST_EMBEDDED", 2000)
+    monkeypatch.setattr(sweep_page, "MAX_EMBEDDED_BYTES", 2000)
     page = write_page(run).read_text()
     taken = page.count("data:image/jpeg")
     assert f"This file has {taken} of the 24 pictures that were kept" in page
     assert 0 < taken < 24
-    monkeypatch.setattr(sweep_page, "MOST_ROWS", 23)
+    monkeypatch.setattr(sweep_page, "MAX_EMBEDDED_ROWS", 23)
     page = write_page(run).read_text()
     assert "This file leaves out the 24 rows" in page
     assert f"<code>advsearch dashboard {run}</code>" in page
@@ -62,7 +62,7 @@ def test_texts_of_a_run_are_no_markup(tmp_path: Path) -> None:
 @pytest.mark.parametrize("many", [False, True])
 def test_the_folder_has_page_rows_and_pictures(many: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if many:
-        monkeypatch.setattr(sweep_page, "MOST_ROWS", 0)
+        monkeypatch.setattr(sweep_page, "MAX_EMBEDDED_ROWS", 0)
     first, second = make_sweep(tmp_path / "a", keep="wrong"), make_sweep(tmp_path / "b")
     index = write_bundle([first, second], tmp_path / "site")
     runs = json.loads(re.findall(r'id="runs">(.*?)</script>', index.read_text())[0])

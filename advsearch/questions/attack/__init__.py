@@ -26,7 +26,7 @@ from advsearch.questions.attack.summary import (
     other_results=BY_FIELD,
 )
 def attack(
-    asked: RunContext[AttackConfig],
+    context: RunContext[AttackConfig],
 ) -> AttackSummary | CurveResult | MatrixResult:
     """Find the worst configuration of a scene, and verify it with fresh renders; or do
     so for several.
@@ -35,8 +35,8 @@ def attack(
     from advsearch.questions.attack.run import attack_once
     from advsearch.questions.attack.studies import curve, matrix
 
-    if asked.config.is_study:
-        return matrix(asked) if asked.config.is_matrix else curve(asked)
+    if context.config.is_study:
+        return matrix(context) if context.config.is_matrix else curve(context)
     return attack_once(
-        asked.config, progress=asked.progress, resumed=asked.resumed
+        context.config, progress=context.progress, resumed=context.resumed
     ).summary

@@ -1,4 +1,4 @@
-"""How bright ambient light may become before an adversarial pattern of light fails."""
+"""Find how bright ambient light may be before an adversarial pattern of light fails."""
 
 from __future__ import annotations
 
@@ -9,75 +9,102 @@ from functools import lru_cache, partial
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import (
-    Ending,
-    verify,
-)
+from advsearch.attacks import Ending, verify
 from advsearch.engine.journal import ProblemKey, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
 
-BRIGHTEST = 1e5  # Lux of direct sun: nothing is tried beyond
-HALVED = 2
-"""How often the step between the last ambient light in which it holds and the first in
-which it does not is halved: to a factor of 1.19.
+MAX_LUX = 1e5  # direct sun: nothing brighter is tried
+N_BISECTIONS = 2
+"""Bisections between the last ambient light in which it holds and the first in which it
+does not: they end at a factor of 1.19.
 """
 
 
 def find_ambient(verifier: Verifier, u: Tensor) -> None:
-    """Try a verified configuration (d,) in twice the ambient light, and twice that,
-    until it no longer holds.
+    """Find the ambient light in which a verified configuration no longer holds.
 
+    It is tried in twice the ambient light of the scene, and twice that, and so on.
     Nothing else changes: exposure follows the ambient light, so that the projector is
-    the darker one. All points have the same seeds, which nothing else has. What comes
-    of it is in `verifier.findings`.
+    the darker one. All points have the same seeds, which nothing else has. The results
+    are in `verifier.findings`.
+
+    Args:
+        verifier: of the attack.
+        u: (d,) the configuration.
     """
     problem = verifier.problem
     findings = verifier.findings
-    ambients = [
-        bound.ambient
-        for bound in problem.searched_space.controls
-        if bound.competes_with_ambient
-    ]
-    own = ambients[0] if ambients else None  # and None where they are searched too
-    if own is None or findings.verification is None:
+    scene_lux = _find_scene_lux(problem)
+    if scene_lux is None or findings.verification is None:
         return
-    tried = findings.ambient
-    tried[own] = findings.verification
+    findings.ambient[scene_lux] = findings.verification
 
     def holds(lux: float) -> bool:
         title = f"trying it in ambient light of {lux:.3g} lux"
         verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
-        shared = verifier.journal.traced
-        there = Shared(in_light(problem, lux / own), shared.executor, lux / own)
-        journal = replace(verifier.journal, traced=there)
-        tried[lux] = verify(
-            replace(verifier, journal=journal).evaluate_all, problem.domain, u, claim=Ending.FOUND, spp=findings.spp,
-            seed=seeds.stream(problem.seed, "ambient"), trials=verifier.looks, rule=problem.rule,
-            kind=f"ambient {lux:.6g} lux", control=f"control {lux:.6g} lux",
-        )  # fmt: skip
-        return tried[lux].ending is Ending.FOUND
+        factor = lux / scene_lux
+        traced = verifier.journal.traced
+        traced_in_light = Shared(in_light(problem, factor), traced.executor, factor)
+        journal = replace(verifier.journal, traced=traced_in_light)
+        verification = verify(
+            replace(verifier, journal=journal).evaluate_all,
+            problem.domain,
+            u,
+            claim=Ending.FOUND,
+            spp=findings.spp,
+            seed=seeds.stream(problem.seed, "ambient"),
+            trials=verifier.looks,
+            rule=problem.rule,
+            kind=f"ambient {lux:.6g} lux",
+            control=f"control {lux:.6g} lux",
+        )
+        findings.ambient[lux] = verification
+        return verification.ending is Ending.FOUND
 
-    good = own
-    bad = 2.0 * own
-    while bad <= BRIGHTEST and holds(bad):
-        good = bad
-        bad = 2.0 * bad
-    for _ in range(HALVED if bad in tried else 0):
-        between = (good * bad) ** 0.5
-        good, bad = (between, bad) if holds(between) else (good, between)
+    good_lux = scene_lux
+    bad_lux = 2.0 * scene_lux
+    while bad_lux <= MAX_LUX and holds(bad_lux):
+        good_lux = bad_lux
+        bad_lux = 2.0 * bad_lux
+    if bad_lux not in findings.ambient:
+        return  # it holds in direct sun
+    for _ in range(N_BISECTIONS):
+        middle_lux = (good_lux * bad_lux) ** 0.5
+        if holds(middle_lux):
+            good_lux = middle_lux
+        else:
+            bad_lux = middle_lux
+
+
+def _find_scene_lux(problem: Problem) -> float | None:
+    """Return the ambient light that a searched control competes with.
+
+    None if no control does, or if the ambient light is searched too.
+    """
+    for control in problem.searched_space.controls:
+        if control.competes_with_ambient:
+            return control.ambient
+    return None
 
 
 def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
-    """Return what gives a worker the problem of a query: that of the run, or for a
-    number the same in so many times the ambient light.
+    """Return the function by which a worker finds the problem of a query.
+
+    A number as the key is a factor on the ambient light; any other key is the problem
+    of the run.
     """
-    brightened = lru_cache(maxsize=2)(partial(in_light, problem))
-    return lambda key: brightened(key) if isinstance(key, float) else problem
+    in_other_light = lru_cache(maxsize=2)(partial(in_light, problem))
+
+    def find_problem(key: ProblemKey) -> Problem:
+        return in_other_light(key) if isinstance(key, float) else problem
+
+    return find_problem
 
 
-def in_light(problem: Problem, times: float) -> Problem:
-    controls = [bound.in_light(times) for bound in problem.space.controls]
+def in_light(problem: Problem, factor: float) -> Problem:
+    """Return the problem with its ambient light multiplied by a factor."""
+    controls = [control.in_light(factor) for control in problem.space.controls]
     space = replace(problem.space, controls=tuple(controls))
     renderer = problem.renderer.like()
     renderer.space = space

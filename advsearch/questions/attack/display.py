@@ -1,6 +1,4 @@
-"""What is shown and claimed of the results of `attack`: of one, of several epsilons,
-and of several models.
-"""
+"""The views and the claims of attacks, of curves over epsilon, and of matrices."""
 
 from __future__ import annotations
 
@@ -26,82 +24,83 @@ from advsearch.report.views import Claim, Column, ResultPart, ShownResult
 from advsearch.runs.results import ControlGroup, VerifiedRate
 
 AttackResults = AttackSummary | CurveResult | MatrixResult
+# of a cell of a matrix, by its ending
+ENDING_MARKS = {"found": " *", "already wrong": " (wrong already)"}
 
 
 def shown(result: AttackResults) -> ShownResult:
-    """Return the verdict, the rates and the cost; of a curve or a matrix, its tables
-    and its figure.
-    """
+    """Return the view of an attack, a curve or a matrix."""
     if isinstance(result, CurveResult):
-        return _shown_curve(result)
-    return (
-        _shown_matrix(result)
-        if isinstance(result, MatrixResult)
-        else _shown_attack(result)
-    )
+        return _view_curve(result)
+    if isinstance(result, MatrixResult):
+        return _view_matrix(result)
+    return _view_attack(result)
 
 
 def claims(result: AttackResults) -> Iterator[Claim]:
+    """Yield what an attack, a curve or a matrix claims."""
     if isinstance(result, CurveResult):
-        yield from _claims_of_curve(result)
+        yield from _curve_claims(result)
     elif isinstance(result, MatrixResult):
-        for row in result.table:
-            for cell in row.tested:
-                at_home = cell.model == row.attacked
-                spent = (
-                    views.searches_text(row.renders, result.policy, False)
-                    if at_home
-                    else None
-                )
-                name = f"searched on {row.attacked}, tried on {cell.model}"
-                yield views.case_claim(name, cell.ending, cell.verified, spent)
+        yield from _matrix_claims(result)
     else:
-        rate = result.verified
-        verdict = wording.attack_verdict(result)
-        extent = views.extent_of("fresh renders that count as a success", rate)
-        if result.ending == "found" and rate is not None and rate.successes:
-            text = f"{verdict} How many such configurations there are is not known."
-            yield views.claim("found", text, extent)
-        elif result.ending in views.ENDED and rate is not None:
-            spent = views.searches_text(
-                result.renders, result.policy, result.baseline is not None
-            )
-            yield views.claim(
-                "not found",
-                f"{verdict} Searched were {spent}. {views.NO_PROOF}",
-                extent,
-            )
-        else:
-            unknown = (
-                f"the search ended as {result.ending!r} without trials that "
-                "carry a claim"
-            )
-            yield views.nothing_claimed(views.WHY.get(result.ending, unknown), verdict)
+        yield _attack_claim(result)
         if result.average is not None:
             yield views.average_claim(result.average, wording.budget_text(result))
 
 
-def _shown_attack(summary: AttackSummary) -> ShownResult:
-    sections = [_rates(summary)]
+def _attack_claim(result: AttackSummary) -> Claim:
+    """Return what an attack claims of the scene that it found."""
+    rate = result.verified
+    verdict = wording.attack_verdict(result)
+    extent = views.extent_of("fresh renders that count as a success", rate)
+    if result.ending == "found" and rate is not None and rate.successes:
+        text = f"{verdict} How many such configurations there are is not known."
+        return views.claim("found", text, extent)
+    if result.ending in views.ENDED and rate is not None:
+        searches = views.searches_text(
+            result.renders, result.policy, result.baseline is not None
+        )
+        text = f"{verdict} Searched were {searches}. {views.NO_PROOF}"
+        return views.claim("not found", text, extent)
+    unknown = f"the search ended as {result.ending!r} without trials that carry a claim"
+    return views.nothing_claimed(views.WHY.get(result.ending, unknown), verdict)
+
+
+def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
+    """Yield what each scene of a matrix does to each model."""
+    for row in result.table:
+        for cell in row.tested:
+            searches = None
+            if cell.model == row.attacked:
+                searches = views.searches_text(row.renders, result.policy, False)
+            name = f"searched on {row.attacked}, tried on {cell.model}"
+            yield views.case_claim(name, cell.ending, cell.verified, searches)
+
+
+def _view_attack(summary: AttackSummary) -> ShownResult:
+    """Return the view of one attack."""
+    sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(failures_part(summary.failures, tried=True))
     sections += ambient_part(summary)
     cautions = [
         text for text in wording.remarks(summary) if text not in summary.warnings
     ]
+    over = ""
+    if summary.over:
+        over = f"{' and '.join(summary.over)}, drawn anew for every picture"
+    steps = words.count(summary.steps, "step")
     facts = {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
         "objective": wording.objective_text(summary),
         "printable": wording.print_cost_text(summary),
-        "over": f"{' and '.join(summary.over)}, drawn anew for every picture"
-        if summary.over
-        else "",
+        "over": over,
         "along the drive": wording.drive_text(summary),
         "smallest": wording.smallest_text(summary),
         "failures": failures_text(summary.failures) if summary.failures else "",
-        "search": f"{summary.policy}, {words.count(summary.steps, 'step')}: "
-        f"{summary.ending}",
+        "search": f"{summary.policy}, {steps}: {summary.ending}",
         "renders": wording.renders_text(summary),
         "environment": "",  # the page has it, and the seed
         "seed": "",
@@ -115,63 +114,55 @@ def _shown_attack(summary: AttackSummary) -> ShownResult:
     )
 
 
-def _rates(summary: AttackSummary) -> ResultPart:
-    def rate(what: str, rated: VerifiedRate | ControlGroup | None) -> Sequence[str]:
-        if rated is None:
-            return "not verified", ""
-        number = rated.correct if isinstance(rated, ControlGroup) else rated.successes
-        return words.tally(
-            what, number, rated.trials, rated.not_a_number
-        ), words.interval_text(rated.interval)
-
+def _rates_part(summary: AttackSummary) -> ResultPart:
+    """Return the table of predictions and rates."""
     clean = summary.clean
     baseline = summary.baseline
     average = summary.average
     success = wording.success(summary)
-    rows = [
-        [
-            "clean",
-            *words.prediction_cells(summary.task, clean),
-            *rate("right", clean.control),
-        ]
-    ]
+    prediction = words.prediction_cells(summary.task, clean)
+    rows = [["clean", *prediction, *_rate_cells("right", clean.control)]]
     if summary.adversarial:
-        cells = words.prediction_cells(summary.task, summary.adversarial)
-        rows.append(["adversarial", *cells, *rate(success, summary.verified)])
+        prediction = words.prediction_cells(summary.task, summary.adversarial)
+        rate = _rate_cells(success, summary.verified)
+        rows.append(["adversarial", *prediction, *rate])
     if baseline:
-        rows.append(
-            [
-                "random search",
-                f"{baseline.renders} pictures",
-                "",
-                *rate(success, baseline.verified),
-            ]
-        )
+        images = f"{baseline.renders} pictures"
+        rate = _rate_cells(success, baseline.verified)
+        rows.append(["random search", images, "", *rate])
     if average:
         right = words.tally("right", average.correct, average.configurations)
-        drawn = words.count(average.configurations, "configuration")
-        rows.append(
-            ["average case", drawn, "", right, words.interval_text(average.interval)]
-        )
-    number = "action" if summary.task == words.COMMAND else "probability"
-    return ResultPart(
-        heads=("", "prediction", number, "rate", "95 % interval"), rows=rows
-    )
+        configurations = words.count(average.configurations, "configuration")
+        interval = words.interval_text(average.interval)
+        rows.append(["average case", configurations, "", right, interval])
+    number_head = "action" if summary.task == words.COMMAND else "probability"
+    heads = ("", "prediction", number_head, "rate", "95 % interval")
+    return ResultPart(heads=heads, rows=rows)
+
+
+def _rate_cells(
+    outcome: str, rate: VerifiedRate | ControlGroup | None
+) -> tuple[str, str]:
+    """Return a rate and its interval; `outcome` says what is counted."""
+    if rate is None:
+        return "not verified", ""
+    n_counted = rate.correct if isinstance(rate, ControlGroup) else rate.successes
+    text = words.tally(outcome, n_counted, rate.trials, rate.not_a_number)
+    return text, words.interval_text(rate.interval)
 
 
 def ambient_part(summary: AttackSummary) -> list[ResultPart]:
+    """Return the section about ambient light, if it was tried."""
     light = summary.ambient
     if light is None:
         return []
-    ends = (
-        "also in direct sun"
-        if light.ends_at is None
-        else f"no longer at {light.ends_at:.3g} lux"
-    )
-    more = light.holds_to / light.lux
+    limit = "also in direct sun"
+    if light.ends_at is not None:
+        limit = f"no longer at {light.ends_at:.3g} lux"
+    factor = light.holds_to / light.lux
     text = (
-        f"Works up to {light.holds_to:.3g} lux, {more:.3g} times the light that is "
-        f"there, and {ends}."
+        f"Works up to {light.holds_to:.3g} lux, {factor:.3g} times the light that is "
+        f"there, and {limit}."
     )
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
@@ -191,80 +182,74 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
     ]
 
 
-def failures_text(known: DifferentFailures) -> str:
-    where = f"{known.found} of {words.count(known.seen, 'draw')}"
-    if known.places is not None:
+def failures_text(failures: DifferentFailures) -> str:
+    """Return where different failures were found, and how many hold."""
+    where = f"{failures.found} of {words.count(failures.seen, 'draw')}"
+    if failures.places is not None:
         where = (
-            f"{known.found} of {known.places} cells over "
-            f"{' and '.join(known.over)} ({known.seen} were seen)"
+            f"{failures.found} of {failures.places} cells over "
+            f"{' and '.join(failures.over)} ({failures.seen} were seen)"
         )
-    if (share := known.share) is not None:
+    if failures.share is not None:
         where += (
-            f"; of all configurations {words.interval_text(share.interval)} fail "
+            f"; of all configurations {words.interval_text(failures.share.interval)} fail "
             "in one render (95 % interval)"
         )
-        where += (
-            ""
-            if share.estimate is None
-            else (f", {words.percent(share.estimate)} by the estimate")
-        )
-    if not known.tried:
+        if failures.share.estimate is not None:
+            where += f", {words.percent(failures.share.estimate)} by the estimate"
+    if not failures.tried:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return (
-        f"claimed in {where}; with fresh renders {known.held} of the {known.tried} "
+        f"claimed in {where}; with fresh renders {failures.held} of the {failures.tried} "
         "that were tried hold"
     )
 
 
 def failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
-    def held(failure: DifferentFailure) -> str:
-        if (rate := failure.verified) is None:
-            return "not tried"
-        return (
-            f"{'yes' if failure.holds else 'no'}, {rate.successes} of "
-            f"{words.count(rate.trials, 'render')}"
-        )
-
+    """Return the table of different failures; with `tried` only of those in trials."""
     columns: Mapping[str, Column] = {
         "failures": range_text,
         "most often predicted": most_predicted,
-        "holds in fresh renders": held,
+        "holds in fresh renders": _holds_text,
         "objective": lambda failure: words.number_text(failure.objective),
     }
-    return ResultPart.table(
-        (
-            failure
-            for failure in known.listed
-            if not tried or failure.verified is not None
-        ),
-        columns,
-    )
+    failures = [
+        failure for failure in known.listed if not tried or failure.verified is not None
+    ]
+    return ResultPart.table(failures, columns)
+
+
+def _holds_text(failure: DifferentFailure) -> str:
+    rate = failure.verified
+    if rate is None:
+        return "not tried"
+    renders = words.count(rate.trials, "render")
+    return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {renders}"
 
 
 def range_text(failure: DifferentFailure) -> str:
-    """Return where a failure lies: ``pose.yaw 36 to 72 degrees, material.kind
-    brass``.
+    """Return where a failure lies.
+
+    ``pose.yaw 36 to 72 degrees, material.kind brass``.
     """
     texts = []
-    for name, ends in failure.ranges.items():
+    for name, bounds in failure.ranges.items():
+        if isinstance(bounds, str):
+            texts.append(f"{name} {bounds}")
+            continue
         value = failure.configuration.get(name)
         unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
-        lies = (
-            ends
-            if isinstance(ends, str)
-            else (f"{words.number_text(ends[0])} to {words.number_text(ends[1])}{unit}")
-        )
-        texts.append(f"{name} {lies}")
+        low, high = map(words.number_text, bounds)
+        texts.append(f"{name} {low} to {high}{unit}")
     return ", ".join(texts) or "anywhere"
 
 
 def most_predicted(failure: DifferentFailure) -> str:
+    """Return the most frequent label in the trials of a failure; empty without any."""
     return next(iter(failure.verified.labels), "") if failure.verified else ""
 
 
-# ---- robust accuracy against epsilon
-# --------------------------------------------------------------------------------
-
+CURVE_TITLE = "Robust accuracy"
 CURVE_NOTE = (
     "Robust: recognised as it is, and no configuration was verified within the "
     "epsilon. That is what these attacks "
@@ -272,15 +257,49 @@ CURVE_NOTE = (
 )
 
 
-def _shown_curve(result: CurveResult) -> ShownResult:
-    by_epsilon: Mapping[str, Column] = {
+def _view_curve(result: CurveResult) -> ShownResult:
+    """Return the view of robust accuracy against epsilon."""
+    known = [point for point in result.curve if point.accuracy is not None]
+    points = [point for point in known if point.epsilon is not None]
+    has_chart = len(points) > 1
+    points_text = "; ".join(
+        f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points
+    )
+    chart = ResultPart(
+        CURVE_TITLE,
+        [f"Over epsilon with 95 % intervals: {points_text}."],
+        draw=lambda axes: _draw_curve(result, points, axes),
+        size=(5.6, 3.6),
+        only="page" if has_chart else "notebook",
+    )
+    point_columns: Mapping[str, Column] = {
         "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
         "accuracy": lambda point: words.percent(point.accuracy),
         "95 % interval": lambda point: words.interval_text(point.interval),
         "wrong already": "{0.already_wrong}",
     }
-    by_object: Mapping[str, Column] = {
+    curve = ResultPart.table(
+        known, point_columns, title="" if has_chart else CURVE_TITLE, note=CURVE_NOTE
+    )
+    margin = words.margin_text(result.task)
+    meaning = f"Margin: {margin}, in the trials of the worst case."
+    sections = [
+        *([chart] if points else []),
+        *([curve] if known else []),
+        _objects_part(result),
+        ResultPart(text=[meaning]),
+    ]
+    return ShownResult(
+        _curve_text(result, known),
+        sections,
+        {"model": result.model, "policy": result.policy},
+    )
+
+
+def _objects_part(result: CurveResult) -> ResultPart:
+    """Return the table of the objects of a curve."""
+    columns: dict[str, Column] = {
         "object": "{0.object}",
         "clean right": lambda row: (
             f"{row.clean.correct}/{row.clean.trials}" if row.clean else ""
@@ -293,58 +312,22 @@ def _shown_curve(result: CurveResult) -> ShownResult:
         "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
     if any(row.average for row in result.table):
-        by_object = {
-            **by_object,
-            "right on average": _average_text,
-            "95 % interval": _average_interval,
-        }
-    known = [point for point in result.curve if point.accuracy is not None]
-    points = [point for point in known if point.epsilon is not None]
-    listed = "; ".join(
-        f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points
-    )
-    chart = ResultPart(
-        "Robust accuracy", [f"Over epsilon with 95 % intervals: {listed}."],
-        draw=lambda axes: _draw_curve(result, points, axes), size=(5.6, 3.6),
-        only="page" if len(points) > 1 else "notebook",
-    )  # fmt: skip
-    curve = ResultPart.table(
-        known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE
-    )
-    runs = [row.run for row in result.table]
-    objects = ResultPart.table(
+        columns["right on average"] = _average_text
+        columns["95 % interval"] = _average_interval
+    return ResultPart.table(
         result.table,
-        by_object,
+        columns,
         title="The objects, at the last epsilon tried",
-        parts=runs,
-    )
-    meaning = ResultPart(
-        text=[
-            f"Margin: {words.margin_text(result.task)}, in the "
-            "trials of the worst case."
-        ]
-    )
-    sections = [
-        *([chart] if points else []),
-        *([curve] if known else []),
-        objects,
-        meaning,
-    ]
-    return ShownResult(
-        _curve_text(result, known),
-        sections,
-        {"model": result.model, "policy": result.policy},
+        parts=[row.run for row in result.table],
     )
 
 
 def _average_text(row: ObjectRow) -> str:
-    """Return how many of the random configurations of an object are right; empty where
-    none was drawn.
-    """
+    """Return how many random configurations of an object are right; empty if none."""
     if row.average is None:
         return ""
-    share = words.percent(row.average.accuracy)
-    return f"{row.average.correct}/{row.average.configurations} ({share})"
+    accuracy = words.percent(row.average.accuracy)
+    return f"{row.average.correct}/{row.average.configurations} ({accuracy})"
 
 
 def _average_interval(row: ObjectRow) -> str:
@@ -352,18 +335,26 @@ def _average_interval(row: ObjectRow) -> str:
 
 
 def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
+    """Return the result of a curve in a sentence.
+
+    Args:
+        result: of the curve.
+        known: the epsilons with a robust accuracy.
+    """
+
     def at(epsilon: float | None) -> str:
         return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
-    row = result.table[0] if result.table else None
-    if not known or row is None:
+    if not known or not result.table:
         return "No object was attacked to the end."
     if len(result.objects) > 1:
-        ends = [
+        first_and_last = [known[0]] if len(known) == 1 else [known[0], known[-1]]
+        rates = [
             f"{point.robust} of {point.objects}{at(point.epsilon)}"
-            for point in (*known[:1], *known[1:][-1:])
+            for point in first_and_last
         ]
-        return f"Still recognised: {' and '.join(ends)}."
+        return f"Still recognised: {' and '.join(rates)}."
+    row = result.table[0]
     if row.ending == "already wrong":
         return f"The model is wrong about {row.object} as it is."
     if row.flips_at is None:
@@ -372,6 +363,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
 
 
 def plain_epsilon(value: EpsilonBudget) -> str:
+    """Return an epsilon, or those of several controls, as text; empty for None."""
     if isinstance(value, dict):
         return ",".join(
             f"{name}={plain_epsilon(epsilon)}" for name, epsilon in value.items()
@@ -380,13 +372,15 @@ def plain_epsilon(value: EpsilonBudget) -> str:
 
 
 def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) -> None:
-    at = [point.epsilon for point in points]
+    """Draw the robust accuracy over epsilon on matplotlib axes."""
+    epsilon = [point.epsilon for point in points]
     accuracy = [point.accuracy for point in points]
-    low, high = ([point.interval[end] for point in points] for end in (0, 1))
+    low = [point.interval[0] for point in points]
+    high = [point.interval[1] for point in points]
     axes.fill_between(
-        at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval"
+        epsilon, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval"
     )
-    axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
+    axes.plot(epsilon, accuracy, color=BLUE, marker="o", label="robust accuracy")
     axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
     axes.set_title(
         f"{', '.join(result.controls)}: {points[0].objects} objects, {result.model}"
@@ -395,28 +389,29 @@ def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) ->
     axes.legend()
 
 
-def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
-    total: Counter[str] = Counter()
+def _curve_claims(result: CurveResult) -> Iterator[Claim]:
+    """Yield the robust accuracy at each epsilon, and the average of each object."""
+    renders: Counter[str] = Counter()
     for row in result.table:
-        total.update(row.renders or {})
-    searched = views.searches_text(total, result.policy, bool(total["baseline"]))
-    spent = f"Searched were, of all objects and epsilons together, {searched}. "
+        renders.update(row.renders or {})
+    searches = ""
+    if renders:
+        spent = views.searches_text(renders, result.policy, bool(renders["baseline"]))
+        searches = f"Searched were, of all objects and epsilons together, {spent}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
         extent = views.counted(
             "objects without a failure", point.robust, point.objects, point.interval
         )
-        where = (
-            "the controls' own budget"
-            if point.epsilon is None
-            else f"epsilon {point.epsilon:g}"
-        )
+        budget = "the controls' own budget"
+        if point.epsilon is not None:
+            budget = f"epsilon {point.epsilon:g}"
         text = (
-            f"Within {where} the policy {result.policy} found no failure of "
+            f"Within {budget} the policy {result.policy} found no failure of "
             f"{views.share_text(extent)} objects; "
             f"{point.already_wrong} are wrong as they are. "
-            f"{spent if total else ''}{views.NO_PROOF}"
+            f"{searches}{views.NO_PROOF}"
         )
         yield views.claim("measured", text, extent)
     for row in result.table:
@@ -424,36 +419,52 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
             yield views.average_claim(row.average, row.object)
 
 
-# ---- attacked on against tested on
-# ----------------------------------------------------------------------------------
+def _view_matrix(result: MatrixResult) -> ShownResult:
+    """Return the view of a matrix."""
+    n_rows = sum(bool(row.tested) for row in result.table)
+    figure = ResultPart(
+        draw=lambda axes: _draw_matrix(result, axes),
+        size=(2.6 + 1.3 * len(result.models), 1.8 + 0.5 * n_rows),
+        only="notebook",
+    )
+    models = ", ".join(
+        f"{tested.model} ({' x '.join(map(str, tested.input_size))})"
+        for tested in result.tested
+    )
+    facts = {
+        "models": models,
+        "ensemble": result.ensemble or "",
+        "policy": result.policy,
+    }
+    sections = [_matrix_part(result), *([figure] if n_rows else [])]
+    return ShownResult(_matrix_text(result), sections, facts)
 
 
-def _shown_matrix(result: MatrixResult) -> ShownResult:
-    """The matrix, with a row for the clean scene; the stronger a cell's colour, the
-    more successes.
+def _matrix_part(result: MatrixResult) -> ResultPart:
+    """Return the table of a matrix, with a row for the clean scene.
+
+    The stronger a cell's color, the more successes.
     """
-    marks = {"found": " *", "already wrong": " (wrong already)"}
-    heads = [
-        "attacked on",
-        "ending",
-        *(f"tested on {words.short_name(tried.model)}" for tried in result.tested),
-    ]
-    right = [
-        f"right {', '.join(words.rated_cells(tried.clean))}" for tried in result.tested
-    ]
-    rows = [["clean scene", "", *right]] if right else []
-    before = len(rows)
-    shares = dict[tuple[int, int], float]()
-    for up, row in enumerate(result.table, before):
-        cells = [
-            ", ".join(words.rated_cells(cell.verified)) + marks.get(cell.ending, "")
-            for cell in row.tested
+    heads = ["attacked on", "ending"]
+    heads += [f"tested on {words.short_name(tested.model)}" for tested in result.tested]
+    rows = list[list[str]]()
+    runs = list[str | None]()
+    if result.tested:
+        clean_rates = [
+            f"right {', '.join(words.rated_cells(tested.clean))}"
+            for tested in result.tested
         ]
-        rows.append([words.short_name(row.attacked), row.ending, *cells])
-        shares |= {
-            (up, across): cell.verified.rate
-            for across, cell in enumerate(row.tested, 2)
-        }
+        rows.append(["clean scene", "", *clean_rates])
+        runs.append(None)
+    rate_of_cell = dict[tuple[int, int], float]()
+    for row in result.table:
+        cells = [words.short_name(row.attacked), row.ending]
+        for cell in row.tested:
+            rate_of_cell[len(rows), len(cells)] = cell.verified.rate
+            rate = ", ".join(words.rated_cells(cell.verified))
+            cells.append(rate + ENDING_MARKS.get(cell.ending, ""))
+        rows.append(cells)
+        runs.append(row.run)
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
     note = (
         "Successes of the trials, in which the model is wrong on the adversarial scene "
@@ -463,71 +474,53 @@ def _shown_matrix(result: MatrixResult) -> ShownResult:
         f"scene with the same seeds{spp}, rounded to 8 bits. The stronger a cell's "
         "colour, the more successes."
     )
-    runs = [*[None] * before, *(row.run for row in result.table)]
-    table = ResultPart(
+    return ResultPart(
         "Attacked on, tested on",
         heads=heads,
         rows=rows,
         note=note,
         parts=runs,
-        shares=shares,
+        shares=rate_of_cell,
     )
-    tried = sum(bool(row.tested) for row in result.table)
-    size = (2.6 + 1.3 * len(result.models), 1.8 + 0.5 * tried)
-    figure = ResultPart(
-        draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook"
-    )
-    facts = {
-        "models": ", ".join(
-            f"{tried.model} ({' x '.join(map(str, tried.input_size))})"
-            for tried in result.tested
-        ),
-        "ensemble": result.ensemble or "",
-        "policy": result.policy,
-    }
-    at_home = [
-        cell.ending
-        for row in result.table
-        for cell in row.tested
-        if cell.model == row.attacked
-    ]
-    others = [
-        cell.ending
-        for row in result.table
-        for cell in row.tested
-        if cell.model != row.attacked
-    ]
-    held = at_home.count("found")
-    passed = others.count("found")
-    pairs = len(at_home) + len(others)
-    text = (
-        f"{held} of {len(at_home)} answers hold on the model that they were searched "
-        "on; "
-        f"{passed} of {len(others)} on another one."
-    )
-    if not pairs:
-        text = "No adversarial scene was tried on any model."
-    elif result.ensemble is not None:
-        text = (
-            f"One scene against all models together misleads {held + passed} of "
-            f"{pairs}."
+
+
+def _matrix_text(result: MatrixResult) -> str:
+    """Return the result of a matrix in a sentence."""
+    same_model = list[str]()
+    other_model = list[str]()
+    for row in result.table:
+        for cell in row.tested:
+            endings = same_model if cell.model == row.attacked else other_model
+            endings.append(cell.ending)
+    n_held = same_model.count("found")
+    n_transferred = other_model.count("found")
+    n_pairs = len(same_model) + len(other_model)
+    if not n_pairs:
+        return "No adversarial scene was tried on any model."
+    if result.ensemble is not None:
+        return (
+            "One scene against all models together misleads "
+            f"{n_held + n_transferred} of {n_pairs}."
         )
-    return ShownResult(text, [table, *([figure] if tried else [])], facts)
+    return (
+        f"{n_held} of {len(same_model)} answers hold on the model that they were "
+        f"searched on; {n_transferred} of {len(other_model)} on another one."
+    )
 
 
 def _draw_matrix(result: MatrixResult, axes: Any) -> None:
+    """Draw the rates of a matrix on matplotlib axes."""
     rows = [row for row in result.table if row.tested]
     rates = [[cell.verified.rate for cell in row.tested] for row in rows]
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
-    for up, row in enumerate(rows):
-        for across, cell in enumerate(row.tested):
+    for y, row in enumerate(rows):
+        for x, cell in enumerate(row.tested):
             text = f"{cell.verified.successes}/{cell.verified.trials}"
-            colour = "white" if rates[up][across] > 0.6 else "black"
-            axes.text(across, up, text, ha="center", va="center", color=colour)
-    names = [words.short_name(tried.model) for tried in result.tested]
-    axes.set_xticks(
-        range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0
-    )
+            color = "white" if rates[y][x] > 0.6 else "black"
+            axes.text(x, y, text, ha="center", va="center", color=color)
+    tested_names = [words.short_name(tested.model) for tested in result.tested]
+    rotation = 20 if max(map(len, tested_names)) > 12 else 0
+    axes.set_xticks(range(len(tested_names)), tested_names, rotation=rotation)
     axes.set_yticks(range(len(rows)), [words.short_name(row.attacked) for row in rows])
     axes.set(xlabel="tested on", ylabel="attacked on")
     axes.set_title(

@@ -1,15 +1,15 @@
-"""From what an attack found to its summary, its pictures and its files."""
+"""Make the result of an attack from its findings: summary, images and files."""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from torch import Tensor
 
-from advsearch.attacks import Ending, SearchResult, count_right
+from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.engine.journal import Journal
@@ -25,8 +25,15 @@ from advsearch.engine.record import (
 from advsearch.engine.transport import remark
 from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.progress import Stages
-from advsearch.questions.attack import result as kept
-from advsearch.questions.attack.result import AttackResult, KeptPicture
+from advsearch.questions.attack.result import (
+    AttackResult,
+    KeptPicture,
+    along_drive,
+    save_trial,
+    trial_to_show,
+    write_object,
+    write_pictures,
+)
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import (
     AmbientLight,
@@ -52,6 +59,7 @@ from advsearch.questions.attack.summary import (
     VerificationSamples,
 )
 from advsearch.report.wording import number_text
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import (
     AverageCase,
     DescribedValue,
@@ -69,7 +77,7 @@ from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
 
 T = TypeVar("T")
-MOST_NUMBERS = 4096  # Numbers of a distribution that a summary names, at most
+MAX_LISTED_NUMBERS = 4096  # of a distribution, in a summary
 
 
 def make_result(
@@ -86,8 +94,7 @@ def make_result(
     command_line: str | None,
     python_only: list[str],
 ) -> AttackResult:
-    """Make the result of an attack from what it found, and store it with its images in
-    the run, if there is one.
+    """Make the result of an attack, and store it with its images in the run, if any.
 
     Args:
         findings: of the attack.
@@ -95,80 +102,143 @@ def make_result(
         stages: which took their time.
         warnings: so far.
         object_name: of the object under attack.
-        judge: the thing that is judged.
+        judge: the thing that is evaluated.
         policy: by name, as requested.
         objective: by name; None for the task's own.
         printable: whether the search had print terms.
-        command_line: repeats the attack; None where no command does.
+        command_line: repeats the attack; None if no command does.
         python_only: its parts that exist only in Python.
     """
     problem = journal.problem
     search = findings.search
     run = journal.run
-    space = problem.searched_space
-    start = problem.domain.start
-    u = start if search is None else problem.domain.project(search.best_u)
     stages.progress.stage("making the pictures and the report")
-    # whoever presses Ctrl-C is in a hurry
-    trial = None if findings.interrupted else kept.trial_to_show(findings)
-    clean, adversarial = (
-        KeptPicture.of(problem, findings, at, trial) for at in (start, u)
-    )
-    artifacts = space.artifacts(u)
+    u = problem.domain.start
+    if search is not None:
+        u = problem.domain.project(search.best_u)
+    # After Ctrl-C no more images are rendered than needed.
+    trial = None if findings.interrupted else trial_to_show(findings)
+    clean = KeptPicture.of(problem, findings, problem.domain.start, trial)
+    adversarial = KeptPicture.of(problem, findings, u, trial)
+    artifacts = problem.searched_space.artifacts(u)
     if run is not None:
-        kept.write_pictures(
-            run, problem, findings, {"clean": clean, "adversarial": adversarial}
-        )
-        for number, checked in enumerate(findings.failures):
-            kept.save_trial(
-                run,
-                problem,
-                findings,
-                (f"failure {number}", 0),
-                _picture(number),
-                checked.u,
-            )
-        # an 8-bit PNG, and the same display-referred values in float32
-        for name, picture in artifacts.items():
-            run.save_image(name, picture, folder="artifacts")
-            run.save_exr(name, picture, folder="artifacts")
-        kept.write_object(run, problem, u)
-        for name, data in space.files(u).items():
-            write_bytes(run.path / "artifacts" / name, data)
-        write_configuration(run.path, u.numpy())
-    searched = None if search is None else u
-    drive = (
-        None
-        if findings.interrupted
-        else kept.along_drive(problem, searched, findings.spp, run)
-    )
-    task = problem.task
-    depth = problem.renderer.scene.max_depth
-    controls = problem.searched_space.controls
-    verification = findings.verification
-    history = [] if search is None else search.history
-    path = None if run is None else run.path
-    summary = AttackSummary(
-        run=None if path is None else str(path),
+        images = {"clean": clean, "adversarial": adversarial}
+        _write_files(run, problem, findings, u, images, artifacts)
+    drive = None
+    if not findings.interrupted:
+        searched_u = None if search is None else u
+        drive = along_drive(problem, searched_u, findings.spp, run)
+    summary = _summarize(
+        findings,
+        journal,
+        clean,
+        adversarial,
+        run=None if run is None else str(run.path),
         object=object_name,
         judge=judge,
+        policy=policy,
+        objective=name_objective(problem.task, objective),
+        drive=drive,
+        printability=_printability(problem, findings) if printable else None,
+        warnings=[*warnings, *_remarks(findings, problem, journal)],
+        seconds={**stages.seconds, "total": stages.total},
+        command_line=command_line,
+        python_only=python_only,
+    )
+    if run is not None:
+        keep_result(run, summary)
+        if not findings.interrupted:
+            run.store.forget()
+    return AttackResult(
+        summary,
+        None if run is None else run.path,
+        u,
+        clean.picture,
+        adversarial.picture,
+        artifacts,
+        search,
+        in_memory=tuple(journal.rows),
+    )
+
+
+def _write_files(
+    run: RunDirectory,
+    problem: Problem,
+    findings: Findings,
+    u: Tensor,
+    images: Mapping[str, KeptPicture],
+    artifacts: Mapping[str, Tensor],
+) -> None:
+    """Write images, the object and the configuration into the run directory.
+
+    Args:
+        run: the run directory.
+        problem: of the attack.
+        findings: of the attack.
+        u: (d,) the adversarial configuration.
+        images: of both scenes.
+        artifacts: images that the controls make of `u`.
+    """
+    write_pictures(run, problem, findings, images)
+    for number, verification in enumerate(findings.failures):
+        trial = (f"failure {number}", 0)
+        save_trial(
+            run, problem, findings, trial, _failure_image(number), verification.u
+        )
+    # an 8-bit PNG, and the same display-referred values in float32
+    for name, image in artifacts.items():
+        run.save_image(name, image, folder="artifacts")
+        run.save_exr(name, image, folder="artifacts")
+    write_object(run, problem, u)
+    for name, data in problem.searched_space.files(u).items():
+        write_bytes(run.path / "artifacts" / name, data)
+    write_configuration(run.path, u.numpy())
+
+
+def _summarize(
+    findings: Findings,
+    journal: Journal,
+    clean: KeptPicture,
+    adversarial: KeptPicture,
+    **fields: Any,
+) -> AttackSummary:
+    """Return what `summary.json` holds.
+
+    Args:
+        findings: of the attack.
+        journal: of the run.
+        clean: image of the clean scene.
+        adversarial: image of the adversarial scene.
+        **fields: those that follow from neither.
+    """
+    problem = journal.problem
+    task = problem.task
+    search = findings.search
+    verification = findings.verification
+    controls = problem.searched_space.controls
+    random_controls = problem.space.controls[len(controls) :]
+    max_depth = problem.renderer.scene.max_depth
+    return AttackSummary(
+        **fields,
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,
-        controls=[bound.name for bound in controls],
-        policy=policy,
-        objective=name_objective(task, objective),
-        epsilon=_alone({bound.name: bound.budget.epsilon for bound in controls}),
-        norm=_alone({bound.name: bound.budget.norm for bound in controls}),
+        controls=[control.name for control in controls],
+        epsilon=_unwrap_single(
+            {control.name: control.budget.epsilon for control in controls}
+        ),
+        norm=_unwrap_single(
+            {control.name: control.budget.norm for control in controls}
+        ),
         label_set=list(task.truth_names(problem.truth())),
         goal=task.goal,
         target=list(task.target_names) or None,
-        over=[bound.name for bound in problem.space.controls[len(controls) :]],
+        over=[control.name for control in random_controls],
         conditions=_conditions(problem),
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
         light_path_segments=PathSegments(
-            search=problem.search_depth or depth, verification=depth
+            search=problem.search_depth or max_depth, verification=max_depth
         ),
         ending=_ending(problem, findings).value,
         clean=_clean_prediction(problem, findings, clean),
@@ -185,11 +255,9 @@ def make_result(
         baseline=_baseline(problem, findings),
         answer_from="random" if findings.beaten is not None else None,
         policy_verified=findings.beaten and verified_rate(findings.beaten),
-        drive=drive,
         ambient=_ambient_light(findings),
         average=_average_case(findings),
         smallest=_smallest_epsilon(problem, findings),
-        printability=_printability(problem, findings) if printable else None,
         distribution=None if search is None else _distribution(problem, search),
         failures=described_failures(problem, findings),
         sample_count=findings.sample_count
@@ -200,55 +268,40 @@ def make_result(
         configuration=None if search is None else _found_values(problem, search.best_u),
         shared=SharedWork.of_facts(journal.traced.facts, journal.machines),
         renders=_renders(findings, problem),
-        steps=len(history),
+        steps=0 if search is None else len(search.history),
         non_finite=NotFinite(
             objectives=0 if search is None else search.non_finite_objectives,
             gradient_elements=0 if search is None else search.non_finite_elements,
         ),
-        warnings=[*warnings, *_remarks(findings, problem, journal)],
-        seconds={**stages.seconds, "total": stages.total},
         seed=problem.seed,
-        command_line=command_line,
-        python_only=python_only,
-    )
-    if run is not None:
-        keep_result(run, summary)
-        if not findings.interrupted:
-            run.store.forget()
-    return AttackResult(
-        summary,
-        path,
-        u,
-        clean.picture,
-        adversarial.picture,
-        artifacts,
-        search,
-        in_memory=tuple(journal.rows),
     )
 
 
-def _alone(values: dict[str, T]) -> T | dict[str, T]:
+def _unwrap_single(values: dict[str, T]) -> T | dict[str, T]:
+    """Return the value of a single control, or all by control."""
     return next(iter(values.values())) if len(values) == 1 else values
 
 
 def _ending(problem: Problem, findings: Findings) -> Ending:
+    """Return how the attack ended."""
     if findings.interrupted:
         return Ending.INTERRUPTED
     if findings.verification is not None:
         return findings.verification.ending
-    if findings.clean and problem.rule.already_wrong(
-        count_right(findings.clean, findings.spp)
-    ):
-        return Ending.ALREADY_WRONG
+    if findings.clean:
+        counts = count_right(findings.clean, findings.spp)
+        if problem.rule.already_wrong(counts):
+            return Ending.ALREADY_WRONG
     return Ending.INTERRUPTED
 
 
 def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
-    said = judgement.prediction
+    """Return the prediction of a stored image, which is that of a trial, if any."""
+    prediction = judgement.prediction
     return PicturedPrediction(
-        label=said.label,
-        index=said.index,
-        probability=said.probability,
+        label=prediction.label,
+        index=prediction.index,
+        probability=prediction.probability,
         payload=judgement.payload,
         trial=trial,
     )
@@ -257,39 +310,45 @@ def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
 def _clean_prediction(
     problem: Problem, findings: Findings, picture: KeptPicture
 ) -> CleanPrediction:
+    """Return the prediction of the clean scene, with its trials if there are any."""
+    control = None
+    if findings.clean:
+        control = control_group(findings.clean, findings.spp)
     return CleanPrediction(
         **vars(_prediction(picture.judgement, picture.trial)),
         correct=picture.judgement.right,
         moved=[MovedValue.of(value) for value in problem.space.moved],
-        control=control_group(findings.clean, findings.spp) if findings.clean else None,
+        control=control,
     )
 
 
 def _baseline(problem: Problem, findings: Findings) -> BaselineSearch | None:
+    """Return the random search; None if there was none."""
     if findings.baseline is None:
         return None
-    verified = findings.baseline_verification and verified_rate(
-        findings.baseline_verification
-    )
+    verification = findings.baseline_verification
     return BaselineSearch(
         policy="random",
         renders=findings.baseline.renders * problem.draws,
-        verified=verified,
+        verified=verification and verified_rate(verification),
     )
 
 
 def _ambient_light(findings: Findings) -> AmbientLight | None:
+    """Return in which ambient light the adversarial scene holds, if that was tried."""
     if not findings.ambient:
         return None
     points = [
         AmbientPoint(
-            lux=lux, holds=tried.ending is Ending.FOUND, verified=verified_rate(tried)
+            lux=lux,
+            holds=verification.ending is Ending.FOUND,
+            verified=verified_rate(verification),
         )
-        for lux, tried in sorted(findings.ambient.items())
+        for lux, verification in sorted(findings.ambient.items())
     ]
-    n_holding = next(
-        (number for number, point in enumerate(points) if not point.holds), len(points)
-    )
+    n_holding = 0
+    while n_holding < len(points) and points[n_holding].holds:
+        n_holding += 1
     return AmbientLight(
         lux=points[0].lux,
         holds_to=points[n_holding - 1].lux,
@@ -299,39 +358,45 @@ def _ambient_light(findings: Findings) -> AmbientLight | None:
 
 
 def _average_case(findings: Findings) -> AverageCase | None:
+    """Return the rate over random configurations, if there are any.
+
+    Those without the object count only if there are no others.
+    """
     if not findings.average:
         return None
     visible = [
         trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW
-    ] or findings.average
-    right = count_right(visible, findings.spp)
-    scores = [trial.score for trial in visible]
+    ]
+    trials = visible or findings.average
+    right = count_right(trials, findings.spp)
+    scores = [trial.score for trial in trials]
+    known_scores = [score for score in scores if not math.isnan(score)]
+    # 0.0 - x and not -x: a margin of 0 has no sign
     return AverageCase(
         configurations=right.trials,
         correct=right.successes,
         accuracy=right.rate,
         interval=right.interval,
         margin=0.0 - mean_number(scores),
-        worst_margin=0.0
-        - max((score for score in scores if score == score), default=math.nan),
+        worst_margin=0.0 - max(known_scores, default=math.nan),
     )
 
 
 def _smallest_epsilon(problem: Problem, findings: Findings) -> SmallestEpsilon | None:
+    """Return the bracket of the smallest epsilon, by control; None if not searched."""
     bracket = findings.smallest
     if bracket is None:
         return None
-    budgets = {
-        bound.name: float(bound.budget.epsilon or 0.0)
-        for bound in problem.searched_space.controls
-    }
+
+    def scale_budgets(factor: float) -> dict[str, float]:
+        return {
+            control.name: factor * float(control.budget.epsilon or 0.0)
+            for control in problem.searched_space.controls
+        }
+
     return SmallestEpsilon(
-        epsilon=None
-        if bracket.u is None
-        else {name: bracket.high * budget for name, budget in budgets.items()},
-        not_found_at={name: bracket.low * budget for name, budget in budgets.items()}
-        if bracket.low
-        else None,
+        epsilon=None if bracket.u is None else scale_budgets(bracket.high),
+        not_found_at=scale_budgets(bracket.low) if bracket.low else None,
         closed=bracket.closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
@@ -340,6 +405,7 @@ def _smallest_epsilon(problem: Problem, findings: Findings) -> SmallestEpsilon |
 
 
 def _claim(search: SearchResult) -> SearchClaim:
+    """Return what the search itself claims."""
     return SearchClaim(
         objective=search.claimed_objective,
         re_evaluated=search.best_objective,
@@ -348,16 +414,18 @@ def _claim(search: SearchResult) -> SearchClaim:
 
 
 def _gradients(search: SearchResult) -> SearchGradients:
+    """Return the statistics of the gradients of a search."""
     norms = [
         record.gradient_norm
         for record in search.history
-        if record.objective == record.objective
+        if not math.isnan(record.objective)
     ]
+    median_cosine = None
+    if search.agreement:
+        median_cosine = statistics.median(search.agreement)
     return SearchGradients(
         count=search.gradients,
-        cosine_with_the_one_before=statistics.median(search.agreement)
-        if search.agreement
-        else None,
+        cosine_with_the_one_before=median_cosine,
         zero=sum(norm == 0.0 for norm in norms),
         cut=search.counts.cut,
         shortened=search.counts.shortened,
@@ -366,63 +434,69 @@ def _gradients(search: SearchResult) -> SearchGradients:
 
 
 def _distribution(problem: Problem, search: SearchResult) -> SearchDistribution | None:
+    """Return the distribution that a policy ended with; None if it has none."""
     distribution = search.distribution
-    if distribution is None or distribution.mean.numel() > MOST_NUMBERS:
+    if distribution is None or distribution.mean.numel() > MAX_LISTED_NUMBERS:
         return None
-    middle = problem.describe(problem.domain.project(distribution.mean))
+    mean_values = problem.describe(problem.domain.project(distribution.mean))
     return SearchDistribution(
-        mean={name: DescribedValue.of(value) for name, value in middle.items()},
+        mean={name: DescribedValue.of(value) for name, value in mean_values.items()},
         deviation=distribution.deviation.tolist(),
     )
 
 
 def name_objective(task: Task, objective: str | None) -> str:
-    """Name what a search maximised: a task's own score has the name of the goal that
-    the task seeks.
+    """Return the name of what a search maximised.
 
-    "vanish" is what "score" means to a detector without a goal, so it stays "score".
+    A task's own score has the name of the goal that the task seeks. "vanish" is what
+    "score" means to a detector without a goal, so it stays "score".
+
+    Args:
+        task: of the search.
+        objective: None for the task's own.
     """
-    named = objective or task.objective
+    name = objective or task.objective
     goal = getattr(task, "seek", "")
-    if named == Task.objective and goal not in ("", Detection.seek):
+    if name == Task.objective and goal not in ("", Detection.seek):
         return str(goal)
-    return named
+    return name
 
 
 def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
-    """Return mean, deviation and range of the objective over trials; None where there
-    are none.
-    """
+    """Return mean, deviation and range of the objective over trials, if it is known."""
     values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
         return None
-    spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
+    are_finite = all(map(math.isfinite, values))
+    deviation = statistics.pstdev(values) if are_finite else math.nan
     return ObjectiveValues(
-        mean=mean(values), deviation=spread, low=min(values), high=max(values)
+        mean=mean(values), deviation=deviation, low=min(values), high=max(values)
     )
 
 
 def _printability(problem: Problem, findings: Findings) -> Printability:
+    """Return how printable the scenes are, and what that costs in margin."""
+
     def terms_of(search: SearchResult | None) -> PrintTerms | None:
         if search is None:
             return None
-        return print_terms(
-            problem.searched_space, problem.domain.project(search.best_u)
-        )
+        u = problem.domain.project(search.best_u)
+        return print_terms(problem.searched_space, u)
 
-    verified = findings.verification
-    unprinted_verified = findings.unprinted_verification
     cost = None
-    unprinted_terms = terms_of(findings.unprinted)
-    if verified and unprinted_verified and findings.unprinted and unprinted_terms:
-        margin = verified_rate(verified).margin
-        unprinted = verified_rate(unprinted_verified)
+    verification = findings.verification
+    unprinted = findings.unprinted
+    unprinted_verification = findings.unprinted_verification
+    unprinted_terms = terms_of(unprinted)
+    if verification and unprinted_verification and unprinted and unprinted_terms:
+        margin = verified_rate(verification).margin
+        unprinted_rate = verified_rate(unprinted_verification)
         cost = PrintCost(
-            steps=len(findings.unprinted.history),
+            steps=len(unprinted.history),
             margin_with=margin,
-            margin_without=unprinted.margin,
-            cost=margin - unprinted.margin,
-            verified=unprinted,
+            margin_without=unprinted_rate.margin,
+            cost=margin - unprinted_rate.margin,
+            verified=unprinted_rate,
             terms=unprinted_terms,
         )
     clean = print_terms(problem.searched_space, problem.domain.start)
@@ -430,83 +504,104 @@ def _printability(problem: Problem, findings: Findings) -> Printability:
 
 
 def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
-    """Return the adversarial configuration, with the clean value and, of a single
-    number, the bounds of its range.
+    """Return the adversarial configuration, with clean values and ranges.
+
+    A range has what is a single number.
+
+    Args:
+        problem: of the attack.
+        u: (d,) the configuration.
     """
     start = problem.domain.start
-    single = {
+    column_of_number = {
         group.name: group.begin
         for group in problem.space.groups
         if group.size == 1 and group.begin < len(start)
     }
-    bounds = []
-    for bound in (0.0, 1.0):
-        moved = start.clone()
-        moved[[*single.values()]] = bound
-        bounds.append(problem.describe(moved))
+    columns = [*column_of_number.values()]
+    values_at_low = _describe_with(problem, start, columns, 0.0)
+    values_at_high = _describe_with(problem, start, columns, 1.0)
     clean_values = problem.describe(start)
-    values = dict[str, FoundValue]()
+    found_values = dict[str, FoundValue]()
     for name, described in problem.describe(problem.domain.project(u)).items():
-        clean = clean_values[name]["value"] if name in clean_values else None
-        low, high = (
-            at_bound[name]["value"] if name in at_bound else None for at_bound in bounds
-        )
+        clean = _value_of(clean_values, name)
+        low = _value_of(values_at_low, name)
+        high = _value_of(values_at_high, name)
         has_range = (
-            name in single
+            name in column_of_number
             and isinstance(low, float)
             and isinstance(high, float)
             and low < high
         )
-        values[name] = FoundValue(
+        found_values[name] = FoundValue(
             value=described["value"],
             unit=described["unit"],
             clean=clean if isinstance(clean, (int, float, str)) else None,
             low=low if has_range else None,
             high=high if has_range else None,
         )
-    return values
+    return found_values
+
+
+def _describe_with(
+    problem: Problem, u: Tensor, columns: list[int], coordinate: float
+) -> dict[str, Value]:
+    """Return the values of a configuration with some coordinates set."""
+    changed = u.clone()
+    changed[columns] = coordinate
+    return problem.describe(changed)
+
+
+def _value_of(values: Mapping[str, Value], name: str) -> Any:
+    return values[name]["value"] if name in values else None
 
 
 def _conditions(problem: Problem) -> dict[str, VariedValue]:
-    varied: dict[str, VariedValue] = {}
+    """Return the ranges of the single numbers that vary by chance, by name."""
+    ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
-        return varied
+        return ranges
     start = problem.whole(problem.domain.start)
-    for group, (block, _) in zip(
-        problem.space.groups, domain_of(problem.space.controls).parts(), strict=True
-    ):
-        if group.size != 1 or group.begin < len(problem.domain.start):
+    domain = domain_of(problem.space.controls)
+    for group, (block, _) in zip(problem.space.groups, domain.parts(), strict=True):
+        is_random = group.begin >= len(problem.domain.start)
+        if group.size != 1 or not is_random:
             continue
+        coordinates = [0.0, 1.0]
+        if block.options:
+            coordinates = [
+                (option + 0.5) / block.options for option in range(block.options)
+            ]
         described = list[Value]()
-        for share in [(k + 0.5) / block.options for k in range(block.options)] or [
-            0.0,
-            1.0,
-        ]:
-            moved = start.clone()
-            moved[group.begin] = share
-            described += filter(None, [problem.space.describe(moved).get(group.name)])
-        if not described:
-            continue
-        values = [value["value"] for value in described]
-        unit = str(described[0]["unit"])
-        numbers = [float(value) for value in values if isinstance(value, (int, float))]
-        if numbers and not block.options:
-            varied[group.name] = VariedValue(
-                unit=unit, low=min(numbers), high=max(numbers)
-            )
-        else:
-            varied[group.name] = VariedValue(
-                unit=unit, names=[number_text(value) for value in dict.fromkeys(values)]
-            )
-    return varied
+        for coordinate in coordinates:
+            u = start.clone()
+            u[group.begin] = coordinate
+            value = problem.space.describe(u).get(group.name)
+            if value:
+                described.append(value)
+        if described:
+            ranges[group.name] = _to_range(described, is_choice=bool(block.options))
+    return ranges
+
+
+def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
+    """Return the range of numbers, or the names of a choice."""
+    unit = str(described[0]["unit"])
+    values = [value["value"] for value in described]
+    numbers = [float(value) for value in values if isinstance(value, (int, float))]
+    if numbers and not is_choice:
+        return VariedValue(unit=unit, low=min(numbers), high=max(numbers))
+    names = [number_text(value) for value in dict.fromkeys(values)]
+    return VariedValue(unit=unit, names=names)
 
 
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
+    """Count the images that were rendered, by what for, and those predicted instead."""
     transport = findings.transport
-    spent = dict.fromkeys(
+    counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
-    spent["verification"] = findings.verification_renders + len(findings.first_look)
+    counts["verification"] = findings.verification_renders + len(findings.first_look)
     searches = {
         "search": findings.search,
         "baseline": findings.baseline,
@@ -515,50 +610,56 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     for kind, search in searches.items():
         if search is None:
             continue
-        predicted = (
-            transport.predicted(kind, len(search.history)) * problem.draws
-            if transport
-            else 0
-        )
-        rendered = search.renders * problem.draws - predicted
-        gradients = max(0, search.gradients - predicted)
-        spent["products"] += predicted
+        n_predicted = 0
+        if transport:
+            n_steps = transport.predicted(kind, len(search.history))
+            n_predicted = n_steps * problem.draws
+        n_rendered = search.renders * problem.draws - n_predicted
+        n_gradients = max(0, search.gradients - n_predicted)
+        counts["products"] += n_predicted
         if kind == UNPRINTED:
-            spent["unprinted"] = rendered + gradients
+            counts["unprinted"] = n_rendered + n_gradients
         else:
-            spent[kind] = rendered
-            spent["gradient"] += gradients if kind == "search" else 0
-    spent["search"] += transport.traced if transport else 0
-    return spent
+            counts[kind] = n_rendered
+            if kind == "search":
+                counts["gradient"] += n_gradients
+    if transport:
+        counts["search"] += transport.traced
+    return counts
 
 
 def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str]:
-    remarks = [why] if (why := remark(findings.rendered_because)) else []
-    count = findings.sample_count
-    if count is not None and count.table and not count.converged:
-        more = f"It is not shown that more than {count.spp} samples a pixel"
+    """Return what a reader of the result has to know."""
+    remarks = list[str]()
+    rendering_remark = remark(findings.rendered_because)
+    if rendering_remark:
+        remarks.append(rendering_remark)
+    samples = findings.sample_count
+    if samples is not None and samples.table and not samples.converged:
+        text = f"It is not shown that more than {samples.spp} samples a pixel"
         if problem.conditions is None:
-            more += (
+            text += (
                 ", the most that a check takes, would leave the margin on its "
                 "side: noise may decide the verdict."
             )
         else:
-            more += (
+            text += (
                 f" would leave the rate within {100 * MOVED:.0f} points. A check takes "
                 "no more than "
                 f"{OVER_LADDER[-1]}, and {MOST_TIMES} times the samples of the "
                 "searches; `verify_spp` asks for more."
             )
-        remarks.append(more)
-    searches = [
+        remarks.append(text)
+    n_in_searches = sum(
         search.non_finite_elements
         for search in (findings.search, findings.baseline)
         if search is not None
-    ]
-    # what predicts pictures has no such count
-    if not_finite := max(problem.renderer.non_finite, sum(searches)):
+    )
+    # What predicts images has no such count.
+    n_non_finite = max(problem.renderer.non_finite, n_in_searches)
+    if n_non_finite:
         remarks.append(
-            f"{not_finite} values of pictures or gradients were not finite "
+            f"{n_non_finite} values of pictures or gradients were not finite "
             "and were set to 0."
         )
     return [*remarks, *lost_remarks(journal.lost), *journal.remarks]
@@ -567,59 +668,101 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
 def described_failures(
     problem: Problem, findings: Findings
 ) -> DifferentFailures | None:
+    """Return the different failures of a policy that looks for them; else None."""
     known = findings.search.failures if findings.search else None
     if known is None:
         return None
-    listed = []
-    for number, failure in enumerate(known.listed):
-        checked = findings.failures[number] if number < len(findings.failures) else None
-        configuration = problem.describe(failure.u)
-        described = DifferentFailure(
-            ranges=_ranges_of(problem, failure),
-            configuration={
-                name: DescribedValue.of(value) for name, value in configuration.items()
-            },
-            objective=failure.objective,
-            holds=None if checked is None else checked.ending is Ending.FOUND,
-            verified=checked and verified_rate(checked),
-            picture=None if checked is None else f"images/{_picture(number)}.png",
-            pictured=checked and _prediction(checked.adversarial_trials[0], 0),
+    n_verified = len(findings.failures)
+    listed = [
+        _describe_failure(
+            problem,
+            failure,
+            number,
+            findings.failures[number] if number < n_verified else None,
         )
-        listed.append(described)
+        for number, failure in enumerate(known.listed)
+    ]
     return DifferentFailures(
-        over=[problem.domain.names[place] for place in known.over],
+        over=[problem.domain.names[column] for column in known.over],
         found=known.found,
         seen=known.seen,
         places=known.places,
         share=known.share and FailingShare.of(known.share),
-        tried=len(findings.failures),
-        held=sum(checked.ending is Ending.FOUND for checked in findings.failures),
+        tried=n_verified,
+        held=sum(
+            verification.ending is Ending.FOUND for verification in findings.failures
+        ),
         listed=listed,
+    )
+
+
+def _describe_failure(
+    problem: Problem,
+    failure: FoundFailure,
+    number: int,
+    verification: Verification | None,
+) -> DifferentFailure:
+    """Return one of the different failures, as a result lists it.
+
+    Args:
+        problem: of the attack.
+        failure: as the search found it.
+        number: in the list.
+        verification: None if it was not tried.
+    """
+    configuration = {
+        name: DescribedValue.of(value)
+        for name, value in problem.describe(failure.u).items()
+    }
+    ranges = _ranges_of(problem, failure)
+    if verification is None:
+        return DifferentFailure(
+            ranges=ranges,
+            configuration=configuration,
+            objective=failure.objective,
+            holds=None,
+            verified=None,
+            picture=None,
+            pictured=None,
+        )
+    return DifferentFailure(
+        ranges=ranges,
+        configuration=configuration,
+        objective=failure.objective,
+        holds=verification.ending is Ending.FOUND,
+        verified=verified_rate(verification),
+        picture=f"images/{_failure_image(number)}.png",
+        pictured=_prediction(verification.adversarial_trials[0], 0),
     )
 
 
 def _ranges_of(
     problem: Problem, failure: FoundFailure
 ) -> dict[str, tuple[float, float] | str]:
-    """Return the ranges of a failure: in the parameter's unit, else in u; of a discrete
-    choice its option.
+    """Return the ranges of a failure.
+
+    They are in the parameter's unit, or in u if that has none; of a discrete choice its
+    option.
     """
     ranges: dict[str, tuple[float, float] | str] = {}
-    for place, ends in failure.ranges.items():
-        block = problem.domain.block_of(place)
+    for column, bounds in failure.ranges.items():
+        block = problem.domain.block_of(column)
         values = list[Any]()
-        for end in ends:
-            moved = failure.u.clone()
-            moved[place] = failure.u[place] if block.options else end
-            value = problem.describe(moved).get(block.name)
-            values.append(end if value is None else value["value"])
+        for bound in bounds:
+            u = failure.u.clone()
+            if not block.options:
+                u[column] = bound
+            described = problem.describe(u).get(block.name)
+            values.append(bound if described is None else described["value"])
         options = [value for value in values if isinstance(value, str)]
-        numbers = values if block.size == 1 else ends
-        ranges[problem.domain.names[place]] = (
-            options[0] if options else (min(numbers), max(numbers))
-        )
+        name = problem.domain.names[column]
+        if options:
+            ranges[name] = options[0]
+        else:
+            numbers = values if block.size == 1 else bounds
+            ranges[name] = (min(numbers), max(numbers))
     return ranges
 
 
-def _picture(number: int) -> str:
+def _failure_image(number: int) -> str:
     return f"failure-{number:02d}"

@@ -1,5 +1,4 @@
-"""The page of an attack: what is shown of its result, with pictures, the course of the
-search and how it worked.
+"""The page of an attack: its result with images, and how the search went.
 
 Without its script it lacks the slider and the animation.
 """
@@ -8,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,63 +16,65 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.questions.attack import display, wording
-from advsearch.questions.attack.summary import AttackSummary
+from advsearch.questions.attack.summary import AttackSummary, FoundValue
 from advsearch.report import wording as words
 from advsearch.report.figures import search_axes
-from advsearch.report.views import Column, Picture, ResultPart
+from advsearch.report.views import Column, Html, Picture, ResultPart
 from advsearch.report.wording import count, number_text
 from advsearch.runs import directory, files, store
-from advsearch.runs.results import GroupDerivative, PlannedGradient, Result
+from advsearch.runs.results import (
+    ControlGroup,
+    GroupDerivative,
+    PlannedGradient,
+    Result,
+    VerifiedRate,
+)
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 
-FRAME_QUALITY = 85  # Of the JPEG frames of the search, from 1 to 95
-MOST_TRIALS = 24  # Pictures of the verification that the page shows
-# Of a range: as near as that to one of its ends a value was stopped by it
-AT_THE_END = 1e-6
-MARKED = "-prediction.png"
-"""How files with marks end, and how those of runs that were made before do."""
+FRAME_QUALITY = 85  # of the JPEG frames of the search, from 1 to 95
+MAX_TRIAL_IMAGES = 24  # of the verification on a page
+# fraction of a range; a value as near to an end lies at it
+END_TOLERANCE = 1e-6
+MARKED = "-prediction.png"  # end of the names of files with marks
 
 
 def page(run: Path, result: Result) -> str | None:
-    """Return the page of an attack in the folder `run`; None of several, which are
-    shown as all results are. Raises FileFormatError where the rows are damaged.
+    """Return the page of an attack.
+
+    None of a study, whose page is that of any result.
+
+    Args:
+        run: the run directory.
+        result: of the attack.
+
+    Raises:
+        FileFormatError: the rows are corrupt.
     """
     if not isinstance(result, AttackSummary):
         return None
-    given = display.shown(result)
-    thing = read_object(run)
+    view = display.shown(result)
+    turned_object = read_object(run)
     frames = _read_frames(run / directory.IMAGES / "search.gif")
-    curves = {}
-    if (run / store.NAME).is_file():
-        with store.Store(run / store.NAME, read_only=True) as stored:
-            curves = {
-                kind: [row.objective for row in stored.rows(kind)]
-                for kind in ("search", "baseline")
-            }
-    worked = [
+    objectives = _read_objectives(run)
+    method_rows = [
         [name, text] for name, text in wording.method_facts(result).items() if text
     ]
     sections = [
-        *_pictures(run, result, animated=bool(frames)),
-        object_part(thing),
-        _changes(result),
-        _textures(run),
-        *_failures(result),
-        _rates(result, given.sections[0]),
+        *_image_parts(run, result, animated=bool(frames)),
+        object_part(turned_object),
+        _changes_part(result),
+        _textures_part(run),
+        *_failures_parts(result),
+        _rates_part(result, view.sections[0]),
         *display.ambient_part(result),
-        _curve(result, curves),
-        ResultPart("How the search worked", rows=worked, folded=True),
-        _plan(result.gradient_plan),
+        _search_part(result, objectives),
+        ResultPart("How the search worked", rows=method_rows, folded=True),
+        _plan_part(result.gradient_plan),
     ]
-    times = {
-        name: words.seconds_text(seconds) for name, seconds in result.seconds.items()
-    }
-    total = times.pop("total")
-    parts = ", ".join(map(" ".join, times.items()))
     facts = {
-        **given.facts,
-        "time": f"{total} ({parts})" if parts else total,
+        **view.facts,
+        "time": _time_text(result.seconds),
         "image formation": words.formation_text(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
@@ -84,181 +85,246 @@ def page(run: Path, result: Result) -> str | None:
         result.environment,
         result.model,
     ]
-    data = object_data(thing)
-    # with the steps that they are of, where each step has one; the last is the
-    # adversarial one
+    data = object_data(turned_object)
     if frames:
-        searched = curves.get("search", [])
-        steps = [
-            round(number)
-            for number in np.linspace(0, max(len(searched) - 1, 0), len(frames) - 1)
-        ]
-        objectives = [
-            searched[step] if step < len(searched) else None for step in steps
-        ]
-        data = [
-            data_script(
-                {"pictures": frames, "steps": steps, "objectives": objectives}, "frames"
-            ),
-            *data,
-        ]
-    scripts = ["make.js", "attack.js", *(["object.js"] if thing else [])]
-    given = replace(given, sections=sections, facts=facts, about=about)
-    return shown_page(run, result, given, data=data, scripts=scripts)
+        data = [_frames_data(frames, objectives.get("search", [])), *data]
+    scripts = ["make.js", "attack.js"]
+    if turned_object:
+        scripts.append("object.js")
+    view = replace(view, sections=sections, facts=facts, about=about)
+    return shown_page(run, result, view, data=data, scripts=scripts)
 
 
-def _pictures(
+def _read_objectives(run: Path) -> dict[str, list[float | None]]:
+    """Read the objective of every evaluation of the search and of the baseline."""
+    if not (run / store.NAME).is_file():
+        return {}
+    with store.Store(run / store.NAME, read_only=True) as stored:
+        return {
+            kind: [row.objective for row in stored.rows(kind)]
+            for kind in ("search", "baseline")
+        }
+
+
+def _time_text(seconds: Mapping[str, float]) -> str:
+    """Return the total time, with that of each stage."""
+    times = {name: words.seconds_text(value) for name, value in seconds.items()}
+    total = times.pop("total")
+    stages = ", ".join(f"{name} {text}" for name, text in times.items())
+    return f"{total} ({stages})" if stages else total
+
+
+def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
+    """Return the frames of the search for the page's script.
+
+    Each has its step and the objective there; the last frame is the adversarial scene.
+
+    Args:
+        frames: data addresses.
+        objectives: of all evaluations of the search.
+    """
+    last_step = max(len(objectives) - 1, 0)
+    steps = [round(step) for step in np.linspace(0, last_step, len(frames) - 1)]
+    frame_objectives = [
+        objectives[step] if step < len(objectives) else None for step in steps
+    ]
+    data = {"pictures": frames, "steps": steps, "objectives": frame_objectives}
+    return data_script(data, "frames")
+
+
+def _image_parts(
     run: Path, summary: AttackSummary, *, animated: bool
 ) -> Iterator[ResultPart]:
-    predictions = {
-        name: "no prediction recorded"
-        if predicted is None
-        else words.prediction_text(summary.task, predicted)
-        for name, predicted in (
-            ("clean", summary.clean),
-            ("adversarial", summary.adversarial),
-        )
-    }
+    """Yield the sections with images.
 
-    def pair(ending: str) -> list[Picture]:
-        return [
-            Picture(f"images/{name}{ending}", text, name.capitalize())
-            for name, text in predictions.items()
-        ]
-
-    trial = summary.clean.trial
-    where = " and ".join(summary.over)
-    note = ""
-    if where and trial is None:
-        note = f"Both with the {where} that the scene comes with."
-    elif where:
-        others = "in other trials they, and what the model says, are others."
-        note = f"Both of trial {trial}, with the same {where}; {others}"
+    Args:
+        run: the run directory.
+        summary: of the attack.
+        animated: whether there are frames of the search.
+    """
+    images = run / directory.IMAGES
     gain = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
-    seen = [*pair(".png"), Picture("images/difference.png", gain, "Difference")]
-    yield ResultPart("What the model sees", pictures=[seen], note=note)
+    difference = Picture("images/difference.png", gain, "Difference")
+    yield ResultPart(
+        "What the model sees",
+        pictures=[[*_clean_and_adversarial(summary, ".png"), difference]],
+        note=_trial_note(summary),
+    )
     yield ResultPart(live="compare")
-    kept = run / directory.IMAGES
-    if (kept / f"clean{MARKED}").is_file():
-        marks = words.marks_text(summary.task)
+    if (images / f"clean{MARKED}").is_file():
         yield ResultPart(
-            "What it predicts", pictures=[pair(MARKED)], layout="large", note=marks
+            "What it predicts",
+            pictures=[_clean_and_adversarial(summary, MARKED)],
+            layout="large",
+            note=words.marks_text(summary.task),
         )
-    trials = sorted(file.name for file in kept.glob("verification*.png"))
-    trials = ([name for name in trials if name.endswith(MARKED)] or trials)[
-        :MOST_TRIALS
-    ]
-    if small := [
-        Picture(f"images/{name}", f"trial {''.join(filter(str.isdigit, name))}")
-        for name in trials
-    ]:
+    trial_images = _find_trial_images(images)
+    if trial_images:
         yield ResultPart(
             "Pictures of the verification",
-            pictures=[small],
+            pictures=[trial_images],
             layout="small",
             folded=True,
         )
     if animated:
         yield ResultPart("The search, step by step", live="search")
     if summary.drive is not None:
-        pictures = {"drive-clean": "Clean", "drive": "Adversarial"}
-        frames = "from the first frame to the last"
+        caption = "from the first frame to the last"
         strips = [
-            Picture(f"images/{file}.png", frames, name)
-            for file, name in pictures.items()
+            Picture("images/drive-clean.png", caption, "Clean"),
+            Picture("images/drive.png", caption, "Adversarial"),
         ]
         note = f"The model is {wording.drive_text(summary)}."
         yield ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
 
 
-def _changes(summary: AttackSummary) -> ResultPart:
+def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]:
+    """Return the images of both scenes; `suffix` is the end of their file names."""
+    pictures = []
+    for name, prediction in (
+        ("clean", summary.clean),
+        ("adversarial", summary.adversarial),
+    ):
+        caption = "no prediction recorded"
+        if prediction is not None:
+            caption = words.prediction_text(summary.task, prediction)
+        pictures.append(Picture(f"images/{name}{suffix}", caption, name.capitalize()))
+    return pictures
+
+
+def _trial_note(summary: AttackSummary) -> str:
+    """Return which conditions the images have, of an attack over conditions."""
+    conditions = " and ".join(summary.over)
+    trial = summary.clean.trial
+    if not conditions:
+        return ""
+    if trial is None:
+        return f"Both with the {conditions} that the scene comes with."
+    return (
+        f"Both of trial {trial}, with the same {conditions}; in other trials they, and "
+        "what the model says, are others."
+    )
+
+
+def _find_trial_images(images: Path) -> list[Picture]:
+    """Return the images of the first trials, those with marks if there are any."""
+    names = sorted(file.name for file in images.glob("verification*.png"))
+    marked_names = [name for name in names if name.endswith(MARKED)]
+    pictures = []
+    for name in (marked_names or names)[:MAX_TRIAL_IMAGES]:
+        trial = "".join(filter(str.isdigit, name))
+        pictures.append(Picture(f"images/{name}", f"trial {trial}"))
+    return pictures
+
+
+def _changes_part(summary: AttackSummary) -> ResultPart:
+    """Return the table of the parameters that were changed."""
     rows = []
     bars = []
     for name, changed in (summary.configuration or {}).items():
         clean = "" if changed.clean is None else number_text(changed.clean)
         values = changed.value if isinstance(changed.value, list) else [changed.value]
         unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
-        low = changed.low
-        high = changed.high
-        value = changed.value
-        within = ""
-        bar = None
-        if low is not None and high is not None and isinstance(value, (int, float)):
-            stopped = min(value - low, high - value) <= AT_THE_END * (high - low)
-            within = (
-                f"{number_text(low)} to "
-                f"{number_text(high)}{', at its end' if stopped else ''}"
-            )
-            begin = changed.clean if isinstance(changed.clean, (int, float)) else value
-            ends = (min(begin, value), max(begin, value), value)
-            bar = tuple(min(max((end - low) / (high - low), 0.0), 1.0) for end in ends)
-        rows.append([name, clean, ", ".join(map(number_text, values)) + unit, within])
-        bars.append(bar)
+        adversarial = ", ".join(map(number_text, values)) + unit
+        rows.append([name, clean, adversarial, _range_text(changed)])
+        bars.append(_range_bar(changed))
     heads = ("parameter", "clean", "adversarial", "in its range")
-    kept = [at for at in range(len(heads)) if any(row[at] for row in rows)]
+    columns = [
+        column for column in range(len(heads)) if any(row[column] for row in rows)
+    ]
+    has_all_columns = len(columns) == len(heads)
     return ResultPart(
         "What was changed" if rows else "",
-        heads=[heads[at] for at in kept],
-        rows=[[row[at] for at in kept] for row in rows],
-        bars=bars if len(kept) == len(heads) else (),  # type: ignore[arg-type]
+        heads=[heads[column] for column in columns],
+        rows=[[row[column] for column in columns] for row in rows],
+        bars=bars if has_all_columns else (),  # type: ignore[arg-type]
     )
 
 
-def _textures(run: Path) -> ResultPart:
-    files = sorted((run / directory.ARTIFACTS).glob("texture*-original.png"))
-    before = [
+def _range_text(changed: FoundValue) -> str:
+    """Return the range of a number, and whether it lies at an end; empty without one."""
+    low = changed.low
+    high = changed.high
+    if low is None or high is None or not isinstance(changed.value, (int, float)):
+        return ""
+    distance_to_end = min(changed.value - low, high - changed.value)
+    is_at_end = distance_to_end <= END_TOLERANCE * (high - low)
+    at_end = ", at its end" if is_at_end else ""
+    return f"{number_text(low)} to {number_text(high)}{at_end}"
+
+
+def _range_bar(changed: FoundValue) -> tuple[float, ...] | None:
+    """Return the bar from the clean value to the adversarial one, and its mark.
+
+    In [0, 1] of the range; None of what has none.
+    """
+    low = changed.low
+    high = changed.high
+    value = changed.value
+    if low is None or high is None or not isinstance(value, (int, float)):
+        return None
+    begin = changed.clean if isinstance(changed.clean, (int, float)) else value
+    points = (min(begin, value), max(begin, value), value)
+    return tuple(min(max((point - low) / (high - low), 0.0), 1.0) for point in points)
+
+
+def _textures_part(run: Path) -> ResultPart:
+    """Return the textures before and after, if the run has them."""
+    originals = [
         file.name
-        for file in files
+        for file in sorted((run / directory.ARTIFACTS).glob("texture*-original.png"))
         if re.fullmatch(r"texture(@[\w-]+)?-original\.png", file.name)
     ]
     pictures = []
-    for original in before:
-        changed = f"artifacts/{original.removesuffix('-original.png')}.png"
-        pictures.append(
-            Picture(f"artifacts/{original}", "texture as it was", "Original")
-        )
-        pictures.append(
-            Picture(changed, f"texture that was found; {changed}", "Adversarial")
-        )
-    title = "The textures" if len(before) > 1 else "The texture"
+    for name in originals:
+        adversarial = f"artifacts/{name.removesuffix('-original.png')}.png"
+        caption = f"texture that was found; {adversarial}"
+        pictures.append(Picture(f"artifacts/{name}", "texture as it was", "Original"))
+        pictures.append(Picture(adversarial, caption, "Adversarial"))
+    title = "The textures" if len(originals) > 1 else "The texture"
     return ResultPart(title, pictures=[pictures] if pictures else [], layout="pair")
 
 
-def _failures(summary: AttackSummary) -> Iterator[ResultPart]:
-    if (known := summary.failures) is None:
+def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
+    """Yield the section about different failures, if the policy looked for them."""
+    known = summary.failures
+    if known is None:
         return
     pictures = []
     for failure in known.listed:
-        if failure.picture and failure.holds:
-            says = (
-                words.prediction_text(summary.task, failure.pictured)
-                if failure.pictured
-                else ""
-            )
-            name = says or display.most_predicted(failure)
-            pictures.append(Picture(failure.picture, display.range_text(failure), name))
-    text = [f"Failures are {display.failures_text(known)}."]
-    groups = [pictures] if pictures else []
+        if not failure.picture or not failure.holds:
+            continue
+        name = ""
+        if failure.pictured:
+            name = words.prediction_text(summary.task, failure.pictured)
+        name = name or display.most_predicted(failure)
+        pictures.append(Picture(failure.picture, display.range_text(failure), name))
     yield replace(
         display.failures_part(known),
         title="Different failures",
-        text=text,
-        pictures=groups,
+        text=[f"Failures are {display.failures_text(known)}."],
+        pictures=[pictures] if pictures else [],
     )
 
 
-def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
-    """The table of rates with bars, rates first, as a phone cuts what is on the right;
-    empty if nothing was rated.
+def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
+    """Return the table of rates with bars; empty if there are no rates.
+
+    The rates come first, because a phone cuts what is on the right.
+
+    Args:
+        summary: of the attack.
+        table: the same without bars.
     """
     average = summary.average
-    rated = [
-        summary.clean.control,
-        *([summary.verified] if summary.adversarial else []),
-    ]
-    rated += [summary.baseline.verified] if summary.baseline else []
-    bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rated]
-    bars += [(*average.interval, average.accuracy)] if average else []
+    rates: list[ControlGroup | VerifiedRate | None] = [summary.clean.control]
+    if summary.adversarial:
+        rates.append(summary.verified)
+    if summary.baseline:
+        rates.append(summary.baseline.verified)
+    bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rates]
+    if average:
+        bars.append((*average.interval, average.accuracy))
     if not any(bars):
         return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
@@ -269,53 +335,53 @@ def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
     )
 
 
-def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> ResultPart:
-    named = {
-        summary.policy: curves.get("search", []),
-        "random search": curves.get("baseline", []),
-    }
-    named = {
+def _search_part(
+    summary: AttackSummary, objectives: Mapping[str, list[float | None]]
+) -> ResultPart:
+    """Return the chart of the objective over evaluations; empty without any.
+
+    Args:
+        summary: of the attack.
+        objectives: of the search and of the baseline.
+    """
+    curves = {
         name: values
-        for name, values in named.items()
+        for name, values in (
+            (summary.policy, objectives.get("search", [])),
+            ("random search", objectives.get("baseline", [])),
+        )
         if any(value is not None for value in values)
     }
-    if not named:
+    if not curves:
         return ResultPart()
-    ends = {
-        name: [value for value in values if value is not None]
-        for name, values in named.items()
-    }
-    above = "right" if summary.minimises else wording.success(summary)
-    zero = f"above: {above}" if summary.objective in words.SUCCESS_ABOVE_ZERO else ""
-    listed = "; ".join(
-        f"{name}: from {values[0]:.3g} to {max(values):.3g}"
-        for name, values in ends.items()
-    )
+    ranges = []
+    for name, values in curves.items():
+        known = [value for value in values if value is not None]
+        ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
+    zero_means = ""
+    if summary.objective in words.SUCCESS_ABOVE_ZERO:
+        above = "right" if summary.minimises else wording.success(summary)
+        zero_means = f"above: {above}"
     label = words.objective_label(summary.objective)
     return ResultPart(
         "The search",
-        [f"{label} over evaluations. {listed}"],
-        draw=partial(search_axes, named, label, zero_means=zero),
+        [f"{label} over evaluations. {'; '.join(ranges)}"],
+        draw=partial(search_axes, curves, label, zero_means=zero_means),
         note="Lines: the best so far. Dots: each evaluation. These are the search's "
         "claims; the table above is "
         "verified.",
     )
 
 
-def _plan(plan: PlannedGradient) -> ResultPart:
-    def step(group: GroupDerivative) -> str:
-        unit = "" if group.unit in ("", "1") else f" {group.unit}"
-        wide = (
-            f"{group.step:.3g} of its range"
-            if group.step_in_unit is None
-            else f"{group.step_in_unit:.3g}{unit}"
-        )
-        return f"{wide}: {group.step_reason}" if group.step_reason else ""
-
+def _plan_part(plan: PlannedGradient) -> ResultPart:
+    """Return the table of gradient estimators."""
     columns: Mapping[str, Column] = {
-        "parameter": "{0.name}", "numbers": "{0.size}", "derivative": "{0.estimator}", "why": "{0.reason}",
-        "step": step,
-    }  # fmt: skip
+        "parameter": "{0.name}",
+        "numbers": "{0.size}",
+        "derivative": "{0.estimator}",
+        "why": "{0.reason}",
+        "step": _step_text,
+    }
     spp = "" if plan.spp is None else f", {count(plan.spp, 'sample')} a pixel"
     renders = (
         f"{count(plan.renders_per_gradient, 'render')} a gradient beside the "
@@ -325,7 +391,22 @@ def _plan(plan: PlannedGradient) -> ResultPart:
     return ResultPart.table(plan.groups, columns, title=title, folded=True)
 
 
+def _step_text(group: GroupDerivative) -> str:
+    """Return the step of finite differences, and why it is that; empty without one."""
+    if not group.step_reason:
+        return ""
+    step = f"{group.step:.3g} of its range"
+    if group.step_in_unit is not None:
+        unit = "" if group.unit in ("", "1") else f" {group.unit}"
+        step = f"{group.step_in_unit:.3g}{unit}"
+    return f"{step}: {group.step_reason}"
+
+
 def _read_frames(file: Path) -> list[str]:
+    """Return the frames of an animation as data addresses of JPEG files.
+
+    There are none if the file is missing or corrupt, or has a single frame.
+    """
     frames = []
     try:
         with Image.open(file, formats=("GIF",)) as animation:

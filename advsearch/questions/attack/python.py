@@ -1,6 +1,4 @@
-"""`advsearch.attack`: an attack on what a session has: scenes, models, controls, tasks,
-objectives and policies.
-"""
+"""`advsearch.attack`: attack scenes and models of a Python session."""
 
 from __future__ import annotations
 
@@ -79,8 +77,7 @@ def attack(
     progress: Watched = None,
     **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
-    """Search for the worst configuration of a scene, verify it, and return everything
-    that is known about it.
+    """Search for the worst configuration of a scene, verify it, and return the result.
 
     All other arguments are the settings of `advsearch attack`; `environment`, `up`,
     `set` and `exposure` belong to a scene that is named here, not to one that is
@@ -115,20 +112,21 @@ def attack(
     options: dict[str, Any] = {
         name: value for name, value in settings.items() if value is not None
     }
-    task = make_task(task) if callable(task) else task
+    if callable(task):
+        task = make_task(task)
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
             "policy: expected a name, a mapping with a `name` and options, or an "
             f"instance, got {told(policy)}"
         )
-    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    session_controls = [*loading.only_here(controls), *loading.only_here(over)]
     are_named = all(
-        isinstance(named, (str, Path)) for named in (scene, *several(model))
+        isinstance(value, (str, Path)) for value in (scene, *several(model))
     )
     if (
         not are_named
         or callable(objective)
-        or own_controls
+        or session_controls
         or isinstance(task, OwnTask)
     ):
         naming.check_not_spread(options)
@@ -154,27 +152,13 @@ def attack(
     )
     losses.check_aim(objective, targeted=config.target is not None)
 
-    only_here = [
-        PythonOnly("model", model_name(network))
-        for network in several(model)
-        if naming.exists_here(network)
-    ]
-    only_here += [PythonOnly("scene")] if scene.only_here else []
-    if isinstance(task, Task) and not is_named(task, make_task):
-        only_here.append(PythonOnly("task", task.name))
-    only_here += (
-        [PythonOnly("objective", str(objective_name))] if callable(objective) else []
+    python_only = _find_python_only(
+        config, scene, model, task, objective, policy, session_controls
     )
-    if isinstance(policy, Policy) and not is_named(policy, _make_policy):
-        only_here.append(PythonOnly("policy", policy.name))
-    only_here += [PythonOnly("control", name) for name in own_controls]
-    only_here += [
-        PythonOnly("metric", name) for name in judging.only_here(config.metrics)
-    ]
-    config = config.with_only_here(only_here)
+    config = config.with_only_here(python_only)
     _check_single(config)
 
-    searched, drawn = controls_given(config, controls, over)
+    searched, random_controls = controls_given(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
     loaded_task, objective = task_and_objective(
@@ -182,27 +166,64 @@ def attack(
         task if isinstance(task, Task) else config.task,
         objective if callable(objective) else config.objective,
     )
-    stopped = (
-        run_path(run) if resume and run is not None and is_run(run_path(run)) else None
-    )
-    with (
-        begun(config)
-        if run is not None and stopped is None
-        else nullcontext(stopped) as folder
-    ):
+    resumed = None
+    if resume and run is not None and is_run(run_path(run)):
+        resumed = run_path(run)
+    context: Any = nullcontext(resumed)
+    if run is not None and resumed is None:
+        context = begun(config)
+    with context as directory:
         parts = AttackParts(
             config,
             scene,
             loaded=models_as_one(model, config, loaded_task),
             task=loaded_task,
             controls=searched,
-            over=drawn,
+            over=random_controls,
             objective=objective,
             policy=policy,
             keep=run is not None,
             metrics=judging.load_metrics(config.metrics, metrics),
         )
-        return run_attack(parts, watcher(progress), folder)
+        return run_attack(parts, watcher(progress), directory)
+
+
+def _find_python_only(
+    config: AttackConfig,
+    scene: Scene,
+    model: AnyModel | Sequence[AnyModel],
+    task: AnyTask,
+    objective: str | Callable[..., Tensor] | None,
+    policy: str | Mapping[str, object] | Policy[Any],
+    session_controls: Sequence[str],
+) -> list[PythonOnly]:
+    """Return what exists in this session only, so that no command can repeat it.
+
+    Args:
+        config: the settings.
+        scene: loaded.
+        model: as the caller passed it, and so on.
+        task: of the model.
+        objective: of the search.
+        policy: of the search.
+        session_controls: names of the controls that exist in this session only.
+    """
+    parts = [
+        PythonOnly("model", model_name(network))
+        for network in several(model)
+        if naming.exists_here(network)
+    ]
+    if scene.only_here:
+        parts.append(PythonOnly("scene"))
+    if isinstance(task, Task) and not is_named(task, make_task):
+        parts.append(PythonOnly("task", task.name))
+    if callable(objective):
+        parts.append(PythonOnly("objective", _name_objective(objective)))
+    if isinstance(policy, Policy) and not is_named(policy, _make_policy):
+        parts.append(PythonOnly("policy", policy.name))
+    parts += [PythonOnly("control", name) for name in session_controls]
+    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    return parts
 
 
 def _load_scene(
@@ -210,14 +231,18 @@ def _load_scene(
     shape: str | None,
     options: Mapping[str, Any],
 ) -> Scene:
-    """Return a scene, loaded with the options that belong to it; `shape` is its object
-    where it holds several.
+    """Return a scene, loaded with the options that belong to it.
+
+    Args:
+        scene: loaded, a file, a name, or a dictionary of Mitsuba.
+        shape: its object, if it has several.
+        options: of the attack.
     """
     if isinstance(scene, Scene):
         naming.check_not_of_scene({**options, "object": shape})
         return scene
-    of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
-    config = SceneConfig(**{"object": "mug", **of_scene})
+    scene_options = {name: options[name] for name in naming.OF_SCENE if name in options}
+    config = SceneConfig(**{"object": "mug", **scene_options})
     environment = config.environment
     keywords = naming.told_of_scene(config)
     if shape is not None:
@@ -240,8 +265,11 @@ def _make_policy(setting: Any) -> Policy[Any]:
 
 
 def _check_single(config: AttackConfig) -> None:
-    """Refuse settings of several attacks, and those that need a run directory or
-    workers and cannot have them.
+    """Check that the settings are of one attack, which can be made.
+
+    Raises:
+        InputError: they are of several attacks, or need a run directory or functions
+            that workers can load.
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
@@ -251,9 +279,9 @@ def _check_single(config: AttackConfig) -> None:
             "together, or attack each by itself"
         )
     if config.epsilons:
-        listed = ", ".join(f"{epsilon:g}" for epsilon in config.epsilons)
+        epsilons = ", ".join(f"{epsilon:g}" for epsilon in config.epsilons)
         raise InputError(
-            f"epsilon: expected one, got {listed}; attack with each, or have "
+            f"epsilon: expected one, got {epsilons}; attack with each, or have "
             "`advsearch attack` draw the curve"
         )
     if config.aov is not None and config.run is None:

@@ -1,5 +1,6 @@
-"""The result of an attack as Python has it, and its pictures: of trials, of the object
-to turn, along a drive.
+"""The result of an attack as Python has it, and its images.
+
+These are of trials, of the object to turn, and along a drive.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 
 class RenderKeywords(TypedDict, total=False):
-    """What may be said of a picture, see `render`."""
+    """Settings that `AttackResult.render` takes as keywords, as `render` does."""
 
     resolution: int | tuple[int, int] | None
     spp: int
@@ -61,6 +62,34 @@ class RenderKeywords(TypedDict, total=False):
     seed: int
     around: int | None
     aov: bool
+
+
+def _check_render_keywords(options: Mapping[str, Any]) -> None:
+    """Check that `render` has these keywords. Raises TypeError: it has not."""
+    unknown = sorted(options.keys() - RenderKeywords.__annotations__)
+    if unknown:
+        known = ["model", "scene", "camera", "settings"]
+        known += RenderKeywords.__annotations__
+        raise TypeError(
+            "render() got an unexpected keyword argument "
+            f"{unknown[0]!r}; it takes {', '.join(known)}"
+        )
+
+
+def _resolve_scene(scene: Scene | str | Path | None, default: Scene) -> Scene:
+    """Return a scene, loaded if it is named, or the default for None."""
+    if scene is None:
+        return default
+    return scene if isinstance(scene, Scene) else load_scene(scene)
+
+
+def _change_view(scene: Scene, camera: str | None, settings: Given | None) -> Scene:
+    """Return a scene with other settings, and with the view of one of its cameras."""
+    if settings:
+        scene = scene.with_settings(settings)
+    if camera:
+        scene = replace(scene, description=scene.description.seen_by(camera))
+    return scene
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,8 +141,9 @@ class AttackResult:
 
     @property
     def values(self) -> dict[str, Any]:
-        """The adversarial configuration by name, such as `pose.yaw`, without units; of
-        a texture, numbers that describe it. Empty where nothing was searched;
+        """The adversarial configuration by name, such as `pose.yaw`, without units.
+
+        Of a texture, numbers that describe it. Empty if nothing was searched;
         `summary.configuration` has the units.
         """
         return {
@@ -123,15 +153,14 @@ class AttackResult:
 
     @property
     def images(self) -> dict[str, Tensor]:
-        """The two pictures by name, `clean` and `adversarial`: (H, W, 3)
-        display-referred sRGB in [0, 1].
-        """
+        """The images `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0, 1]."""
         return {"clean": self.clean, "adversarial": self.adversarial}
 
     @property
     def history(self) -> list[float]:
-        """The objective of each evaluation of the search, in order; `rows("search")`
-        has all that is known of them.
+        """The objective of each evaluation of the search, in order.
+
+        `rows("search")` has all that is known of them.
         """
         rows = [row for row in self.rows("search") if row.phase != "ranking"]
         return [row.objective for row in rows if row.objective is not None]
@@ -147,9 +176,9 @@ class AttackResult:
         settings: Given | None = None,
         **options: Unpack[RenderKeywords],
     ) -> Rendering:
-        """Render the adversarial scene again, and ask a model what it sees.
+        """Render the adversarial scene again, and return what a model predicts of it.
 
-        What the adversarial configuration does not say is as the scene comes:
+        What the adversarial configuration does not state is as the scene comes:
         conditions of `over` have their start.
 
         Args:
@@ -159,8 +188,8 @@ class AttackResult:
                 the scene's cameras.
             settings: parameters of the scene to fix to other values, e.g.
                 ``{"camera.azimuth": 130.0}``.
-            **options: `resolution`, `spp`, `denoise`, `sampler`, `seed`, `around` and `aov`, as for `render`; by
-                default as in the attack.
+            **options: `resolution`, `spp`, `denoise`, `sampler`, `seed`, `around` and
+                `aov`, as for `render`; by default as in the attack.
 
         Raises:
             TypeError: there is no such keyword.
@@ -173,62 +202,42 @@ class AttackResult:
                 "process; load_run(FOLDER) has it "
                 "with all that it needs"
             )
-        if unknown := sorted(options.keys() - RenderKeywords.__annotations__):
-            known = ", ".join(
-                [
-                    "model",
-                    "scene",
-                    "camera",
-                    "settings",
-                    *RenderKeywords.__annotations__,
-                ]
-            )
-            raise TypeError(
-                "render() got an unexpected keyword argument "
-                f"{unknown[0]!r}; it takes {known}"
-            )
+        _check_render_keywords(options)
         parts = self.parts()
         camera = as_python(camera)
         settings = as_python(settings)
-        seen = (
-            parts.scene
-            if scene is None
-            else scene
-            if isinstance(scene, Scene)
-            else load_scene(scene)
-        )
         if isinstance(camera, Mapping):
-            settings = {
-                **(settings or {}),
-                **{f"camera.{name}": one for name, one in camera.items()},
+            camera_settings = {
+                f"camera.{name}": value for name, value in camera.items()
             }
+            settings = {**(settings or {}), **camera_settings}
             camera = None
-        if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
+        clashes = set(settings or {}) & set(self.summary.configuration or {})
+        if clashes:
             raise InputError(
                 "settings: the adversarial configuration says what "
-                f"{twice[0]} is; leave it out"
+                f"{min(clashes)} is; leave it out"
             )
-        seen = seen.with_settings(settings) if settings else seen
-        seen = (
-            replace(seen, description=seen.description.seen_by(camera))
-            if camera
-            else seen
-        )
-        task = (
-            parts.task if model is not None else task_for(parts.task, parts.loaded[0])
-        )
+        attacked_model = parts.loaded[0]
         return render(
-            seen, parts.loaded[0] if model is None else model, task=task, label=parts.config.label,
-            controls=parts.controls, at=self.u, **{**parts.config.image_settings, **options},
-        )  # fmt: skip
+            _change_view(_resolve_scene(scene, parts.scene), camera, settings),
+            attacked_model if model is None else model,
+            task=task_for(parts.task, attacked_model) if model is None else parts.task,
+            label=parts.config.label,
+            controls=parts.controls,
+            at=self.u,
+            **{**parts.config.image_settings, **options},
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: not what only this session has."""
+        """Return what is pickled: not what only this session has."""
         return {**vars(self), "parts": None}
 
     def rows(self, kind: str | None = None) -> Iterator[store.Row]:
-        """Yield every evaluated configuration, or those of one kind ("search",
-        "verification", ...), in order.
+        """Yield every evaluated configuration in order.
+
+        Args:
+            kind: "search", "verification", ...; None yields all.
         """
         if self.run is None:
             yield from (row for row in self.in_memory if kind in (None, row.kind))
@@ -237,16 +246,16 @@ class AttackResult:
             yield from results.rows(kind)
 
     def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`: columns as in an export
-        (docs/runs.md), units in its `attrs`.
+        """Return these rows as a `pandas.DataFrame`.
+
+        Columns are those of an export (docs/runs.md); its `attrs` have the units.
         """
         from advsearch.runs.tables import to_pandas  # pandas takes half a second
 
         return to_pandas(self.rows(kind))
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the objective over the search's evaluations, and return the matplotlib
-        axes.
+        """Draw the objective over evaluations, and return the matplotlib axes.
 
         Args:
             axes: to draw on; None makes new ones.
@@ -272,20 +281,25 @@ class AttackResult:
         return side_by_side([*self.images.values()])
 
 
-# Faces of the meshes that are kept to turn; of more, as many are shown
-MOST_FACES = 30_000
-# How far from the object's middle another mesh may be to be shown with it, in the
-# object's extent
-NEAR = 2.0
-# Samples a pixel of the pictures that are kept where nothing was tried
-PICTURE_SPP = 16
+# of all meshes that are written to turn; larger meshes are simplified
+MAX_FACES = 30_000
+# between the centers of the object and of another mesh that is written with it, in units
+# of the object's extent
+MAX_NEAR_DISTANCE = 2.0
+# samples per pixel of the images that are stored if there were no trials
+UNTRIED_SPP = 16
 
 
 @dataclass(frozen=True, eq=False)
 class KeptPicture:
-    """The picture of a configuration of the whole space that is kept, as the model sees
-    it: (H, W, 3) sRGB, 8-bit values in [0, 1], and its linear radiance; what is said of
-    it, and the number of its trial, None where nothing was tried.
+    """An image of a configuration that is stored, as the model gets it.
+
+    Attributes:
+        whole: the configuration of the full space.
+        radiance: (H, W, 3) linear.
+        picture: (H, W, 3) sRGB, 8-bit values in [0, 1].
+        judgement: of the image.
+        trial: whose image it is; None if there were no trials.
     """
 
     whole: Tensor
@@ -298,100 +312,117 @@ class KeptPicture:
     def of(
         cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None
     ) -> KeptPicture:
-        """Render the searched controls at `u` as they are in a trial; as the scene
-        comes, where that is None.
+        """Render a configuration as in a trial.
+
+        Args:
+            problem: of the attack.
+            findings: of the attack.
+            u: (d,) of the searched controls.
+            trial: None renders the conditions as the scene comes.
         """
-        seed = seeds.stream(
-            problem.seed, *(("pictures",) if trial is None else ("verification", trial))
-        )
-        whole = problem.whole(u, None if trial is None else seed)
-        spp = PICTURE_SPP if trial is None else findings.spp
+        if trial is None:
+            seed = seeds.stream(problem.seed, "pictures")
+            whole = problem.whole(u, None)
+            spp = UNTRIED_SPP
+        else:
+            seed = seeds.stream(problem.seed, "verification", trial)
+            whole = problem.whole(u, seed)
+            spp = findings.spp
         with torch.no_grad():
             radiance = problem.renderer.radiance(whole, seed, spp)
-            picture = to_8_bit(
-                problem.space.picture(
-                    whole, problem.renderer.formation.display(radiance)
-                )
-            )
+            display = problem.renderer.formation.display(radiance)
+            picture = to_8_bit(problem.space.picture(whole, display))
         return cls(whole, radiance, picture, problem.judge(picture, whole), trial)
 
 
 def trial_to_show(findings: Findings) -> int | None:
-    """Return the trial whose pictures are kept, of the clean scene and of the
-    adversarial scene, which see the same conditions.
+    """Return the trial whose images of both scenes are stored.
 
-    It is the first with the most frequent prediction among the successes (else among
-    the trials that count), if there is one beside which the clean scene has its own
-    most frequent prediction. None where nothing was tried.
+    Both scenes have the same conditions in it. It is the first with the most frequent
+    prediction among the successes (else among the trials that count), if possible one
+    in which the clean scene has its own most frequent prediction. None if there were no
+    trials.
     """
+    verification = findings.verification
+    if verification is None:
+        clean_labels = _labels(findings.clean)
+        return clean_labels.index(mode(clean_labels)) if clean_labels else None
+    clean_labels = _labels(verification.clean_trials)
+    has_successes = bool(verification.successes)
+    usual = mode(_labels(verification.successes or verification.counting))
+    usual_clean = mode(clean_labels)
+    ranks = []
+    for label, outcome, clean_label in zip(
+        _labels(verification.adversarial_trials),
+        verification.outcomes,
+        clean_labels,
+        strict=False,
+    ):
+        is_usual = label == usual
+        is_counted = is_usual and outcome is has_successes
+        ranks.append((is_counted, is_usual, clean_label == usual_clean))
+    return verification.begin + ranks.index(max(ranks))
 
-    def labels(trials: Sequence[Judgement]) -> list[str]:
-        return [trial.prediction.label for trial in trials]
 
-    checked = findings.verification
-    if checked is None:
-        clean = labels(findings.clean)
-        return clean.index(mode(clean)) if clean else None
-    clean = labels(checked.clean_trials)
-    usual = mode(labels(checked.successes or checked.counting))
-    usual_clean = mode(clean)
-    ranks = [
-        (
-            label == usual and outcome is bool(checked.successes),
-            label == usual,
-            beside == usual_clean,
-        )
-        for label, outcome, beside in zip(
-            labels(checked.adversarial_trials), checked.outcomes, clean, strict=False
-        )
-    ]
-    return checked.begin + ranks.index(max(ranks))
+def _labels(trials: Sequence[Judgement]) -> list[str]:
+    return [trial.prediction.label for trial in trials]
 
 
 def write_pictures(
     run: RunDirectory,
     problem: Problem,
     findings: Findings,
-    shown: Mapping[str, KeptPicture],
+    scene_images: Mapping[str, KeptPicture],
 ) -> None:
-    for name, kept in shown.items():
-        run.save_image(name, kept.picture)
-        run.save_exr(name, kept.radiance * problem.renderer.formation.gain)
-        save_marked(run, name, kept.picture, problem.marks(kept.picture, kept.whole))
-        if problem.aovs:
-            surfaces = problem.renderer.surfaces(kept.whole)
-            file = run.path / IMAGES / f"{name}.aov.exr"
-            files.write_layers(
-                file,
-                surfaces.layers(problem.aovs, OBJECT),
-                surfaces.notes(problem.aovs),
-            )
-    run.save_image(
-        "difference",
-        files.difference(shown["clean"].picture, shown["adversarial"].picture),
+    """Save the images of an attack: of both scenes, of trials, and of the search.
+
+    Args:
+        run: where they are saved.
+        problem: of the attack.
+        findings: of the attack.
+        scene_images: those of the scenes, `clean` and `adversarial`.
+    """
+    for name, image in scene_images.items():
+        _save_scene_image(run, problem, name, image)
+    difference = files.difference(
+        scene_images["clean"].picture, scene_images["adversarial"].picture
     )
-    checked = findings.verification
+    run.save_image("difference", difference)
+    verification = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
-    if checked is not None:
-        for number in range(
-            checked.begin, checked.begin + len(checked.adversarial_trials)
-        )[:KEPT]:
+    if verification is not None:
+        end = verification.begin + len(verification.adversarial_trials)
+        for number in range(verification.begin, end)[:KEPT]:
             save_trial(
                 run,
                 problem,
                 findings,
                 (kind, number),
                 f"verification-{number:02d}",
-                checked.u,
+                verification.u,
             )
     if findings.frames:
-        last = shown["adversarial"].picture
-        # the frames see the scene as it comes
+        last_frame = scene_images["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:
-            last = KeptPicture.of(
-                problem, findings, problem.domain.project(findings.search.best_u), None
-            ).picture
-        run.save_animation("search", [*findings.frames, last.numpy()])
+            # The other frames have the conditions as the scene comes.
+            u = problem.domain.project(findings.search.best_u)
+            last_frame = KeptPicture.of(problem, findings, u, None).picture
+        run.save_animation("search", [*findings.frames, last_frame.numpy()])
+
+
+def _save_scene_image(
+    run: RunDirectory, problem: Problem, name: str, image: KeptPicture
+) -> None:
+    """Save the image of a scene, its radiance, its marks and its layers."""
+    run.save_image(name, image.picture)
+    run.save_exr(name, image.radiance * problem.renderer.formation.gain)
+    marks = problem.marks(image.picture, image.whole)
+    save_marked(run, name, image.picture, marks)
+    if problem.aovs:
+        surfaces = problem.renderer.surfaces(image.whole)
+        layers = surfaces.layers(problem.aovs, OBJECT)
+        notes = surfaces.notes(problem.aovs)
+        files.write_layers(run.path / IMAGES / f"{name}.aov.exr", layers, notes)
 
 
 def save_trial(
@@ -402,169 +433,255 @@ def save_trial(
     name: str,
     u: Tensor,
 ) -> None:
+    """Save the image of a trial, and the same with marks.
+
+    Args:
+        run: where it is saved.
+        problem: of the attack.
+        findings: of the attack; an image that it does not have is rendered again.
+        trial: its kind and its number.
+        name: of the file.
+        u: (d,) the configuration.
+    """
     seed = seeds.stream(problem.seed, "verification", trial[1])
-    picture = findings.pictures.get(trial)
-    picture = problem.picture(u, seed, findings.spp) if picture is None else picture
-    run.save_image(name, picture)
-    save_marked(run, name, picture, problem.marks(picture, problem.whole(u, seed)))
+    image = findings.pictures.get(trial)
+    if image is None:
+        image = problem.picture(u, seed, findings.spp)
+    run.save_image(name, image)
+    save_marked(run, name, image, problem.marks(image, problem.whole(u, seed)))
 
 
 def save_marked(
     run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]
 ) -> None:
+    """Save an image with the marks of a task, if there are any."""
     if marks:
         run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
 
 
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
-    """Keep the object, and the meshes beside it that controls move or paint, to turn in
-    a browser.
+    """Write the object before and after, to turn in a browser.
+
+    Meshes near it that controls move or paint are written, too.
+
+    Args:
+        run: where it is written.
+        problem: of the attack.
+        u: (d,) the adversarial configuration.
     """
     scene = problem.space.scene
-    assembly = problem.renderer.scene.assembly
     if scene is None:
         return
-    with torch.no_grad():
-        after, before = (
-            assembly(problem.space.inputs(problem.whole(at)))
-            for at in (u, problem.domain.start)
-        )
-    moved = {OBJECT, *(key.partition(".")[0] for key in after)}
-    parts = [part for name, part in scene.meshes.items() if name in moved]
-    fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
+    adversarial = _assemble(problem, u)
+    clean = _assemble(problem, problem.domain.start)
+    changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
+    meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
+    max_faces = MAX_FACES // len(meshes)
+    # None if a mesh has few faces already
+    simplify = {part.name: simpler(part.mesh, max_faces) for part in meshes}
 
-    def shown(inputs: Mapping[str, Tensor]) -> list[Shape]:
-        shapes = {part.name: posed(part, inputs) for part in parts}
-        vertices = shapes[OBJECT].mesh.vertices
-        middle = vertices.mean(axis=0)
-        reach = NEAR * float(np.ptp(vertices, axis=0).max())
-        near = [
-            one
-            for one in shapes.values()
-            if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach
-        ]
-        return [
-            replace(one, mesh=left(one.mesh)) if (left := fewer[one.name]) else one
-            for one in near
-        ]
+    def make_shapes(inputs: Mapping[str, Tensor]) -> list[Shape]:
+        """Return the shapes near the object, with fewer faces."""
+        shapes = {part.name: posed(part, inputs) for part in meshes}
+        near_shapes = []
+        for shape in _select_near(shapes):
+            simplify_shape = simplify[shape.name]
+            if simplify_shape:
+                shape = replace(shape, mesh=simplify_shape(shape.mesh))
+            near_shapes.append(shape)
+        return near_shapes
 
-    camera = after.get("camera.to_world")
-    pose = camera_to_world(scene) if camera is None else camera.double().numpy()
-    cut = [
-        f"{len(part.mesh.faces):,} of {part.name}" for part in parts if fewer[part.name]
+    camera_pose = adversarial.get("camera.to_world")
+    if camera_pose is None:
+        to_world = camera_to_world(scene)
+    else:
+        to_world = camera_pose.double().numpy()
+    simplified = [
+        f"{len(part.mesh.faces):,} of {part.name}"
+        for part in meshes
+        if simplify[part.name]
     ]
-    note = (
-        f"It is shown with fewer faces than it has ({', '.join(cut)})." if cut else ""
-    )
-    write_bytes(
-        run.path / OBJECT_FILE, web_glb(shown(after), shown(before), pose, note)
-    )
+    note = ""
+    if simplified:
+        note = f"It is shown with fewer faces than it has ({', '.join(simplified)})."
+    glb = web_glb(make_shapes(adversarial), make_shapes(clean), to_world, note)
+    write_bytes(run.path / OBJECT_FILE, glb)
 
 
-FRAMES = 24
-STRIP = 8  # Pictures of a strip at most, and the height of each in pixels
-SIDE = 160
-FASTEST = 40  # Milliseconds that a frame of an animation is shown at least
+def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
+    """Return what the scene takes for a configuration (d,)."""
+    with torch.no_grad():
+        inputs = problem.space.inputs(problem.whole(u))
+        return problem.renderer.scene.assembly(inputs)
+
+
+def _select_near(shapes: Mapping[str, Shape]) -> list[Shape]:
+    """Select the shapes whose center is near that of the object."""
+    vertices = shapes[OBJECT].mesh.vertices
+    center = vertices.mean(axis=0)
+    max_distance = MAX_NEAR_DISTANCE * float(np.ptp(vertices, axis=0).max())
+    return [
+        shape
+        for shape in shapes.values()
+        if np.abs(shape.mesh.vertices.mean(axis=0) - center).max() < max_distance
+    ]
+
+
+FRAMES = 24  # of each path
+MAX_STRIP_FRAMES = 8
+STRIP_HEIGHT = 160  # pixels
+MIN_FRAME_MILLISECONDS = 40
 
 
 def along_drive(
     problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None
 ) -> AlongDrive | None:
-    """Look at an adversarial scene, and at the clean scene, at evenly spaced times of
-    each path that varies by chance; None where none does. What varies beside it is as
-    the scene comes.
+    """Evaluate both scenes at evenly spaced times of each path that varies by chance.
+
+    The images are saved. Other conditions are as the scene comes.
+
+    Args:
+        problem: of the attack.
+        u: (d,) the adversarial configuration; None evaluates the clean scene only.
+        spp: samples per pixel.
+        run: where the images are saved; None saves none.
+
+    Returns:
+        How many frames are right; None if no path varies.
     """
-    place = len(problem.domain.start)
-    path = None
-    for control in problem.space.controls[len(problem.searched_space.controls) :]:
-        if control.travels and any(
-            slot.parameter.name == "time" and slot.width for slot in control.slots
-        ):
-            path = control
-            break
-        place += len(control.start)
+    path, time_column = _find_path(problem)
     if path is None:
         return None
+    paths, frames = _make_frames(problem, path, time_column)
+    first_time = _read_time(problem, path, frames[0])
+    last_time = _read_time(problem, path, frames[-1])
+    seconds = last_time - first_time
+    total_seconds = seconds * max(1, len(paths))
+    right_counts: dict[str, int] = {}
+    for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
+        if configuration is None:
+            continue
+        frames[:, : len(configuration)] = configuration
+        images, right_counts[name] = _render_frames(problem, frames, spp)
+        if run is not None:
+            write_drive(run, name, images, total_seconds)
+    return AlongDrive(
+        frames=len(frames),
+        seconds=seconds,
+        paths=[str(name) for name in paths],
+        clean=right_counts["drive-clean"],
+        answer=right_counts.get("drive"),
+        spp=spp,
+    )
+
+
+def _find_path(problem: Problem) -> tuple[Any, int]:
+    """Return the control that travels at random times, and the column of its time.
+
+    None if there is none.
+    """
+    n_searched = len(problem.searched_space.controls)
+    column = len(problem.domain.start)
+    for control in problem.space.controls[n_searched:]:
+        has_random_time = any(
+            slot.parameter.name == "time" and slot.width for slot in control.slots
+        )
+        if control.travels and has_random_time:
+            return control, column
+        column += len(control.start)
+    return None, column
+
+
+def _make_frames(
+    problem: Problem, path: Any, time_column: int
+) -> tuple[list[Any], Tensor]:
+    """Return the names of several paths, and the configurations of all frames.
+
+    Args:
+        problem: of the attack.
+        path: the control that travels.
+        time_column: of its time.
+
+    Returns:
+        Names, none of a single path; and (paths * FRAMES, d) of the full space.
+    """
     start = problem.whole(problem.domain.start)
     specs = [slot.spec for slot in path.slots if slot.parameter.name == Control.WAY]
-    drawn = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
-    # which one is drawn is the coordinate behind the time
-    ways = list(dict.fromkeys(drawn))
-    each = start.repeat(max(1, len(ways)), FRAMES, 1)
-    each[..., place] = torch.linspace(0.0, 1.0, FRAMES)
-    for number, way in enumerate(ways):
-        each[number, :, place + 1] = (drawn.index(way) + 0.5) / len(drawn)
-    times = each.flatten(0, 1)
-    first, last = (
-        problem.space.describe(times[end], [path])[f"{path.name}.time"]["value"]
-        for end in (0, -1)
-    )
-    seconds = float(str(last)) - float(str(first))
-    counts: dict[str, int] = {}
-    for name, at in (("drive-clean", start[: len(problem.domain.start)]), ("drive", u)):
-        if at is None:
-            continue
-        pictures, counts[name] = list[npt.NDArray[np.float32]](), 0
-        for number, whole in enumerate(times):
-            whole[: len(at)] = at
-            with torch.no_grad():
-                picture = to_8_bit(
-                    problem.renderer(
-                        whole, seed=seeds.stream(problem.seed, "drive", number), spp=spp
-                    )
-                )
-            right, marks = problem.seen(picture, whole)
-            counts[name] += right
-            pictures.append(
-                np.asarray(marked(picture.numpy(), marks), dtype=np.float32)
-            )
-        if run is not None:
-            write_drive(run, name, pictures, seconds * max(1, len(ways)))
-    return AlongDrive(
-        frames=len(times), seconds=seconds, paths=[str(way) for way in ways], clean=counts["drive-clean"],
-        answer=counts.get("drive"), spp=spp,
-    )  # fmt: skip
+    # A path with a weight comes several times.
+    choices = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
+    names = list(dict.fromkeys(choices))
+    frames = start.repeat(max(1, len(names)), FRAMES, 1)
+    frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
+    # The coordinate behind the time selects the path.
+    for index, name in enumerate(names):
+        share = (choices.index(name) + 0.5) / len(choices)
+        frames[index, :, time_column + 1] = share
+    return names, frames.flatten(0, 1)
+
+
+def _read_time(problem: Problem, path: Any, u: Tensor) -> float:
+    """Return the time of a frame in seconds."""
+    value = problem.space.describe(u, [path])[f"{path.name}.time"]["value"]
+    return float(str(value))
+
+
+def _render_frames(
+    problem: Problem, frames: Tensor, spp: int
+) -> tuple[list[npt.NDArray[np.float32]], int]:
+    """Return the images of frames (n, d) with marks, and how many are right."""
+    images = list[npt.NDArray[np.float32]]()
+    n_right = 0
+    for number, configuration in enumerate(frames):
+        seed = seeds.stream(problem.seed, "drive", number)
+        with torch.no_grad():
+            image = to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
+        is_right, marks = problem.seen(image, configuration)
+        n_right += is_right
+        images.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
+    return images, n_right
 
 
 def write_drive(
     run: RunDirectory,
     name: str,
-    pictures: Sequence[npt.NDArray[np.float32]],
+    images: Sequence[npt.NDArray[np.float32]],
     seconds: float,
 ) -> None:
-    """Write frames (h, w, 3) in sRGB as an animation, NAME.webp, and some side by side,
-    NAME.png, into a run.
+    """Save frames as an animation, NAME.webp, and some side by side, NAME.png.
+
+    Args:
+        run: where they are saved.
+        name: of the files.
+        images: (h, w, 3) in sRGB.
+        seconds: from the first frame to the last.
     """
-    frames = [Image.fromarray(files.to_8bit(picture)) for picture in pictures]
-    file = io.BytesIO()
-    pause = max(FASTEST, round(1000.0 * seconds / len(frames)))
+    frames = [Image.fromarray(files.to_8bit(picture)) for picture in images]
+    stream = io.BytesIO()
+    milliseconds = max(MIN_FRAME_MILLISECONDS, round(1000.0 * seconds / len(frames)))
     frames[0].save(
-        file,
+        stream,
         "WEBP",
         save_all=True,
         append_images=frames[1:],
-        duration=pause,
+        duration=milliseconds,
         loop=0,
         quality=80,
     )
-    write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
-    size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE
-    small = [
-        frames[number].resize(size, Image.Resampling.LANCZOS)
-        for number in evenly(len(frames), STRIP)
-    ]
-    run.save_image(
-        name,
-        np.concatenate(
-            [np.asarray(frame, dtype=np.float32) / 255.0 for frame in small], axis=1
-        ),
-    )
+    write_bytes(run.path / IMAGES / f"{name}.webp", stream.getvalue())
+    width = max(1, round(frames[0].width * STRIP_HEIGHT / frames[0].height))
+    strip = []
+    for number in evenly(len(frames), MAX_STRIP_FRAMES):
+        small = frames[number].resize((width, STRIP_HEIGHT), Image.Resampling.LANCZOS)
+        strip.append(np.asarray(small, dtype=np.float32) / 255.0)
+    run.save_image(name, np.concatenate(strip, axis=1))
 
 
-def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
-    """Return the numbers of some of so many frames, evenly spaced, the first and the
-    last among them.
+def evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
+    """Return indices of evenly spaced frames, the first and the last among them.
+
+    Args:
+        count: of all frames.
+        max_count: of the indices.
     """
-    return np.unique(
-        np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
-    )
+    indices = np.linspace(0, count - 1, min(count, max_count)).round()
+    return np.unique(indices.astype(np.int64))

@@ -1,7 +1,6 @@
-"""An attack, from its parts to its result: problem, search, random search,
-verification.
+"""An attack, from its parts to its result.
 
-`run_attack` is the whole line, to be read from top to bottom; `search_and_verify` is
+`run_attack` does all of it, to be read from top to bottom; `search_and_verify` is
 what it does with a problem, and `advsearch.questions.attack.stages` has each of its
 stages.
 """
@@ -57,7 +56,7 @@ from advsearch.runs.directory import RunDirectory, check_free
 from advsearch.tasks import function_of
 
 PREPARING = "preparing the scene for rendering"
-WORKER = "advsearch.questions.attack.carry_out:attack_worker"  # what a worker does
+WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 
 
 def attack_once(
@@ -67,12 +66,12 @@ def attack_once(
     resumed: Path | None = None,
     clean: CleanMatrix | None = None,
 ) -> AttackResult:
-    """Attack what settings name, one object with one epsilon, in a run directory.
+    """Attack one object with one epsilon, as settings name them, in a run directory.
 
     Args:
         config: the settings.
-        progress: is told how far it is.
-        resumed: the folder of the run that is continued; None for a new one.
+        progress: reports it.
+        resumed: the directory of the run that is continued; None for a new one.
         clean: the matrix of the clean scene, shared with attacks whose settings differ
             in epsilon alone.
     """
@@ -93,25 +92,22 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
 def run_attack(
     parts: AttackParts, progress: Progress, resumed: str | Path | None = None
 ) -> AttackResult:
-    """Search for the worst configuration of loaded parts, verify it, and return all
-    that is known of it.
+    """Search for the worst configuration, verify it, and return the result.
 
     Args:
         parts: scene, model, task, controls and policy, with the settings of the attack.
-        progress: is told how far it is.
-        resumed: the folder of the run that is continued; None for a new one.
+        progress: reports it.
+        resumed: the directory of the run that is continued; None for a new one.
 
     Raises:
-        InputError: parts do not go together, or the run that goes on began with others.
+        InputError: parts do not fit together, or the run that is continued has others.
     """
     config = parts.config
     model, loading_notes = parts.loaded
     with ExitStack() as stack:
-        run = (
-            None
-            if resumed is None
-            else stack.enter_context(RunDirectory.of(config, resumed))
-        )
+        run = None
+        if resumed is not None:
+            run = stack.enter_context(RunDirectory.of(config, resumed))
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = problem_on(parts)
@@ -122,12 +118,7 @@ def run_attack(
         ]
         for text in warnings:
             progress.message(text)
-        gradient_setting = "measure" if config.measure == "full" else None
-        policy = choose_policy(
-            parts.policy,
-            problem,
-            "estimators" if config.estimators else gradient_setting,
-        )
+        policy = choose_policy(parts.policy, problem, _gradient_setting(config))
         if run is None and parts.keep:
             run = stack.enter_context(RunDirectory.of(config))
         if run is not None:
@@ -135,13 +126,15 @@ def run_attack(
         with executor_for(config, WORKER, progress) as executor:
             # replays stored rows, renders and stores the others
             journal = Journal(run, Shared(problem, executor))
-            if problem.conditions is not None and None in (config.steps, config.draws):
+            is_size_chosen = config.steps is None or config.draws is None
+            if problem.conditions is not None and is_size_chosen:
                 progress.message(
                     "One configuration for many conditions: "
                     f"{count(problem.steps, 'step')}, each over "
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change "
                     "that."
                 )
+            has_trial_count = config.trials is not None or config.smallest
             findings = search_and_verify(
                 policy,
                 journal,
@@ -153,9 +146,7 @@ def run_attack(
                 printable=config.printable,
                 close_looks=config.close_looks,
                 average=config.average,
-                trials=config.trial_count
-                if config.trials is not None or config.smallest
-                else None,
+                trials=config.trial_count if has_trial_count else None,
                 ladder=ladder_of(config.verify_spp, config.pixel_sampler),
                 specialise=config.specialise,
                 measure=config.measure,
@@ -203,16 +194,17 @@ def search_and_verify(
     deterministic: bool = False,
     chooses_spp: bool = False,
 ) -> Findings:
-    """Search a problem with a policy and at random, and verify what was found; Ctrl-C
-    ends it with what there is.
+    """Search a problem with a policy and at random, and verify what was found.
+
+    Ctrl-C ends it with what there is.
 
     Args:
         policy: proposes configurations.
         journal: of the problem; it replays what is stored of the run.
-        stages: is told what is done.
+        stages: reports what is done.
         clean: the matrix of the clean scene, of attacks that share it.
-        smallest: look for the smallest budget in which the model is wrong, in place of
-            the worst configuration.
+        smallest: search the smallest budget in which the model is wrong instead of the
+            worst configuration.
         seconds: that the search may take; None for no limit.
         baseline: whether a random search with as many renders is made.
         printable: whether the objective includes print terms; then a search without
@@ -225,7 +217,7 @@ def search_and_verify(
         specialise: whether what the search does not need may be left out, and images be
             predicted.
         measure: which gradient estimators are measured.
-        deterministic: whether counts decide in place of times.
+        deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel of the
             search.
     """
@@ -240,7 +232,7 @@ def search_and_verify(
         journal, stages, findings, printable=printable, close_looks=close_looks
     )
     if smallest:
-        # refuses what has no budget before anything is rendered
+        # raises for what has no budget, before anything is rendered
         scaled(problem.domain, 1.0)
     try:
         with interruptible():
@@ -281,8 +273,13 @@ def search_and_verify(
 def search_with_baselines(
     searches: Searches, policy: Policy[Any], *, seconds: float | None, baseline: bool
 ) -> None:
-    """Search with a policy; then without print terms, if there are some, and at random,
-    to compare.
+    """Search with a policy, then without print terms, if any, and at random.
+
+    Args:
+        searches: of the attack.
+        policy: that searches.
+        seconds: that its search may take; None for no limit.
+        baseline: whether a random search is made.
     """
     problem = searches.problem
     findings = searches.findings
@@ -322,21 +319,19 @@ def search_with_baselines(
 def choose_policy(
     policy: Policy[Any], problem: Problem, gradient_setting: str | None = None
 ) -> Policy[Any]:
-    """Return the policy that searches a problem: the requested one, or what `auto` is
-    here.
+    """Return the policy that searches a problem: the requested one, or what `auto` is.
 
-    Where a model lets no gradient through, `auto` climbs by differences; behind an
-    address it climbs nowhere.
+    For a model without a gradient, `auto` ascends by differences; behind an address it
+    does not ascend.
 
     Args:
         policy: the requested one.
         problem: is searched.
-        gradient_setting: the setting that says something about derivatives; None if
-            none does.
+        gradient_setting: the setting that concerns derivatives; None if none does.
 
     Raises:
-        InputError: the policy needs the gradient of a model that has none, or
-            derivatives that nobody takes are set.
+        InputError: the policy needs the gradient of a model that has none, or does not
+            use the derivatives that a setting concerns.
     """
     norms = {block.norm for block in problem.domain.blocks}
     if isinstance(problem.model.module, RemoteNetwork):
@@ -362,10 +357,15 @@ def choose_policy(
     return policy
 
 
+def _gradient_setting(config: AttackConfig) -> str | None:
+    """Return the setting that concerns derivatives; None if none does."""
+    if config.estimators:
+        return "estimators"
+    return "measure" if config.measure == "full" else None
+
+
 def functions_of(parts: AttackParts) -> dict[str, Callable[..., Any] | None]:
-    """Return the caller's own functions, by what a run has them for; one that goes on
-    has to have the same.
-    """
+    """Return the caller's functions by their use; a continued run needs the same."""
     functions: dict[str, Callable[..., Any] | None] = {
         f"metric {name}": metric for name, metric in parts.metrics.items()
     }

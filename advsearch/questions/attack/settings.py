@@ -1,4 +1,4 @@
-"""What `attack` needs to know."""
+"""The settings of `attack`."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ OVER_PREDICTED = (300, 8)
 OVER_ONE = (100, 4)
 OVER_RENDERED = (150, 4)
 OVER_NUMBERS = (STEPS, 4)
-"""Steps, and conditions that each looks at, of a search for many conditions: where a
-bank of light transport predicts pictures, where that is so and conditions are one
-number (docs/drives.md), where each is rendered, and where only a few numbers are
+"""Steps of a search for many conditions, and conditions that each evaluates: if a bank
+of light transport predicts images; if, besides, conditions are a single number
+(docs/drives.md); if each image is rendered; and if, besides, only a few numbers are
 searched (a pose).
 """
 FEWEST_TRIALS = 6
-"""With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a
-test holds this to.
+"""With fewer trials nothing can be called found: `attacks.verification.Rule.fewest`,
+which a test compares.
 """
 
 
 class AttackConfig(DerivativeConfig):
-    """Everything that decides what `attack` does. Frozen; unknown names are refused."""
+    """The settings of `attack`. Frozen; unknown names are rejected."""
 
     command: ClassVar[str] = "attack"
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
@@ -50,131 +50,208 @@ class AttackConfig(DerivativeConfig):
         "workers",
         "cluster",
     )
-    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash("smallest", lambda asked: asked.epsilons,
-              "finds one epsilon by itself; give one `epsilon` as the largest, or none"),
-        Clash("smallest", lambda asked: asked.is_study,
-              "is about one object and one model; name one `object`, one `model`, and "
-              "one `epsilon` as the largest"),
-        Clash("model", lambda asked: asked.is_matrix and asked.is_curve,
-              "several make a matrix, of one object and one epsilon; name one `object` "
-              "and one `epsilon`, or one "
-              "`model`"),
-        Clash("ensemble", lambda asked: len(split_names(asked.model)) < 2,
-              "is of several models; name them in `model`, separated by commas, or "
-              "leave `ensemble` out"),
-        Clash("smallest", lambda asked: asked.seconds is not None,
-              "takes several searches; give `steps` for each, and leave `seconds` out"),
-        Clash("smallest", lambda asked: asked.over, "cannot be combined with `over` "
-                                                    "yet; leave one of them out"),
-        Clash("smallest", lambda asked: asked.printable, "cannot be combined with "
-                                                         "`printable`; leave one of "
-                                                         "them out"),
-        Clash("minimise", lambda asked: asked.is_curve, "has no robust accuracy; name "
-                                                        "one `object` and one `epsilon`"),
-        Clash("minimise", lambda asked: asked.target, "makes the right answer easier "
-                                                      "to give; leave `target` out"),
-        Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave "
-                                                        "`smallest` out"),
-        Clash("over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
-              "names a control that is searched already; leave it out of one of the two"),
-        Clash("draws", lambda asked: not asked.over,
-              "is how many conditions of `over` a step looks at, and there are none; "
-              "add `over`, or leave `draws` out"),
-        Clash("estimators",
-              lambda asked: (
-                  {name.partition(".")[0] for name in asked.estimators}
-                  & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
-              ),
-              "names a control that varies by chance, whose derivative nobody asks "
-              "for; leave it out"),
-        Clash("average", lambda asked: asked.epsilons,
-              "is the average within one epsilon; name one `epsilon`, or leave "
-              "`average` out"),
+        Clash(
+            "smallest",
+            lambda config: config.epsilons,
+            "finds one epsilon by itself; give one `epsilon` as the largest, or none",
+        ),
+        Clash(
+            "smallest",
+            lambda config: config.is_study,
+            "is about one object and one model; name one `object`, one `model`, and "
+            "one `epsilon` as the largest",
+        ),
+        Clash(
+            "model",
+            lambda config: config.is_matrix and config.is_curve,
+            "several make a matrix, of one object and one epsilon; name one `object` "
+            "and one `epsilon`, or one "
+            "`model`",
+        ),
+        Clash(
+            "ensemble",
+            lambda config: len(split_names(config.model)) < 2,
+            "is of several models; name them in `model`, separated by commas, or "
+            "leave `ensemble` out",
+        ),
+        Clash(
+            "smallest",
+            lambda config: config.seconds is not None,
+            "takes several searches; give `steps` for each, and leave `seconds` out",
+        ),
+        Clash(
+            "smallest",
+            lambda config: config.over,
+            "cannot be combined with `over` yet; leave one of them out",
+        ),
+        Clash(
+            "smallest",
+            lambda config: config.printable,
+            "cannot be combined with `printable`; leave one of them out",
+        ),
+        Clash(
+            "minimise",
+            lambda config: config.is_curve,
+            "has no robust accuracy; name one `object` and one `epsilon`",
+        ),
+        Clash(
+            "minimise",
+            lambda config: config.target,
+            "makes the right answer easier to give; leave `target` out",
+        ),
+        Clash(
+            "minimise",
+            lambda config: config.smallest,
+            "has no smallest change; leave `smallest` out",
+        ),
+        Clash(
+            "over",
+            lambda config: (
+                {*map(instance, config.over)} & {*map(instance, config.controls)}
+            ),
+            "names a control that is searched already; leave it out of one of the two",
+        ),
+        Clash(
+            "draws",
+            lambda config: not config.over,
+            "is how many conditions of `over` a step looks at, and there are none; "
+            "add `over`, or leave `draws` out",
+        ),
+        Clash(
+            "estimators",
+            lambda config: (
+                {name.partition(".")[0] for name in config.estimators}
+                & {
+                    part
+                    for name in map(instance, config.over)
+                    for part in (name, name.rpartition(":")[2])
+                }
+            ),
+            "names a control that varies by chance, whose derivative nobody asks "
+            "for; leave it out",
+        ),
+        Clash(
+            "average",
+            lambda config: config.epsilons,
+            "is the average within one epsilon; name one `epsilon`, or leave "
+            "`average` out",
+        ),
     )
 
     object: str = setting_as_in(
-        SceneConfig, "object",
+        SceneConfig,
+        "object",
         description="the object that the model should recognise; several, separated by "
-                    "commas, are attacked in turn",
+        "commas, are attacked in turn",
     )
     model: str = setting_as_in(
-        SceneConfig, "model",
+        SceneConfig,
+        "model",
         description="the network under test; of several, separated by commas, each is "
-                    "attacked and its adversarial "
+        "attacked and its adversarial "
         "scene tried on all",
     )
     ensemble: Literal["mean", "worst"] | None = setting(
-        None, "model",
+        None,
+        "model",
         "find one scene against several models together: maximise the mean of their "
         "objectives, or the lowest one",
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
-        "quick", "search",
+        "quick",
+        "search",
         "measure which gradient estimator is best on this scene; full also measures "
         "step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(
-        "auto", "search", "the search policy, which proposes configurations",
+        "auto",
+        "search",
+        "the search policy, which proposes configurations",
         "the name of a policy, or NAME={OPTION: VALUE}",
     )
     steps: int | None = setting(
-        None, "search", "number of search steps, each of which evaluates one "
-                        "configuration",
+        None,
+        "search",
+        "number of search steps, each of which evaluates one configuration",
         otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} "
-                  "where pictures are predicted, "
+        "where pictures are predicted, "
         f"{OVER_ONE[0]} where one number varies, as along a path, and "
         f"{OVER_RENDERED[0]} where they are rendered",
-        ge=1, le=1_000_000,
+        ge=1,
+        le=1_000_000,
     )
     seconds: float | None = setting(
-        None, "search", "stop the search after this time; the random search beside it "
-                        "gets as many renders",
-        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
+        None,
+        "search",
+        "stop the search after this time; the random search beside it "
+        "gets as many renders",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
     )
     target: str | None = setting(
-        None, "search", "the wrong prediction to aim for, or several",
-        "names of classes or their numbers, separated by commas", otherwise="any wrong prediction",
+        None,
+        "search",
+        "the wrong prediction to aim for, or several",
+        "names of classes or their numbers, separated by commas",
+        otherwise="any wrong prediction",
     )
-    minimise: bool = setting(False, "search", "make the object easier to recognise, "
-                                              "not harder")
+    minimise: bool = setting(
+        False, "search", "make the object easier to recognise, not harder"
+    )
     smallest: bool = setting(
-        False, "search", "find the smallest epsilon at which the model is wrong; "
-                         "--epsilon is the largest to try"
+        False,
+        "search",
+        "find the smallest epsilon at which the model is wrong; "
+        "--epsilon is the largest to try",
     )
     printable: bool = setting(
-        False, "search",
+        False,
+        "search",
         "prefer a smooth texture or patch in printable colours; a second search "
         "without this tells what it costs in "
         "margin",
     )
     aov: str | None = setting_as_in(
-        RenderConfig, "aov",
+        RenderConfig,
+        "aov",
         description="write ground truth of each pixel, names separated by commas, as "
-                    "layers of an EXR, for the clean "
+        "layers of an EXR, for the clean "
         "scene and the adversarial one",
     )
     metrics: dict[str, str] = setting(
-        dict, "run", "your own numbers for every picture, each a column of the rows; "
-                     "may be repeated",
-        "NAME=package.module:function of image, output and truth", flag="--metric", metavar="NAME=FUNCTION",
+        dict,
+        "run",
+        "your own numbers for every picture, each a column of the rows; "
+        "may be repeated",
+        "NAME=package.module:function of image, output and truth",
+        flag="--metric",
+        metavar="NAME=FUNCTION",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
-        None, "run", "experiment tracker to which every evaluation is sent; its "
-                     "package has to be installed",
-        otherwise="none", power=powers.tracker,
+        None,
+        "run",
+        "experiment tracker to which every evaluation is sent; its "
+        "package has to be installed",
+        otherwise="none",
+        power=powers.tracker,
     )
     over: ControlsByName = setting_as_in(
-        SceneConfig, "controls", default=dict,
+        SceneConfig,
+        "controls",
+        default=dict,
         description="controls that are drawn at random; one configuration has to hold "
-                    "across the draws", flag="",
+        "across the draws",
+        flag="",
         min_length=None,
     )
     path: str | None = setting(
-        None, "search",
+        None,
+        "search",
         "the path along which camera or object travel, with --over path; pictures of "
         "the adversarial scene along it "
         "are kept",
@@ -182,61 +259,101 @@ class AttackConfig(DerivativeConfig):
         "two of them, the camera's and the "
         "object's, as in approach+orbit; of "
         "several with commas between them, one is drawn each time",
-        otherwise="approach", min_length=1,
+        otherwise="approach",
+        min_length=1,
     )
     shutter: float | None = setting(
-        None, "search", "how long each row of a picture is exposed along a path "
-                        "(motion blur)", otherwise="a still",
-        unit="seconds", gt=0.0, le=60.0,
+        None,
+        "search",
+        "how long each row of a picture is exposed along a path (motion blur)",
+        otherwise="a still",
+        unit="seconds",
+        gt=0.0,
+        le=60.0,
     )
     rolling: float | None = setting(
-        None, "search",
+        None,
+        "search",
         "how long the rows of a picture are read one after the other along a path "
         "(rolling shutter), from the top; "
-        "below 0 from the bottom", otherwise="all at once", unit="seconds", ge=-60.0, le=60.0,
+        "below 0 from the bottom",
+        otherwise="all at once",
+        unit="seconds",
+        ge=-60.0,
+        le=60.0,
     )
     draws: int | None = setting(
-        None, "search", "how many random conditions each step looks at, with --over",
+        None,
+        "search",
+        "how many random conditions each step looks at, with --over",
         otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one "
-                  "number varies, otherwise "
-        f"{OVER_RENDERED[1]}", ge=1, le=1000,
+        "number varies, otherwise "
+        f"{OVER_RENDERED[1]}",
+        ge=1,
+        le=1000,
     )
     average: int = setting(
-        0, "search", "also evaluate this many random configurations, to tell how often "
-                     "the model is wrong on average",
-        unit="renders", ge=0, le=1_000_000,
+        0,
+        "search",
+        "also evaluate this many random configurations, to tell how often "
+        "the model is wrong on average",
+        unit="renders",
+        ge=0,
+        le=1_000_000,
     )
     baseline: bool = setting(
-        True, "search", "run a random search with as many renders beside it", flag="--no-baseline",
+        True,
+        "search",
+        "run a random search with as many renders beside it",
+        flag="--no-baseline",
         switched="skip the random search that runs beside the search as a baseline",
     )
 
     verify_spp: int | None = setting(
-        None, "verification", "samples per pixel of the verification",
-        otherwise="raised until more would leave the margin on its side", unit="samples", ge=1, le=65536,
+        None,
+        "verification",
+        "samples per pixel of the verification",
+        otherwise="raised until more would leave the margin on its side",
+        unit="samples",
+        ge=1,
+        le=65536,
     )
     trials: int | None = setting(
-        None, "verification", "fresh renders that verify the adversarial scene, and as "
-                              "many of the clean scene",
+        None,
+        "verification",
+        "fresh renders that verify the adversarial scene, and as "
+        "many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be "
         "called found)",
         otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} "
-                  f"where some fail; {TRIALS} with "
-        "--smallest", unit="renders", ge=FEWEST_TRIALS, le=100_000,
+        f"where some fail; {TRIALS} with "
+        "--smallest",
+        unit="renders",
+        ge=FEWEST_TRIALS,
+        le=100_000,
     )
 
     workers: int | None = setting(
-        None, "run",
+        None,
+        "run",
         "worker processes; they share the attacks of several objects or models, or the "
         "independent renders of one",
-        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=powers.many_processes,
+        otherwise="this one alone",
+        unit="processes",
+        ge=1,
+        le=100_000,
+        power=powers.many_processes,
     )
     cluster: str | None = setting(
-        None, "run", "where the workers are", "the address of a Dask scheduler, local, "
-                                              "or a .yaml file",
-        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=powers.connection,
+        None,
+        "run",
+        "where the workers are",
+        "the address of a Dask scheduler, local, or a .yaml file",
+        metavar="PLACE",
+        otherwise="this machine, if there are `workers`",
+        min_length=1,
+        power=powers.connection,
     )
-    # fmt: on
 
     @model_validator(mode="before")
     @classmethod
@@ -259,11 +376,11 @@ class AttackConfig(DerivativeConfig):
     @property
     def policy_options(self) -> JsonObject:
         """Options of the policy."""
-        return (
-            {}
-            if isinstance(self.policy, str)
-            else {k: v for k, v in self.policy.items() if k != "name"}
-        )
+        if isinstance(self.policy, str):
+            return {}
+        return {
+            option: value for option, value in self.policy.items() if option != "name"
+        }
 
     @property
     def is_curve(self) -> bool:
@@ -283,18 +400,15 @@ class AttackConfig(DerivativeConfig):
     @property
     def trial_count(self) -> int:
         """Trials of each group in the verification."""
-        return (
-            self.trials
-            if self.trials is not None
-            else TRIALS_OVER
-            if self.over
-            else TRIALS
-        )
+        if self.trials is not None:
+            return self.trials
+        return TRIALS_OVER if self.over else TRIALS
 
 
 def instance(asked: str) -> str:
-    """A control as it is asked for, without its parameter: `light:key`, or `camera` of
-    `camera.azimuth`.
+    """Return the instance in the name of a parameter.
+
+    `light:key` for itself, `camera` for `camera.azimuth`.
     """
     kind, colon, name = asked.partition(":")
     return kind.partition(".")[0] + colon + name.partition(".")[0]

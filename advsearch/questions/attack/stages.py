@@ -1,6 +1,4 @@
-"""The stages of an attack, in the order in which `advsearch.questions.attack.run` goes
-through them.
-"""
+"""The stages of an attack, in the order of `advsearch.questions.attack.run`."""
 
 from __future__ import annotations
 
@@ -60,8 +58,8 @@ from advsearch.tasks import Judgement
 
 MAX_FRAMES = 60
 UNPRINTED = "search without print terms"
-"""The kind of the search without print terms, alongside one with them: it tells what
-these cost.
+"""The kind of the search without print terms: compared with one that has them, it
+measures what they cost.
 """
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes
@@ -74,10 +72,6 @@ all, with step and samples.
 """
 
 
-# ---- before the search
-# ----------------------------------------------------------------------------------------------
-
-
 def plan_renders(
     policy: Policy[Any],
     journal: Journal,
@@ -88,8 +82,7 @@ def plan_renders(
     deterministic: bool,
     chooses_spp: bool,
 ) -> None:
-    """Choose the bounces of light, gradient estimators and samples of a search by
-    measurement on the scene.
+    """Choose light bounces, gradient estimators and samples of a search by measurement.
 
     The choice is set in the journal's problem, and stored: a run that goes on has the
     same.
@@ -97,10 +90,10 @@ def plan_renders(
     Args:
         policy: what searches; only one that uses gradients has them measured.
         journal: of the run.
-        stages: is told what is measured.
+        stages: reports what is measured.
         specialise: whether what the search does not need may be left out.
         measure: which gradient estimators are measured.
-        deterministic: whether counts decide in place of times.
+        deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
     problem = journal.problem
@@ -110,27 +103,17 @@ def plan_renders(
         problem.spp = stored["spp"]
         problem.search_depth = stored["search_depth"]
         return
-    is_worth_measuring = measure == "full" or problem.steps >= planning.WORTH_BOUNCES
-    if specialise and is_worth_measuring:
+    is_full = measure == "full"
+    if specialise and (is_full or problem.steps >= planning.WORTH_BOUNCES):
         refusal = surface_light.refusal_of_surface_light(
             problem, problem.steps, policy, specialise
         )
         if refusal is not None:  # else no step will be rendered
-            title = "finding how many bounces of light the search needs"
-            most = planning.most_pictures(problem)
-            hint = "few samples each; `specialise=false` leaves it out"
-            stages.begin("setup", title, most, hint=hint, at_most=True)
-            tick = stages.progress.advance
-            problem.search_depth = planning.bounces_of(
-                problem, problem.seed, tick=tick
-            ).depth
-    is_full = measure == "full"
+            _choose_bounces(problem, stages)
     if policy.uses_gradient and measure != "no":
-        # else derivatives come from what predicts the images
-        if (
-            is_full
-            or refusal_of_matrices(problem, problem.steps, specialise) is not None
-        ):
+        refusal = refusal_of_matrices(problem, problem.steps, specialise)
+        # Without a refusal, derivatives come from what predicts the images.
+        if is_full or refusal is not None:
             _measure_gradients(
                 problem,
                 stages,
@@ -138,12 +121,26 @@ def plan_renders(
                 deterministic=deterministic,
                 chooses_spp=chooses_spp,
             )
-    chosen = {
+    choice = {
         "plan": problem.plan.to_dict(),
         "spp": problem.spp,
         "search_depth": problem.search_depth,
     }
-    journal.set_note(PLAN, chosen)
+    journal.set_note(PLAN, choice)
+
+
+def _choose_bounces(problem: Problem, stages: Stages) -> None:
+    """Choose how many bounces of light the search renders."""
+    stages.begin(
+        "setup",
+        "finding how many bounces of light the search needs",
+        planning.most_pictures(problem),
+        hint="few samples each; `specialise=false` leaves it out",
+        at_most=True,
+    )
+    tick = stages.progress.advance
+    bounces = planning.bounces_of(problem, problem.seed, tick=tick)
+    problem.search_depth = bounces.depth
 
 
 def _measure_gradients(
@@ -154,9 +151,7 @@ def _measure_gradients(
     deterministic: bool,
     chooses_spp: bool,
 ) -> None:
-    """Choose gradient estimators, and with `full` their step and samples, by
-    measurement.
-    """
+    """Choose gradient estimators by measurement, and with `full` step and samples."""
     renderer = problem.renderer
     progress = stages.progress
     counted = not full or deterministic
@@ -198,9 +193,7 @@ def _measure_gradients(
 def look_at_clean_scene(
     journal: Journal, stages: Stages, spp: int
 ) -> tuple[Judgement, ...]:
-    """Render the clean configuration a few times, and return what model and objective
-    say.
-    """
+    """Render the clean configuration a few times, and return the judgements."""
     problem = journal.problem
     seed = seeds.stream(problem.seed, "first look")
     start = problem.domain.start
@@ -218,10 +211,10 @@ def look_at_clean_scene(
 
 
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
-    """Return whether the clean scene is wrong in the full trials, so that there is
-    nothing to search for.
+    """Return whether the clean scene is wrong, so that there is nothing to search for.
 
-    They are made where it was wrong in every first look, or `in_any_case`.
+    The full trials decide. They are made if it was wrong in every first look, or
+    `in_any_case`.
     """
     problem = verifier.problem
     findings = verifier.findings
@@ -243,11 +236,10 @@ def choose_predictor(
     specialise: bool,
     clean: CleanMatrix,
 ) -> PredictedSearch | None:
-    """Return the cheapest predictor that is accurate here, prepared, or None: then
-    every step is rendered.
+    """Prepare and return the cheapest predictor that is accurate here.
 
-    Light on surfaces is compared with traced images first. Why another predictor, or
-    none, was taken is in `findings`.
+    None if there is none: then every step is rendered. Light on surfaces is compared
+    with traced images first. Why it is another predictor, or none, is in `findings`.
     """
     problem = journal.problem
     steps = problem.steps
@@ -286,9 +278,7 @@ def choose_predictor(
 
 
 def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
-    """Prepare what predicts images, and return why it cannot be used; None if it
-    can.
-    """
+    """Prepare a predictor, and return why it cannot be used; None if it can."""
     is_light = isinstance(predictor, SurfaceLight)
     title = (
         "finding the light on surfaces" if is_light else "collecting light transport"
@@ -306,24 +296,21 @@ def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
 
 
 def _report_rendering(refusal: Refusal, stages: Stages, findings: Findings) -> None:
+    """Report and store why images are rendered."""
     findings.rendered_because = refusal
-    if text := remark(refusal):
+    text = remark(refusal)
+    if text:
         stages.progress.message(text)
-
-
-# ---- searches
-# -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Searches:
-    """Makes the searches of one attack: by what predicts images, where there is
-    something, or else by rendering.
+    """Makes the searches of one attack, with predicted images or rendered ones.
 
     Attributes:
         journal: replays stored evaluations, and stores the others.
-        stages: is told how far a search is.
-        findings: what is known so far; its `transport` predicts.
+        stages: reports the progress.
+        findings: so far; their `transport` predicts images.
         printable: whether objectives include print terms.
         close_looks: further renders of candidates that are close to the best.
     """
@@ -339,17 +326,21 @@ class Searches:
         return self.journal.problem
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
-        """Begin the stage of a search of so many steps; `shorter` says which settings
-        shorten it.
+        """Begin the stage of a search.
+
+        Args:
+            name: of the stage.
+            title: for the progress.
+            steps: of the search.
+            shorter: which settings shorten it.
         """
-        renders = planned_renders(steps, close=self.close_looks)
-        hint = (
-            f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; "
-            f"{shorter}"
-        )
+        n_renders = planned_renders(steps, close=self.close_looks)
+        samples = count(self.problem.spp, "sample")
+        hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         if self.findings.transport is not None:
-            hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
-        self.stages.begin(name, title, renders, hint=hint, at_most=True)
+            n_traced = n_renders - steps
+            hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
+        self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
     def search(
         self,
@@ -370,7 +361,7 @@ class Searches:
             policy: proposes configurations.
             steps: evaluations.
             seed: of the policy.
-            frames: are given images on the way, (H, W, 3) 8-bit values in [0, 1].
+            frames: gets images on the way, (H, W, 3) 8-bit values in [0, 1].
             seconds: that it may take; None for no limit.
             domain: to search; None for the problem's.
             ranked: whether the best configurations are rendered again.
@@ -380,7 +371,7 @@ class Searches:
                 search is in `findings` before.
         """
         renders_before = 0
-        frame_interval = max(1, -(-steps // MAX_FRAMES))
+        frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
         transport = self.findings.transport
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
@@ -434,8 +425,9 @@ class Searches:
         return result
 
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer queries by what predicts images, or by rendering, and take print terms
-        off the objective.
+        """Evaluate queries with predicted or rendered images.
+
+        Print terms are subtracted from the objective.
         """
         traced = self.journal.traced
         predictor = self.findings.transport
@@ -450,10 +442,6 @@ class Searches:
                 if has_print_terms
                 else evaluation
             )
-
-
-# ---- verification
-# ---------------------------------------------------------------------------------------------------
 
 
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
@@ -501,166 +489,181 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         findings.baseline_verification = verifier.verified(
             "baseline verification", baseline, curtailed=is_found
         )
-        _take_the_worse(verifier, candidate, baseline)
+        _replace_if_random_is_worse(verifier, candidate, baseline)
     if not is_smallest:
         check_failures(verifier, candidate)
     if findings.verification.ending is Ending.FOUND:
         find_ambient(verifier, findings.verification.u)
 
 
-def _take_the_worse(
+def _replace_if_random_is_worse(
     verifier: Verifier, result: SearchResult, baseline: SearchResult
 ) -> None:
-    """Let what the random search found be the run's if it is found and the worse one
-    for the model.
+    """Use what the random search found if that is worse for the model.
 
-    It is chosen by its trials, so these are no evidence: it has to be the worse one in
-    fresh ones, too.
+    It is chosen by its trials, so these are no evidence: it has to be worse in fresh
+    ones, too.
     """
     findings = verifier.findings
-    by_policy = findings.verification
-    by_chance = findings.baseline_verification
-    if by_policy is None or by_chance is None or by_chance.ending is not Ending.FOUND:
+    policy_verification = findings.verification
+    random = findings.baseline_verification
+    if (
+        policy_verification is None
+        or random is None
+        or random.ending is not Ending.FOUND
+    ):
         return
-    if _rank(by_chance) <= _rank(by_policy):
+    if _rank(random) <= _rank(policy_verification):
         return
     title = "checking what the random search found again"
     verifier.begin(title, 2 * verifier.count, at_most=True)
-    by_chance = verifier.verified("baseline verification", baseline, again=True)
-    findings.baseline_verification = by_chance
-    if _rank(by_chance) > _rank(by_policy):
-        findings.beaten = by_policy
-        findings.verification = by_chance
-        names = ("best_u", "best_objective", "claimed_objective", "success_rate")
-        taken = {name: getattr(baseline, name) for name in names}
-        findings.search = replace(result, **taken, distribution=None)
+    random = verifier.verified("baseline verification", baseline, again=True)
+    findings.baseline_verification = random
+    if _rank(random) > _rank(policy_verification):
+        findings.beaten = policy_verification
+        findings.verification = random
+        findings.search = replace(
+            result,
+            best_u=baseline.best_u,
+            best_objective=baseline.best_objective,
+            claimed_objective=baseline.claimed_objective,
+            success_rate=baseline.success_rate,
+            distribution=None,
+        )
 
 
-# Trials in a row that the upper end of a smallest epsilon has to pass, or as many
-# checks as have them
-CONFIRMED = 40
+# trials in a row that the upper end of a smallest epsilon has to pass, in as many checks
+# as have them
+MIN_CONFIRMING_TRIALS = 40
 
 
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
-    """Bracket the smallest epsilon; every claim on the way goes through trials with
-    seeds of its own.
+    """Bracket the smallest epsilon at which the model is wrong.
 
-    On the way the fewest trials that can verify anything are enough where none fails.
-    The upper end is tried again in full, and what is verified at the end is the
-    configuration there.
+    Every claim on the way goes through trials with seeds of its own. There, the fewest
+    trials that can verify anything are enough if none fails. The upper end is tried
+    again in full, and what is verified at the end is the configuration there.
+
+    Args:
+        searches: of the attack.
+        policy: that searches.
+        verifier: that tries what was found.
     """
     problem = searches.problem
     findings = searches.findings
-    trials = verifier.count
+    n_trials = verifier.count
     results: list[SearchResult] = []
-    transport = (
-        findings.transport if isinstance(findings.transport, Transport) else None
-    )
+    transport = None
+    if isinstance(findings.transport, Transport):
+        transport = findings.transport
 
-    def searched(inside: Domain, number: int) -> Tensor:
+    def search_inside(domain: Domain, number: int) -> Tensor:
         title = f"search {number + 1} of at most {ROUNDS}"
         searches.begin("search", title, problem.steps, "`steps` shortens each search")
-        kind = f"search {number}" if number else "search"
-        seed = seeds.stream(problem.seed, "smallest", number)
-        ranked = transport is None  # what is predicted has no noise
-        results.append(
-            searches.search(
-                kind, policy, problem.steps, seed, domain=inside, ranked=ranked
-            )
+        result = searches.search(
+            f"search {number}" if number else "search",
+            policy,
+            problem.steps,
+            seeds.stream(problem.seed, "smallest", number),
+            domain=domain,
+            ranked=transport is None,  # what is predicted has no noise
         )
+        results.append(result)
         # what was found if this is interrupted
         findings.search = findings.search or results[0]
-        verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
-        return results[-1].best_u
+        verifier.begin("trying smaller changes", MOST_CHECKS * n_trials, at_most=True)
+        return result.best_u
 
-    def passes(u: Tensor, check: int, few: int = trials) -> bool:
-        allowed = problem.rule.allowed(trials)
+    def passes(u: Tensor, check: int, min_trials: int = n_trials) -> bool:
+        """Return whether a configuration (d,) passes a check, as many as it needs."""
+        max_failures = problem.rule.allowed(n_trials)
         scores = list[float]()
-        failures = 0
-        while (
-            len(scores) < trials
-            and failures <= allowed
-            and (failures or len(scores) < few)
-        ):
+        n_failures = 0
+        while len(scores) < n_trials and n_failures <= max_failures:
+            if not n_failures and len(scores) >= min_trials:
+                break
             (trial,) = verifier.trials(f"check {check}", {len(scores): u})
             scores.append(trial.score)
-            failures += not trial.success
+            n_failures += not trial.success
         if transport is not None:
             transport.correct(u, scores)
-        if failures <= allowed:
+        has_passed = n_failures <= max_failures
+        if has_passed:
             findings.search = replace(results[-1], best_u=u)
-        return failures <= allowed
+        return has_passed
 
-    def seems(u: Tensor, check: int) -> bool:
+    def passes_few(u: Tensor, check: int) -> bool:
         return passes(u, check, problem.rule.fewest)
 
-    times = -(-CONFIRMED // trials)
     bracket = smallest(
-        searched,
-        seems,
+        search_inside,
+        passes_few,
         problem.domain,
         likely=None if transport is None else transport.likely,
     )
+    n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
     if bracket.u is not None:
         verifier.begin(
-            "checking the smallest change", ATTEMPTS * times * trials, at_most=True
+            "checking the smallest change",
+            ATTEMPTS * n_repeats * n_trials,
+            at_most=True,
         )
-    findings.smallest = bracket = confirmed(
-        bracket, passes, problem.domain, times=times
-    )
+    bracket = confirmed(bracket, passes, problem.domain, times=n_repeats)
+    findings.smallest = bracket
     winner = results[0]
     if bracket.u is not None:
         winner = replace(
             results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND
         )
-    renders, gradients = (
-        sum(getattr(result, name) for result in results)
-        for name in ("renders", "gradients")
+    findings.search = replace(
+        winner,
+        renders=sum(result.renders for result in results),
+        gradients=sum(result.gradients for result in results),
     )
-    findings.search = replace(winner, renders=renders, gradients=gradients)
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
+    """Return how bad a verified configuration is for the model; larger is worse."""
     scores = [trial.score for trial in verification.counting]
-    mean = sum(scores) / len(scores)
+    mean_score = sum(scores) / len(scores)
     return (
         verification.ending is Ending.FOUND,
         verification.adversarial.rate,
-        mean if mean == mean else -math.inf,
+        -math.inf if math.isnan(mean_score) else mean_score,
     )
 
 
-TRIED = 8  # Different failures that are tried, at most: the first of the list
+MAX_TRIED_FAILURES = 8  # the first of the list
 
 
 def check_failures(verifier: Verifier, result: SearchResult) -> None:
-    """Verify the first of the different failures that a search found, each for itself:
-    by the trials of the adversarial configuration, with the seeds that the control
-    group had, up to the first that decides against it.
+    """Verify the first of the different failures that a search found, each by itself.
 
-    Over conditions that vary one of them takes hundreds of trials, and nothing is tried
-    here.
+    This takes the trials of the adversarial configuration, with the seeds that the
+    control group had, up to the first that decides against it. Over conditions that
+    vary a failure takes hundreds of trials, and nothing is tried here.
+
+    Args:
+        verifier: of the attack.
+        result: of the search.
     """
     problem = verifier.problem
     findings = verifier.findings
     known = result.failures
     rule = problem.rule
-    if (
-        known is None
-        or not known.listed
-        or rule.conditional
-        or rule.already_wrong(count_right(findings.clean, 1))
-    ):
+    if known is None or not known.listed or rule.conditional:
         return
-    tried = known.listed[:TRIED]
+    if rule.already_wrong(count_right(findings.clean, 1)):
+        return
+    failures = known.listed[:MAX_TRIED_FAILURES]
     verifier.begin(
         "checking different failures with fresh renders",
-        len(tried) * verifier.count,
+        len(failures) * verifier.count,
         at_most=True,
     )
     findings.failures = tuple(
         verifier.verified(
             f"failure {number}", replace(result, best_u=failure.u), curtailed=True
         )
-        for number, failure in enumerate(tried)
+        for number, failure in enumerate(failures)
     )

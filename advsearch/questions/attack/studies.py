@@ -1,23 +1,23 @@
-"""Studies: questions that take several attacks, each in a folder of its own in the run,
-on workers if asked to.
+"""Studies: questions that take several attacks, each in a directory of its own.
 
-A part is carried out in its folder, gone on with, or read where it is done. A worker
-carries an attack out in a folder on its own disk, which comes back as files. An attack
-that this process has begun itself stays its own. What is shared are whole attacks, in a
-curve all those of an object, so that one whose worker died begins again.
+An attack is made in its directory, continued, or read if it is done. A worker makes an
+attack in a directory on its own disk, which comes back as files. An attack that this
+process has begun itself is not given to a worker. What is distributed are full attacks,
+in a curve all those of an object, so that one whose worker died begins again.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
@@ -26,6 +26,7 @@ from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import one_label_for_several
 from advsearch.engine.naming import different, load_models
+from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
@@ -33,11 +34,24 @@ from advsearch.errors import ClusterError, FileFormatError
 from advsearch.experiment import Made, RunContext, run_part
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.carry_out import (
+    LOADING,
+    check_from_config,
+    executor_for,
+    problem_from_config,
+)
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    CurvePoint,
+    CurveResult,
+    MatrixCell,
+    MatrixModel,
+    MatrixResult,
+    MatrixRow,
+    ObjectRow,
+)
 from advsearch.runs.directory import PARTS, default_name, is_run
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_configuration
@@ -47,19 +61,23 @@ from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
 from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 
-# Seconds that one attack may take on a worker before it counts as hanging
-LONGEST = 6 * 3600.0
-TEXTS = (".json", ".html", ".yaml")  # Files that may say where the run is
+# that one attack may take on a worker before it counts as hanging
+MAX_ATTACK_SECONDS = 6 * 3600.0
+TEXTS = (".json", ".html", ".yaml")  # files that may have the path of the run
 # Endings after which an object is not attacked with a larger epsilon
 SETTLED = ("found", "already wrong")
-ALL = "all"  # What an ensemble is called among the models that were attacked
+ALL = "all"  # name of the ensemble among the models that were attacked
 
 
 @dataclass(frozen=True)
 class StudyAttack:
-    """One attack of a study: what it is carried out with, the name of its folder, and
-    what tells it from the others: an object or a model. The epsilon is that of a curve,
-    or None.
+    """One attack of a study.
+
+    Attributes:
+        config: its settings.
+        name: of its directory.
+        of: the object or the model that tells it from the others.
+        epsilon: of a curve; None otherwise.
     """
 
     config: AttackConfig
@@ -68,194 +86,229 @@ class StudyAttack:
     epsilon: float | None = None
 
 
-Chain = list[StudyAttack]  # Attacks that follow one another, until one finds something
+Chain = list[StudyAttack]  # attacks in order, until one of them settles the object
 
 
 def chains_of(config: AttackConfig) -> list[Chain]:
-    """Return the attacks of a study: of a matrix or a curve. Raises InputError where a
-    name comes twice.
+    """Return the attacks of a study: of a matrix or a curve.
+
+    Raises:
+        InputError: a model or an object comes twice.
     """
+    return _matrix_chains(config) if config.is_matrix else _curve_chains(config)
+
+
+def _matrix_chains(config: AttackConfig) -> list[Chain]:
+    """Return an attack for each model, or the one on the ensemble."""
+    names: Sequence[str] = different(config.models, "model")
+    if config.ensemble:
+        names = [ALL]
     chains: list[Chain] = []
-    if config.is_matrix:
-        names = different(config.models, "model")
-        for place, name in enumerate([ALL] if config.ensemble else names):
-            alone = AttackConfig.of(
-                config, **({} if config.ensemble else {"model": name})
+    for index, name in enumerate(names):
+        changes = {} if config.ensemble else {"model": name}
+        attack_config = AttackConfig.of(config, **changes)
+        directory = f"{index:02d}-" + default_name(name, [])
+        chains.append([StudyAttack(attack_config, directory, name)])
+    return chains
+
+
+def _curve_chains(config: AttackConfig) -> list[Chain]:
+    """Return the attacks of each object, with the smallest epsilon first."""
+    # None: each control has its own epsilon
+    epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
+    chains: list[Chain] = []
+    for index, name in enumerate(different(config.objects, "object")):
+        chain: Chain = []
+        for epsilon in epsilons:
+            words = []
+            if epsilon is not None:
+                words = [f"epsilon {epsilon:g}".replace(".", "_")]
+            attack_config = AttackConfig.of(
+                config,
+                object=name,
+                epsilon=config.epsilon if epsilon is None else epsilon,
             )
-            chains.append(
-                [StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)]
-            )
-    else:
-        # None is the own of each control
-        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
-        for place, name in enumerate(different(config.objects, "object")):
-            chains.append([])
-            for epsilon in epsilons:
-                words = (
-                    []
-                    if epsilon is None
-                    else [f"epsilon {epsilon:g}".replace(".", "_")]
-                )
-                changed = AttackConfig.of(
-                    config,
-                    object=name,
-                    epsilon=config.epsilon if epsilon is None else epsilon,
-                )
-                chains[-1].append(
-                    StudyAttack(
-                        changed,
-                        f"{place:02d}-" + default_name(name, words),
-                        name,
-                        epsilon,
-                    )
-                )
+            directory = f"{index:02d}-" + default_name(name, words)
+            chain.append(StudyAttack(attack_config, directory, name, epsilon))
+        chains.append(chain)
     return chains
 
 
 def attacks_of(settings: JsonObject) -> Call:
-    """Return what carries out the attacks of the study that the settings describe: what
-    a worker does.
+    """Return the function by which a worker makes attacks of a study.
+
+    It takes the index of a chain, and returns of each attack the name of its directory,
+    where that was, and its files.
+
+    Args:
+        settings: of the study.
     """
     chains = chains_of(AttackConfig(**settings))
 
     def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        carried_out = []
+        finished = []
         clean = CleanMatrix()
-        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
-            for part in chains[numbers[0]]:
-                path = Path(folder) / part.name
-                config_there = part.config.model_copy(
+        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
+            for study_attack in chains[numbers[0]]:
+                path = Path(directory) / study_attack.name
+                config = study_attack.config.model_copy(
                     update={"run": str(path), "overwrite": True}
                 )
-                ending = attack_once(config_there, clean=clean).summary.ending
-                kept = (
-                    file
-                    for file in path.rglob("*")
-                    if file.is_file() and file.name != LOCK
-                )
-                read = {
-                    file.relative_to(path).as_posix(): file.read_bytes()
-                    for file in kept
-                }
-                carried_out.append((part.name, str(path), read))
+                ending = attack_once(config, clean=clean).summary.ending
+                finished.append((study_attack.name, str(path), _read_files(path)))
                 if ending in SETTLED:
                     break
-        return carried_out
+        return finished
 
     return call
+
+
+def _read_files(directory: Path) -> dict[str, bytes]:
+    """Return the files of a run directory by their relative paths, without its lock."""
+    return {
+        file.relative_to(directory).as_posix(): file.read_bytes()
+        for file in directory.rglob("*")
+        if file.is_file() and file.name != LOCK
+    }
 
 
 def share(
     config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress
 ) -> None:
-    """Have the attacks of a study that are not begun carried out by workers into its
-    folder, where some were asked for. Raises ClusterError: every worker died of an
-    attack, or there are none.
+    """Have workers make the attacks of a study that have not begun, if requested.
+
+    Args:
+        config: of the study.
+        chains: all of its attacks.
+        run: its run directory, which gets the files.
+        progress: reports it.
+
+    Raises:
+        ClusterError: every worker died of an attack, or there are none.
     """
-    left = [
-        number
-        for number, chain in enumerate(chains)
-        if not any(is_run(run / PARTS / part.name) for part in chain)
+    missing = [
+        index
+        for index, chain in enumerate(chains)
+        if not any(is_run(run / PARTS / attack.name) for attack in chain)
     ]
-    settings = (
-        config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    )
-    threads = config.used_threads or 1
+    in_process = {"workers": None, "cluster": None}
     work = WorkerTask(
         "advsearch.questions.attack.studies:attacks_of",
-        settings,
+        config.to_repeat().model_copy(update=in_process).plain(),
         FILES,
-        threads,
-        seconds=LONGEST,
+        config.used_threads or 1,
+        seconds=MAX_ATTACK_SECONDS,
     )
-    workers, cluster = (config.workers, config.cluster) if left else (None, None)
     with open_workers(
-        work, workers=workers, cluster=cluster, tell=progress.message
+        work,
+        workers=config.workers if missing else None,
+        cluster=config.cluster if missing else None,
+        tell=progress.message,
     ) as executor:
         if executor is None:
             return
-        progress.stage("attacks on workers", len(left))
-        for done in executor.results([number] for number in left):
+        progress.stage("attacks on workers", len(missing))
+        for done in executor.results([index] for index in missing):
             if done.lost:
-                (lost, *_) = chains[done.items[0]]
-                title = lost.config.object + (
-                    "" if lost.of == lost.config.object else f" with {lost.of}"
-                )
+                lost_attack = chains[done.items[0]][0]
+                title = lost_attack.config.object
+                if lost_attack.of != title:
+                    title += f" with {lost_attack.of}"
                 raise ClusterError(
                     f"{title}: {done.lost}; leave it out, or go on without it"
                 )
-            for name, before, files_there in done.value:
-                path = run / PARTS / name
-                part = run / PARTS / f"{PART}{name}"
-                with storage_errors(path):  # whole or not at all
-                    for relative, data in files_there.items():
-                        if relative.endswith(TEXTS):
-                            data = data.replace(before.encode(), str(path).encode())
-                        (part / relative).parent.mkdir(parents=True, exist_ok=True)
-                        write_bytes(part / relative, data)
-                    part.rename(path)
+            for name, worker_path, files in done.value:
+                _write_part(run, name, worker_path, files)
             facts = executor.facts
-            progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
+            values = {} if facts is None else {"workers": facts.workers}
+            progress.advance(1, **values)
+
+
+def _write_part(
+    run: Path, name: str, worker_path: str, files: dict[str, bytes]
+) -> None:
+    """Write the files of an attack that a worker made: all of them or none.
+
+    Args:
+        run: the run directory of the study.
+        name: of the attack's directory in it.
+        worker_path: the directory on the worker, which texts may name.
+        files: by their relative paths.
+    """
+    path = run / PARTS / name
+    unfinished = run / PARTS / f"{PART}{name}"
+    with storage_errors(path):
+        for relative, data in files.items():
+            if relative.endswith(TEXTS):
+                data = data.replace(worker_path.encode(), str(path).encode())
+            (unfinished / relative).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(unfinished / relative, data)
+        unfinished.rename(path)
 
 
 class StudyRun:
-    """Carries out attacks, each in a folder of its own, unless they are done already;
-    first on workers, if asked to.
+    """Makes the attacks of a study, each in a directory of its own.
 
-    `chains` are all that there are, `names` are of those so far, and `warnings` what
-    they said, each sentence once. After an interrupt nothing more is carried out.
+    Those that are done already are read; workers make the others first, if requested.
+    After an interrupt no attack is made any more.
+
+    Attributes:
+        chains: all attacks.
+        names: of the attacks so far.
+        warnings: of these, each sentence once.
     """
 
-    def __init__(self, asked: RunContext[AttackConfig]) -> None:
-        self.asked = asked
-        self.run = asked.run
-        self.progress = asked.progress
-        config = asked.config
-        self.warnings: list[str] = []
-        if config.label is not None and len(config.objects) > 1:
-            bundled = list_objects()
-            labels = {
-                name: load_object(name).label if name in bundled else None
-                for name in config.objects
-            }
-            models, _ = load_models([config.model], make_task(config.task), config)
-            self.warnings = one_label_for_several(models, config.label, labels)
+    def __init__(self, context: RunContext[AttackConfig]) -> None:
+        self.context = context
+        self.run = context.run
+        self.progress = context.progress
+        config = context.config
+        self.warnings = _find_label_warnings(config)
         for text in self.warnings:
             self.progress.message(text)
         self.chains = chains_of(config)
         self.names: list[str] = []
-        with asked.until_interrupted():
+        with context.until_interrupted():
             share(config, self.chains, self.run.path, self.progress)
 
     @property
     def interrupted(self) -> bool:
-        return self.asked.ending == INTERRUPTED
+        """Whether the study was interrupted."""
+        return self.context.ending == INTERRUPTED
 
     def attack(
         self, study: StudyAttack, clean: CleanMatrix | None = None
     ) -> AttackSummary | None:
+        """Make an attack, or read its result.
+
+        Args:
+            study: the attack.
+            clean: the matrix of the clean scene, shared with others.
+
+        Returns:
+            The result; None after an interrupt.
+
+        Raises:
+            FileFormatError: its directory has the run of another experiment.
+        """
         if self.interrupted:
             return None
         config = study.config
         path = self.run.path / PARTS / study.name
         self.names.append(study.name)
-        budget = (
-            f", epsilon {config.epsilon:.3g}"
-            if isinstance(config.epsilon, float)
-            else ""
-        )
-        what = (
-            f"{config.object} against {config.model}, "
-            f"{' and '.join(config.controls)}{budget}"
-        )
+        budget = ""
+        if isinstance(config.epsilon, float):
+            budget = f", epsilon {config.epsilon:.3g}"
+        n_attacks = sum(map(len, self.chains))
         self.progress.message(
-            f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}"
+            f"attack {len(self.names)} of at most {n_attacks}: {config.object} against "
+            f"{config.model}, {' and '.join(config.controls)}{budget}"
         )
 
-        def ask(there: AttackConfig, **more: Any) -> AttackSummary:
-            return attack_once(there, clean=clean, **more).summary
+        def run_attack(part_config: AttackConfig, **options: Any) -> AttackSummary:
+            return attack_once(part_config, clean=clean, **options).summary
 
-        summary = run_part(path, config, self.progress, ask)
+        summary = run_part(path, config, self.progress, run_attack)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(
                 f"{path}: expected the run of an attack, got one of {summary.command}"
@@ -264,198 +317,166 @@ class StudyRun:
             text for text in summary.warnings if text not in self.warnings
         ]
         if summary.ending == INTERRUPTED:
-            self.asked.ending = INTERRUPTED
-        return None if self.interrupted else summary
+            self.context.ending = INTERRUPTED
+            return None
+        return summary
 
     def result(self, kind: type[Made], **fields: Any) -> Made:
-        return self.asked.result(
+        """Return the result of the study.
+
+        Args:
+            kind: of the result.
+            **fields: of it, besides those that all results have.
+        """
+        return self.context.result(
             kind, parts=self.names, warnings=self.warnings, **fields
         )
 
 
-def curve(asked: RunContext[AttackConfig]) -> CurveResult:
-    """Robust accuracy against epsilon, over objects.
+def _find_label_warnings(config: AttackConfig) -> list[str]:
+    """Return the warnings about a label that several objects share."""
+    if config.label is None or len(config.objects) <= 1:
+        return []
+    bundled = list_objects()
+    labels = {
+        name: load_object(name).label if name in bundled else None
+        for name in config.objects
+    }
+    models, _ = load_models([config.model], make_task(config.task), config)
+    return one_label_for_several(models, config.label, labels)
+
+
+def curve(context: RunContext[AttackConfig]) -> CurveResult:
+    """Measure robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips
     at every larger one, whose ball has the same configuration in it, so it is not
     attacked again. An object that is wrong as it is counts as not robust at any
-    epsilon, and is told apart from those that were found.
+    epsilon, and is counted apart from those that were found.
     """
-    study = StudyRun(asked)
-    rows = []
-    for chain in study.chains:
-        row = results.ObjectRow(object=chain[0].of, clean=None, flips_at=None)
-        clean = CleanMatrix()
-        renders: Counter[str] = Counter()
-        for part in chain:
-            summary = study.attack(part, clean)
-            if summary is None:
-                break
-            renders.update(summary.renders)
-            epsilon = summary.epsilon if part.epsilon is None else part.epsilon
-            row = results.ObjectRow(
-                object=part.of,
-                clean=summary.clean.control,
-                ending=summary.ending,
-                epsilon=epsilon,
-                flips_at=epsilon if summary.ending == "found" else None,
-                verified=summary.verified,
-                margin=summary.verified and summary.verified.margin,
-                run=summary.run,
-                tried=part.epsilon,
-                average=summary.average,
-                renders=dict(renders),
-            )
-            if row.ending in SETTLED:
-                break
-        rows.append(row)
-    epsilons: list[float | None] = [*sorted(asked.config.epsilons)] or [None]
-    points = [_accuracy(rows, epsilon) for epsilon in epsilons]
+    study = StudyRun(context)
+    rows = [_attack_object(study, chain) for chain in study.chains]
+    epsilons: list[float | None] = [*sorted(context.config.epsilons)] or [None]
+    points = [_compute_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 
 
-def _known(row: results.ObjectRow, epsilon: float | None) -> bool:
-    """Whether a row says anything about an epsilon: it was tried there, or had flipped
-    before. What ended without a number does not, nor an object whose own noise makes it
-    wrong too often for any scene to be verified.
+def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
+    """Attack an object with growing epsilons, until one of them settles it."""
+    row = ObjectRow(object=chain[0].of, clean=None, flips_at=None)
+    clean = CleanMatrix()
+    renders: Counter[str] = Counter()
+    for attack in chain:
+        summary = study.attack(attack, clean)
+        if summary is None:
+            break
+        renders.update(summary.renders)
+        epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
+        row = ObjectRow(
+            object=attack.of,
+            clean=summary.clean.control,
+            ending=summary.ending,
+            epsilon=epsilon,
+            flips_at=epsilon if summary.ending == "found" else None,
+            verified=summary.verified,
+            margin=summary.verified and summary.verified.margin,
+            run=summary.run,
+            tried=attack.epsilon,
+            average=summary.average,
+            renders=dict(renders),
+        )
+        if row.ending in SETTLED:
+            break
+    return row
+
+
+def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
+    """Return whether a row says anything about an epsilon.
+
+    It does if the object was attacked there, or had flipped before. An attack that
+    ended without a number does not, nor does an object whose own noise makes it wrong
+    too often for any scene to be verified.
     """
     if row.ending in (None, "non-finite objective"):
         return False
     if row.ending in SETTLED:
         return True
-    steady = row.clean is not None and row.clean.correct >= WORST_CASE.needed(
-        row.clean.trials
+    if row.clean is None:
+        return False
+    min_correct = WORST_CASE.needed(row.clean.trials)
+    if row.clean.correct < min_correct:
+        return False
+    return epsilon is None or (row.tried is not None and row.tried >= epsilon)
+
+
+def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
+    """Compute the robust accuracy at an epsilon, with its Clopper-Pearson interval."""
+    known = [row for row in rows if _is_known(row, epsilon)]
+    n_objects = len(known)
+    n_wrong = sum(row.ending == "already wrong" for row in known)
+    n_found = 0
+    for row in known:
+        if row.ending == "found":
+            flips_at = row.flips_at
+            n_found += epsilon is None or (
+                isinstance(flips_at, float) and flips_at <= epsilon
+            )
+    n_robust = n_objects - n_wrong - n_found
+    return CurvePoint(
+        epsilon=epsilon,
+        objects=n_objects,
+        robust=n_robust,
+        found=n_found,
+        already_wrong=n_wrong,
+        accuracy=n_robust / n_objects if known else None,
+        interval=clopper_pearson(n_robust, n_objects) if known else (0.0, 1.0),
     )
-    return steady and (
-        epsilon is None or (row.tried is not None and row.tried >= epsilon)
-    )
 
 
-def _accuracy(
-    rows: Sequence[results.ObjectRow], epsilon: float | None
-) -> results.CurvePoint:
-    known = [row for row in rows if _known(row, epsilon)]
-    wrong = sum(row.ending == "already wrong" for row in known)
-    flips = [row.flips_at for row in known if row.ending == "found"]
-    found = sum(
-        epsilon is None or (isinstance(flips_at, float) and flips_at <= epsilon)
-        for flips_at in flips
-    )
-    robust = len(known) - wrong - found
-    return results.CurvePoint(
-        epsilon=epsilon, objects=len(known), robust=robust, found=found, already_wrong=wrong,
-        accuracy=robust / len(known) if known else None,
-        interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
-    )  # fmt: skip
+# samples per pixel of the trials, unless an attack needed more or a setting is given
+MIN_TRIAL_SPP = 64
 
 
-# Samples a pixel of the trials, where none of the attacks needed more and nothing was
-# asked for
-LEAST_SPP = 64
-
-
-def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
-    """Attack several models, and try every adversarial scene on each of them in
-    pictures that are the same for all.
+def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
+    """Attack several models, and try every adversarial scene on each of them.
 
     Trial k has the same seed for every scene and every model, and none that a search or
-    its verification has used. Models of one input size are shown the same picture; for
-    another size the same configuration is rendered anew. A success needs the model to
-    be right on the clean scene with the same seed, as everywhere.
+    its verification has used. Models of one input size get the same image; for another
+    size the same configuration is rendered anew. A success needs the model to be right
+    on the clean scene with the same seed, as everywhere.
     """
-    config = asked.config
-    names = different(asked.config.models, "model")
-    asked.progress.stage(attacking.LOADING)
+    config = context.config
+    names = different(config.models, "model")
+    context.progress.stage(LOADING)
     for name in names:
-        attacking.check_from_config(_alone(config, name))
+        check_from_config(_with_model(config, name))
 
-    study = StudyRun(asked)
-    summaries = {part.of: study.attack(part) for (part,) in study.chains}
+    study = StudyRun(context)
+    summaries = {attack.of: study.attack(attack) for (attack,) in study.chains}
     attacked = {
         name: summary for name, summary in summaries.items() if summary is not None
     }
-    models: list[results.MatrixModel] = []
-    cells: dict[str, list[results.MatrixCell]] = {}
-    configurations = {  # of those in which something was searched
-        name: torch.from_numpy(read_configuration(Path(summary.run)))
-        for name, summary in attacked.items()
-        if summary.adversarial is not None and summary.run is not None
-    }
+    models: list[MatrixModel] = []
+    cells: dict[str, list[MatrixCell]] = {}
+    configurations = _read_configurations(attacked)
     if configurations and not study.interrupted:
-        counts = [
+        sample_counts = [
             summary.sample_count.spp
             for summary in attacked.values()
             if summary.sample_count
         ]
-        spp = config.verify_spp or max([LEAST_SPP, *counts])
-        worker = "advsearch.questions.attack.studies:models_worker"
-        with asked.until_interrupted():
-            study.progress.stage("loading the models to try the scenes on")
-            conditions = []
-            for name in names:
-                problem, _ = attacking.problem_from_config(_alone(config, name))
-                conditions.append(
-                    RetrialCondition(
-                        name, problem, spp, problem.renderer.formation.resolution
-                    )
-                )
-            seed = seeds.stream(config.seed, "matrix")
-            trials = config.trial_count
-            with attacking.executor_for(config, worker, study.progress) as executor:
-                retrials = Retrials(
-                    conditions,
-                    study.run,
-                    study.progress,
-                    trials=trials,
-                    seed=seed,
-                    executor=executor,
-                )
-                each = trials * len(names)
-                hint = f"{each} predictions; `trials` or `verify_spp` shorten it"
-                study.progress.stage(
-                    "trying the clean scene on every model", each, hint=hint
-                )
-                models = [
-                    results.MatrixModel(
-                        model=condition.name,
-                        labels=list(
-                            condition.problem.task.truth_names(
-                                condition.problem.truth()
-                            )
-                        ),
-                        input_size=condition.problem.renderer.formation.resolution,
-                        spp=condition.spp,
-                        clean=control_group(retrials.clean(condition), condition.spp),
-                    )
-                    for condition in conditions
-                ]
-                for name, u in configurations.items():
-                    study.progress.stage(
-                        f"trying the scene against {name} on every model",
-                        each,
-                        hint=hint,
-                    )
-                    tried = {
-                        condition.name: retrials.adversarial(name, u, condition)
-                        for condition in conditions
-                    }
-                    cells[name] = [
-                        results.MatrixCell(
-                            model=model,
-                            ending=checked.ending.value,
-                            verified=verified_rate(checked),
-                        )
-                        for model, checked in tried.items()
-                    ]
+        spp = config.verify_spp or max([MIN_TRIAL_SPP, *sample_counts])
+        with context.until_interrupted():
+            _try_on_models(study, names, spp, configurations, models, cells)
     rows = [
-        results.MatrixRow(
+        MatrixRow(
             attacked=name,
-            ending=by.ending,
-            run=by.run,
-            renders=by.renders,
+            ending=summary.ending,
+            run=summary.run,
+            renders=summary.renders,
             tested=cells.get(name, []),
         )
-        for name, by in attacked.items()
+        for name, summary in attacked.items()
     ]
     return study.result(
         MatrixResult,
@@ -466,15 +487,100 @@ def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
     )
 
 
-def models_worker(settings: JsonObject) -> Call:
-    """Return what evaluates queries of the models of a configuration: what a worker
-    does.
+def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Tensor]:
+    """Read the adversarial configurations (d,) of attacks that searched, by model."""
+    return {
+        name: torch.from_numpy(read_configuration(Path(summary.run)))
+        for name, summary in attacked.items()
+        if summary.adversarial is not None and summary.run is not None
+    }
+
+
+def _try_on_models(
+    study: StudyRun,
+    names: Sequence[str],
+    spp: int,
+    configurations: Mapping[str, Tensor],
+    models: list[MatrixModel],
+    cells: dict[str, list[MatrixCell]],
+) -> None:
+    """Try the clean scene and all adversarial ones on every model.
+
+    Args:
+        study: of the attacks.
+        names: of the models.
+        spp: samples per pixel of the trials.
+        configurations: (d,) the adversarial ones, by the model that was attacked.
+        models: is filled: what each model predicts of the clean scene.
+        cells: is filled: what each model predicts of an adversarial scene, by the model
+            that was attacked. What is done before an interrupt stays.
     """
-    config = AttackConfig(**settings)
-    return worker_call(
-        cache(lambda name: attacking.problem_from_config(_alone(config, name))[0])
+    config = study.context.config
+    study.progress.stage("loading the models to try the scenes on")
+    conditions = []
+    for name in names:
+        problem, _ = problem_from_config(_with_model(config, name))
+        resolution = problem.renderer.formation.resolution
+        conditions.append(RetrialCondition(name, problem, spp, resolution))
+    worker = "advsearch.questions.attack.studies:models_worker"
+    with executor_for(config, worker, study.progress) as executor:
+        retrials = Retrials(
+            conditions,
+            study.run,
+            study.progress,
+            trials=config.trial_count,
+            seed=seeds.stream(config.seed, "matrix"),
+            executor=executor,
+        )
+        n_predictions = config.trial_count * len(names)
+        hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
+        title = "trying the clean scene on every model"
+        study.progress.stage(title, n_predictions, hint=hint)
+        models += [_try_clean(retrials, condition) for condition in conditions]
+        for name, u in configurations.items():
+            title = f"trying the scene against {name} on every model"
+            study.progress.stage(title, n_predictions, hint=hint)
+            verifications = [
+                retrials.adversarial(name, u, condition) for condition in conditions
+            ]
+            cells[name] = [
+                MatrixCell(
+                    model=condition.name,
+                    ending=verification.ending.value,
+                    verified=verified_rate(verification),
+                )
+                for condition, verification in zip(
+                    conditions, verifications, strict=True
+                )
+            ]
+
+
+def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
+    """Return what a model predicts of the clean scene."""
+    problem = condition.problem
+    return MatrixModel(
+        model=condition.name,
+        labels=list(problem.task.truth_names(problem.truth())),
+        input_size=problem.renderer.formation.resolution,
+        spp=condition.spp,
+        clean=control_group(retrials.clean(condition), condition.spp),
     )
 
 
-def _alone(config: AttackConfig, name: str) -> AttackConfig:
+def models_worker(settings: JsonObject) -> Call:
+    """Return the function by which a worker evaluates queries of several models.
+
+    Args:
+        settings: of the study.
+    """
+    config = AttackConfig(**settings)
+
+    def load_problem(name: str) -> Problem:
+        return problem_from_config(_with_model(config, name))[0]
+
+    return worker_call(cache(load_problem))
+
+
+def _with_model(config: AttackConfig, name: str) -> AttackConfig:
+    """Return the settings of an attack on one of the models."""
     return AttackConfig.of(config, model=name, ensemble=None)

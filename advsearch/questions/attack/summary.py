@@ -1,5 +1,6 @@
-"""The results of `attack`, as `summary.json` holds them: of one, of several objects or
-epsilons, of several models.
+"""The results of `attack`, as `summary.json` holds them.
+
+They are of one attack, of several objects or epsilons, or of several models.
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ class FoundValue(DescribedValue):
 
 
 class PicturedPrediction(Fields):
-    """What the model says of the picture that is kept, which is that of a trial with
-    the usual prediction.
+    """The prediction of the stored image.
+
+    It is the image of a trial with the most frequent prediction.
     """
 
     label: str
@@ -64,7 +66,7 @@ class PicturedPrediction(Fields):
 
 
 class CleanPrediction(CleanScene, PicturedPrediction):
-    """What the model says of the picture of the clean scene that is kept."""
+    """The prediction of the stored image of the clean scene."""
 
     correct: bool = Field(description="whether that is right")
     control: ControlGroup | None = Field(
@@ -82,8 +84,9 @@ class ObjectiveValues(Fields):
 
 
 class TriedObjective(Fields):
-    """What the search maximised, over the trials of the verification, which have other
-    seeds and 8 bits.
+    """What the search maximised, over the trials of the verification.
+
+    These have other seeds, and images of 8 bits.
     """
 
     clean: ObjectiveValues | None = Field(
@@ -95,9 +98,7 @@ class TriedObjective(Fields):
 
 
 class AlongDrive(Fields):
-    """The clean scene and the adversarial one at evenly spaced times of the path that
-    varied by chance.
-    """
+    """Both scenes at evenly spaced times of the path that varied by chance."""
 
     frames: int
     seconds: float = Field(description="from the first frame to the last")
@@ -169,9 +170,7 @@ class DifferentFailure(Fields):
 
 
 class FailingShare(Fields):
-    """How large a part of all configurations, drawn evenly, fails in one render of the
-    search.
-    """
+    """The fraction of all configurations that fail in one render of the search."""
 
     estimate: float | None = Field(description="null where too few draws failed to say")
     interval: Interval = Field(description="95 %, however the draws were chosen")
@@ -251,8 +250,9 @@ class NotFinite(Fields):
 
 
 class PrintCost(Fields):
-    """What the terms of `printable` cost in margin: beside a search without them, of as
-    many steps.
+    """What the terms of `printable` cost in margin.
+
+    They are compared with a search without them, of as many steps.
 
     Margins are means over trials with the same seeds, of what is sought: the smaller,
     the worse for the model. Each is of one search, so that a cost below 0 says that the
@@ -294,9 +294,7 @@ class AmbientPoint(Fields):
 
 
 class AmbientLight(Fields):
-    """In how much ambient light the picture of a projector still makes the model
-    wrong.
-    """
+    """The ambient light in which a projected image still makes the model wrong."""
 
     lux: float = Field(description="on the object in the scene, without the projector")
     holds_to: float = Field(
@@ -312,9 +310,7 @@ class AmbientLight(Fields):
 
 
 class AttackSummary(SceneResult):
-    """The worst configuration of a scene that was found, how sure that is, and what it
-    cost.
-    """
+    """The worst configuration that was found, how sure that is, and what it cost."""
 
     command: ClassVar[str] = "attack"
 
@@ -404,15 +400,11 @@ class AttackSummary(SceneResult):
 
     @property
     def brief(self) -> str:
-        """The verified rate; of a run that was interrupted before, what was found so
-        far.
-        """
+        """The verified rate, or the prediction that is not verified yet."""
         if self.verified is None:
-            return (
-                f"{self.adversarial.label}, unverified"
-                if self.goes_on and self.adversarial
-                else ""
-            )
+            if self.goes_on and self.adversarial:
+                return f"{self.adversarial.label}, unverified"
+            return ""
         return f"{self.verified.successes}/{self.verified.trials}"
 
 
@@ -466,9 +458,7 @@ class CurveResult(InNotebook, StudyResult):
 
 
 class MatrixModel(Fields):
-    """One of the models, and what it says of the clean scene in the pictures of all
-    trials.
-    """
+    """One of the models, and its predictions of the clean scene."""
 
     model: str
     labels: list[str] = Field(description="the names that count as right")
@@ -506,8 +496,9 @@ class MatrixRow(Fields):
 
 
 class MatrixResult(InNotebook, StudyResult):
-    """Adversarial scenes that were searched on each of several models, or on all of
-    them together, tried on each.
+    """Adversarial scenes of several models, tried on each of them.
+
+    They were searched on each model, or on all of them as an ensemble.
     """
 
     command: ClassVar[str] = "attack"
@@ -525,20 +516,14 @@ class MatrixResult(InNotebook, StudyResult):
     @property
     def brief(self) -> str:
         """How many adversarial scenes hold on models that they were not searched on."""
-        others = [
-            cell
-            for row in self.table
-            for cell in row.tested
-            if cell.model != row.attacked
-        ]
-        return (
-            (
-                f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} "
-                "transfer"
-            )
-            if others
-            else ""
-        )
+        endings = list[str]()
+        for row in self.table:
+            endings += [
+                cell.ending for cell in row.tested if cell.model != row.attacked
+            ]
+        if not endings:
+            return ""
+        return f"{endings.count('found')} of {len(endings)} transfer"
 
 
 BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
@@ -546,7 +531,7 @@ BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResul
 
 
 def attack_of(folder: Path) -> AttackSummary:
-    """Return the result of the attack in `folder`; errors as for `read_result`."""
+    """Load the result of the attack in a run directory; errors as for `read_result`."""
     result = read_result(folder)
     if not isinstance(result, AttackSummary):
         raise other_summary(folder / NAME, f"that of {result.command}")

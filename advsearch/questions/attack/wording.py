@@ -1,6 +1,4 @@
-"""An attack in words: its verdict, what was asked and changed, and how it came to its
-result.
-"""
+"""An attack in words: its verdict, its goal and its changes, and its method."""
 
 from __future__ import annotations
 
@@ -14,37 +12,36 @@ from advsearch.report import wording as words
 from advsearch.report.wording import count, number_text
 from advsearch.runs.results import VerifiedRate
 
-PATH = "path"  # The control whose conditions are moments
+PATH = "path"  # the control whose conditions are moments
 NORMS = {
     "linf": "the largest change of any value",
     "l2": "the root of the sum of all squared changes",
 }
-"""What these words mean, said where they are first used."""
+"""What these words mean, stated where they are first used."""
 
 _REASONS = {
     "budget spent": "The budget is spent.",
     "stalled": "The policy had nothing more to propose.",
     "non-finite objective": "The objective was not a number several times in a row.",
 }
-"""Why a search ended without finding anything, where the name of the ending doesn't say
-it.
-"""
+"""Why a search ended without finding anything, by its ending, unless that says it."""
+
+_RENDER_KINDS = {
+    "search": "of the search",
+    "gradient": "gradients",
+    "verification": "of the verification",
+    "baseline": "of the random search",
+    "unprinted": "of the search without print terms",
+    "products": "predicted",
+}
 
 
 def attack_verdict(summary: AttackSummary) -> str:
     """Return what the run found, in one sentence that holds on its own."""
     ending = summary.ending
     verified = summary.verified
-    # the object, or the thing beside it that is judged: `wine glass` for `wine-glass`,
-    # `mug` for `data/mug.obj`
-    called = (
-        PurePath(summary.object).stem
-        if summary.judge in ("object", "all")
-        else summary.judge
-    )
-    thing = "this " + called.replace("-", " ").replace("_", " ")
-    thing += " or a thing beside it" if summary.judge == "all" else ""
-    after = f"after {count(summary.steps, 'step')}"
+    thing = _name_thing(summary)
+    after_steps = f"after {count(summary.steps, 'step')}"
     if ending == "already wrong":
         wrong = words.calls(
             summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
@@ -55,27 +52,19 @@ def attack_verdict(summary: AttackSummary) -> str:
         )
     if verified is None and ending == "interrupted" and summary.adversarial:
         outcome = get_outcome(summary.adversarial.payload)
-        says = words.calls(summary.task, thing, summary.adversarial.label, outcome)
+        predicts = words.calls(summary.task, thing, summary.adversarial.label, outcome)
         return (
-            f"Interrupted {after}. What was found so far is not verified: the "
-            "model "
-            f"{says}."
+            f"Interrupted {after_steps}. What was found so far is not verified: the "
+            f"model {predicts}."
         )
     if verified is None:
-        return f"{ending[:1].upper()}{ending[1:]} {after}; nothing is verified."
-    several_paths = summary.drive is not None and len(summary.drive.paths) > 1
-    rate = words.rate_text(verified) + another_text(summary.over, several_paths)
-    claim, sought = _clauses(summary, thing)
+        return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
+    has_paths = summary.drive is not None and len(summary.drive.paths) > 1
+    rate = words.rate_text(verified) + another_text(summary.over, has_paths)
+    claim, goal = _clauses(summary, thing)
     if ending == "found":
-        random = summary.baseline.verified if summary.baseline else None
-        more = (
-            " Random search finds as much."
-            if random is not None and random.rate >= verified.rate > 0
-            else ""
-        )
-        if summary.answer_from == "random":
-            more = " Random search found it, and the policy nothing as bad."
-        return f"{_how_it_errs(summary, verified, thing, claim)} in {rate}.{more}"
+        error = _error_clause(summary, verified, thing, claim)
+        return f"{error} in {rate}.{_random_search_remark(summary, verified)}"
     if ending == "interrupted":
         return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
@@ -83,86 +72,113 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The search claims a wrong prediction that is not confirmed: {claim} "
             f"in {rate}."
         )
-    why = _REASONS.get(ending, f"The search ended: {ending}.")
+    reason = _REASONS.get(ending, f"The search ended: {ending}.")
     return (
-        f"No change of {budget_text(summary)} was found that {sought}: {claim} in "
-        f"{rate}. {why}"
+        f"No change of {budget_text(summary)} was found that {goal}: {claim} in "
+        f"{rate}. {reason}"
     )
 
 
-def another_text(over: Sequence[str], paths: bool = False) -> str:
-    """Return what is another one in each trial: ``, each with another camera``; of a
-    path it is the moment, and where there are several `paths`, which one it is.
+def _name_thing(summary: AttackSummary) -> str:
+    """Return what is evaluated: ``this wine glass`` for the object `wine-glass`.
+
+    It is the object or a thing near it; the object of a file has the file's name.
     """
-    others = [name for name in over if name != PATH]
-    parts = [f"with another {' and '.join(others)}"] if others else []
+    name = summary.judge
+    if summary.judge in ("object", "all"):
+        name = PurePath(summary.object).stem
+    thing = "this " + name.replace("-", " ").replace("_", " ")
+    return f"{thing} or a thing beside it" if summary.judge == "all" else thing
+
+
+def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str:
+    """Return what the random search says about a found scene; empty if nothing."""
+    if summary.answer_from == "random":
+        return " Random search found it, and the policy nothing as bad."
+    random = summary.baseline.verified if summary.baseline else None
+    if random is not None and random.rate >= verified.rate > 0:
+        return " Random search finds as much."
+    return ""
+
+
+def another_text(over: Sequence[str], paths: bool = False) -> str:
+    """Return what differs between trials: ``, each with another camera``.
+
+    Args:
+        over: controls that vary by chance; of a path it is the moment.
+        paths: whether there are several paths.
+    """
+    controls = [name for name in over if name != PATH]
+    parts = []
+    if controls:
+        parts.append(f"with another {' and '.join(controls)}")
     if PATH in over:
-        parts.append(
-            "on one of several paths, at another moment"
-            if paths
-            else "at another moment of the path"
-        )
+        moment = "at another moment of the path"
+        if paths:
+            moment = "on one of several paths, at another moment"
+        parts.append(moment)
     return f", each {' and '.join(parts)}" if parts else ""
 
 
 def remarks(summary: AttackSummary) -> list[str]:
-    texts = []
+    """Return what a reader of the result has to know."""
+    texts = [_clean_remark(summary), _baseline_remark(summary)]
+    return [text for text in texts if text] + summary.warnings
+
+
+def _clean_remark(summary: AttackSummary) -> str:
+    """Return in how many trials the clean scene fails; empty if in none."""
     control = summary.clean.control
+    if control is None or summary.ending == "already wrong" or summary.minimises:
+        return ""
+    n_failures = control.trials - control.correct
+    if not n_failures:
+        return ""
+    outcomes = words.outcomes_text(control.outcomes, summary.task)
+    outcomes = f" ({outcomes})" if outcomes else ""
+    not_a_number = ""
+    if control.not_a_number:
+        not_a_number = f"; in {control.not_a_number} the output is not a number"
+    not_counted = " They do not count." if summary.over else ""
+    return (
+        f"The clean scene itself fails {n_failures} of its {control.trials} "
+        f"trials{outcomes}{not_a_number}.{not_counted}"
+    )
+
+
+def _baseline_remark(summary: AttackSummary) -> str:
+    """Return whether the random search did as well as the policy; empty if not."""
     verified = summary.verified
-    beaten = summary.policy_verified
+    policy_rate = summary.policy_verified
     random = summary.baseline.verified if summary.baseline else None
-    missed = control.trials - control.correct if control else 0
-    if (
-        control
-        and missed
-        and summary.ending != "already wrong"
-        and not summary.minimises
-    ):
-        apart = " They do not count." if summary.over else ""
-        nothing = (
-            f"; in {control.not_a_number} the output is not a number"
-            if control.not_a_number
-            else ""
-        )
-        outcomes = words.outcomes_text(control.outcomes, summary.task)
-        how = f" ({outcomes})" if outcomes else ""
-        texts.append(
-            f"The clean scene itself fails {missed} of its {control.trials} "
-            f"trials{how}{nothing}.{apart}"
-        )
-    if summary.answer_from == "random" and beaten:
-        tally = (
-            f"{beaten.successes} of {beaten.trials} with a margin of "
-            f"{beaten.margin:.2f}"
-        )
-        texts.append(
+    if summary.answer_from == "random" and policy_rate:
+        return (
             "The random search beside it found a worse configuration than the policy "
-            f"did ({tally}); that of the "
+            f"did ({policy_rate.successes} of {policy_rate.trials} with a margin of "
+            f"{policy_rate.margin:.2f}); that of the "
             "random search is the scene. The margin is "
             f"{words.margin_text(summary.task)}."
         )
-    elif (
-        verified is not None
-        and random is not None
-        and random.rate >= verified.rate
-        and random.rate > 0
-    ):
-        tally = f"{random.successes} of {random.trials}"
-        better = random.rate > verified.rate
-        does = (
-            f"better: {tally}."
-            if better
-            else (f"as well: {tally}. The policy adds nothing here.")
-        )
-        texts.append(f"Random search with as many renders does {does}")
-    return texts + summary.warnings
+    if verified is None or random is None:
+        return ""
+    if random.rate < verified.rate or random.rate <= 0:
+        return ""
+    successes = f"{random.successes} of {random.trials}"
+    comparison = f"as well: {successes}. The policy adds nothing here."
+    if random.rate > verified.rate:
+        comparison = f"better: {successes}."
+    return f"Random search with as many renders does {comparison}"
 
 
 def success(summary: AttackSummary) -> str:
-    return "target" if summary.target else "easier" if summary.minimises else "wrong"
+    """Return what counts as a success in the trials, in a word."""
+    if summary.target:
+        return "target"
+    return "easier" if summary.minimises else "wrong"
 
 
 def goal_text(summary: AttackSummary) -> str:
+    """Return the goal of a search; empty for any wrong prediction."""
     if summary.target:
         verb = "command" if summary.task == words.COMMAND else "predict"
         return f"the model should {verb} {' or '.join(summary.target)}"
@@ -170,63 +186,61 @@ def goal_text(summary: AttackSummary) -> str:
 
 
 def objective_text(summary: AttackSummary) -> str:
-    tried = summary.tried_objective
-    if tried is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
+    """Return the objective in the trials; empty if the success says as much."""
+    objective = summary.tried_objective
+    if objective is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
         return ""
+    arms = (("clean", objective.clean), ("adversarial", objective.answer))
     parts = [
         f"{name} {values.mean:.3g} (from {values.low:.3g} to {values.high:.3g})"
-        for name, values in (("clean", tried.clean), ("adversarial", tried.answer))
+        for name, values in arms
         if values is not None
     ]
     return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
 
 
 def drive_text(summary: AttackSummary) -> str:
+    """Return in how many frames of a drive the model is right; empty without one."""
     drive = summary.drive
     if drive is None:
         return ""
-    adversarial = (
-        "" if drive.answer is None else (f", {drive.answer} of the adversarial one")
-    )
-    along = f", {len(drive.paths)} paths" if len(drive.paths) > 1 else ""
-    return (
-        f"right in {drive.clean} of {drive.frames} frames of the clean "
-        f"scene{adversarial}{along}"
-    )
+    text = f"right in {drive.clean} of {drive.frames} frames of the clean scene"
+    if drive.answer is not None:
+        text += f", {drive.answer} of the adversarial one"
+    if len(drive.paths) > 1:
+        text += f", {len(drive.paths)} paths"
+    return text
 
 
 def smallest_text(summary: AttackSummary) -> str:
+    """Return the smallest epsilon and the largest without success; empty without."""
     bracket = summary.smallest
     if bracket is None:
         return ""
-
-    def epsilons(by_control: Mapping[str, float] | None) -> str:
-        """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
-        texts = {name: f"{value:.3g}" for name, value in (by_control or {}).items()}
-        return ", ".join(
-            texts.values() if len(texts) == 1 else map(" ".join, texts.items())
-        )
-
-    smallest = epsilons(bracket.epsilon)
-    below = epsilons(bracket.not_found_at)
+    smallest = _epsilons_text(bracket.epsilon)
+    not_found_at = _epsilons_text(bracket.not_found_at)
     if not smallest:
-        return f"none found up to {below}"
-    floor = (
-        f"no search found one at {below}"
-        if below
-        else ("no search failed, so it may be smaller still")
-    )
-    still = (
-        ""
-        if bracket.closed or not below
-        else ("; the searches did not suffice to bring the two together")
-    )
-    return f"{smallest}; {floor}{still}"
+        return f"none found up to {not_found_at}"
+    if not not_found_at:
+        return f"{smallest}; no search failed, so it may be smaller still"
+    text = f"{smallest}; no search found one at {not_found_at}"
+    if not bracket.closed:
+        text += "; the searches did not suffice to bring the two together"
+    return text
+
+
+def _epsilons_text(epsilons: Mapping[str, float] | None) -> str:
+    """Return ``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
+    texts = {name: f"{value:.3g}" for name, value in (epsilons or {}).items()}
+    if len(texts) == 1:
+        return next(iter(texts.values()))
+    return ", ".join(f"{name} {text}" for name, text in texts.items())
 
 
 def changed_text(summary: AttackSummary) -> str:
-    """Return `budget_text` with a word on each norm: ``texture within 0.1 (linf: the
-    largest change of any value)``.
+    """Return `budget_text` with an explanation of each norm.
+
+    ``texture within 0.1 (linf: the largest change of any value)``.
     """
     text = budget_text(summary)
     for norm, meaning in NORMS.items():
@@ -236,35 +250,30 @@ def changed_text(summary: AttackSummary) -> str:
 
 def budget_text(summary: AttackSummary) -> str:
     """Return what could change and how far: ``texture within 0.1 (linf)``."""
-
-    def within(name: str, epsilon: object, norm: object) -> str:
-        if not isinstance(epsilon, (int, float)):
-            return name
-        return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
-
     epsilon = summary.epsilon
     norm = summary.norm
     if isinstance(epsilon, dict) or isinstance(norm, dict):
-        epsilons, norms = (
-            by_control if isinstance(by_control, dict) else {}
-            for by_control in (epsilon, norm)
-        )
+        epsilons = epsilon if isinstance(epsilon, dict) else {}
+        norms = norm if isinstance(norm, dict) else {}
         return " and ".join(
-            within(name, epsilons.get(name), norms.get(name))
+            _within_text(name, epsilons.get(name), norms.get(name))
             for name in summary.controls
         )
-    return within(" and ".join(summary.controls) or "nothing", epsilon, norm)
+    names = " and ".join(summary.controls) or "nothing"
+    return _within_text(names, epsilon, norm)
+
+
+def _within_text(name: str, epsilon: object, norm: object) -> str:
+    if not isinstance(epsilon, (int, float)):
+        return name
+    text = f"{name} within {number_text(epsilon)}"
+    return f"{text} ({norm})" if norm else text
 
 
 def renders_text(summary: AttackSummary) -> str:
     """Return ``40 of the search, 40 gradients, 21 of the verification``."""
-    known = {
-        "search": "of the search", "gradient": "gradients", "verification": "of the verification",
-        "baseline": "of the random search", "unprinted": "of the search without print "
-                                                         "terms", "products": "predicted",
-    }  # fmt: skip
     spent = [
-        f"{number} {known.get(name, f'of {name}')}"
+        f"{number} {_RENDER_KINDS.get(name, f'of {name}')}"
         for name, number in summary.renders.items()
         if number
     ]
@@ -272,182 +281,209 @@ def renders_text(summary: AttackSummary) -> str:
 
 
 def print_cost_text(summary: AttackSummary) -> str:
-    """Return ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost
-    2.2 logits``; empty: not known.
+    """Return what print terms cost; empty if that is not known.
+
+    ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost 2.2 logits``
     """
     cost = None if summary.printability is None else summary.printability.cost
     if cost is None:
         return ""
-    costs = (
-        f"they cost {cost.cost:.3g} logits"
-        if cost.cost > 0
-        else "they cost nothing that shows here"
-    )
-    margins = (
-        f"margin {cost.margin_with:.3g} with the print terms, "
-        f"{cost.margin_without:.3g} without"
-    )
+    cost_text = "they cost nothing that shows here"
+    if cost.cost > 0:
+        cost_text = f"they cost {cost.cost:.3g} logits"
     return (
-        f"{margins} (another search of {count(cost.steps, 'step')}, "
-        f"{cost.verified.trials} trials each): {costs}"
+        f"margin {cost.margin_with:.3g} with the print terms, "
+        f"{cost.margin_without:.3g} without (another search of "
+        f"{count(cost.steps, 'step')}, {cost.verified.trials} trials each): {cost_text}"
     )
 
 
-def _how_it_errs(
+def _error_clause(
     summary: AttackSummary, verified: VerifiedRate, thing: str, claim: str
 ) -> str:
-    """Return "The model calls this mug a vase" where that is known of every trial, a
-    weaker clause otherwise.
+    """Return "The model calls this mug a vase" if that is known of every trial.
+
+    Otherwise a weaker clause.
+
+    Args:
+        summary: of the attack.
+        verified: the rate of the trials.
+        thing: what is evaluated.
+        claim: what a trial counts as.
     """
     labels = verified.labels
-    if (
-        summary.task == words.COMMAND
-        and not summary.target
-        and not summary.minimises
-        and len(labels) == 1
-    ):
-        where = next(iter(labels)).replace("action outside its envelope ", "")
-        claim += f" {where}" if where else ""
+    if summary.task == words.COMMAND and not summary.target and len(labels) == 1:
+        direction = next(iter(labels)).replace("action outside its envelope ", "")
+        if direction and not summary.minimises:
+            claim += f" {direction}"
     if summary.minimises or summary.task == words.COMMAND:
         return claim[:1].upper() + claim[1:]
     outcome = words.get_only_outcome(verified.outcomes)
     if len(labels) == 1:
-        return (
-            f"The model {words.calls(summary.task, thing, next(iter(labels)), outcome)}"
-        )
+        predicts = words.calls(summary.task, thing, next(iter(labels)), outcome)
+        return f"The model {predicts}"
     if labels:
-        most = max(labels, key=lambda label: labels[label])
-        what = (
-            "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        )
+        error = f"is wrong about {thing}"
+        if summary.target:
+            error = f"takes {thing} for one of the targets"
         if outcome is None and verified.outcomes:
-            return (
-                f"The model {what.format(thing)} "
-                f"({words.outcomes_text(verified.outcomes, summary.task)})"
-            )
-        return (
-            f"The model {what.format(thing)}, most often "
-            f"{words.calling(summary.task, most, outcome)},"
-        )
+            outcomes = words.outcomes_text(verified.outcomes, summary.task)
+            return f"The model {error} ({outcomes})"
+        most_frequent = max(labels, key=lambda label: labels[label])
+        calling = words.calling(summary.task, most_frequent, outcome)
+        return f"The model {error}, most often {calling},"
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    called = (
-        words.with_article(summary.adversarial.label)
-        if summary.adversarial
-        else "something else"
-    )
-    return f"The model takes {thing} for something else ({called})"
+    name = "something else"
+    if summary.adversarial:
+        name = words.with_article(summary.adversarial.label)
+    return f"The model takes {thing} for something else ({name})"
 
 
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
-    """Return what a trial counts as, and what was looked for: "the model is wrong about
-    this mug", "makes the model miss this mug". Of a commanded action no more is said:
-    nothing has moved.
+    """Return what a trial counts as, and the goal of the search.
+
+    "the model is wrong about this mug", "makes the model miss this mug". Of a commanded
+    action no more is stated: nothing has moved.
+
+    Args:
+        summary: of the attack.
+        thing: what is evaluated.
     """
     target = summary.target or []
-    names = " or ".join(target)
-    called = " or ".join(map(words.with_article, target))
+    target_names = " or ".join(target)
     if summary.minimises:
         return (
             f"the model recognises {thing}, more surely than in the clean scene,",
             f"makes {thing} easier to recognise",
         )
     if summary.task == words.COMMAND:
-        verbs = ("reached", "reach")
-        envelope = f"the envelope of {names}"
-        if not target:
-            verbs = ("left", "leave")
-            envelope = "its envelope"
+        if target:
+            envelope = f"the envelope of {target_names}"
+            return (
+                f"the commanded action reached {envelope}",
+                f"makes the commanded action reach {envelope}",
+            )
         return (
-            f"the commanded action {verbs[0]} {envelope}",
-            f"makes the commanded action {verbs[1]} {envelope}",
+            "the commanded action left its envelope",
+            "makes the commanded action leave its envelope",
         )
     if target:
-        claim = (
-            f"calls {thing} {called}"
-            if summary.task == words.CLASSIFICATION
-            else f"predicts {names}"
-        )
-        return f"the model {claim}", f"makes the model call {thing} {called}"
-    claim = (
-        "it is wrong"
-        if summary.ending in _REASONS
-        else f"the model is wrong about {thing}"
-    )
+        targets = " or ".join(map(words.with_article, target))
+        claim = f"predicts {target_names}"
+        if summary.task == words.CLASSIFICATION:
+            claim = f"calls {thing} {targets}"
+        return f"the model {claim}", f"makes the model call {thing} {targets}"
+    claim = f"the model is wrong about {thing}"
+    if summary.ending in _REASONS:
+        claim = "it is wrong"
     return claim, words.wanted(summary.objective, thing)
 
 
 def method_facts(summary: AttackSummary) -> dict[str, str]:
-    facts = dict[str, str]()
-    claimed = summary.claimed
-    chosen = summary.sample_count
-    seen = summary.gradients
+    """Return how an attack came to its result, by name; empty texts are left out."""
     segments = summary.light_path_segments
-    nothing = summary.non_finite
-    terms = summary.printability
-    if claimed is not None:
-        again = (
-            f", {_short(claimed.re_evaluated)} when rendered again"
-            if math.isfinite(claimed.re_evaluated)
-            else ""
-        )
-        claim = (
-            f"{words.objective_name(summary.objective)} "
-            f"{_short(claimed.objective)} in the render that won"
-        )
-        facts["The search's claim"] = claim + again
-    if chosen is not None:
-        enough = "more would leave the " + (
-            "rate about where it is" if summary.over else "margin on its side"
-        )
-        enough = (
-            enough
-            if chosen.converged
-            else ("that more would not change it is not shown")
-        )
-        facts["Sample count"] = f"{chosen.spp} a pixel in the verification; {enough}"
-    facts["Light transport"] = transport_text(summary)
-    if seen is not None and seen.count:
-        gradients = f"{seen.count} of the search" + (
-            f", {seen.zero} of them zero" if seen.zero else ""
-        )
-        cosine = seen.cosine_with_the_one_before
-        known = cosine is not None and math.isfinite(cosine)
-        facts["Gradients"] = gradients + (
-            f", median cosine with the one before {cosine:.2f}" if known else ""
-        )
-    # what the policy did about outliers and failed steps
-    if seen is not None and (seen.count or seen.rejected):
-        cut = (
-            f"{count(seen.cut, 'gradient')} with single outliers cut, "
-            f"{seen.shortened} shortened as a whole, "
-        )
-        facts["Cut or taken back"] = f"{cut}{count(seen.rejected, 'step')} taken back"
-    if nothing.objectives or nothing.gradient_elements:
-        numbers = count(nothing.gradient_elements, "number")
-        facts["Not finite"] = (
-            f"{count(nothing.objectives, 'objective')}, {numbers} of gradients"
-        )
-    longest = (
-        f"at most {segments.search} segments in the search, "
-        f"{segments.verification} in the verification"
-    )
-    facts["Light paths"] = longest
-    if terms is not None:
-        far = [
-            f"{of}: step between neighbours {off.variation:.3g}, distance from "
-            f"printable colours {off.off_print:.3g}"
-            for of, off in (("clean", terms.clean), ("answer", terms.answer))
-            if off is not None
-        ]
-        facts["Printability"] = "; ".join(far) + (" (sRGB)" if terms.answer else "")
-    facts["Cost of printability"] = print_cost_text(summary)
     moved = [
         f"{value.parameter} from {number_text(value.scene)} to "
         f"{number_text(value.used)} {value.unit}".rstrip()
         for value in summary.clean.moved
     ]
-    return {**facts, "Moved before": ", ".join(moved)}
+    facts = {
+        "The search's claim": _claim_text(summary),
+        "Sample count": _sample_count_text(summary),
+        "Light transport": transport_text(summary),
+        "Gradients": _gradients_text(summary),
+        "Cut or taken back": _rejected_text(summary),
+        "Not finite": _non_finite_text(summary),
+        "Light paths": (
+            f"at most {segments.search} segments in the search, "
+            f"{segments.verification} in the verification"
+        ),
+        "Printability": _printability_text(summary),
+        "Cost of printability": print_cost_text(summary),
+        "Moved before": ", ".join(moved),
+    }
+    return {name: text for name, text in facts.items() if text}
+
+
+def _claim_text(summary: AttackSummary) -> str:
+    """Return the objective that the search claims, and the one when rendered again."""
+    claimed = summary.claimed
+    if claimed is None:
+        return ""
+    text = (
+        f"{words.objective_name(summary.objective)} "
+        f"{_short(claimed.objective)} in the render that won"
+    )
+    if math.isfinite(claimed.re_evaluated):
+        text += f", {_short(claimed.re_evaluated)} when rendered again"
+    return text
+
+
+def _sample_count_text(summary: AttackSummary) -> str:
+    """Return the samples of the verification, and whether they suffice."""
+    samples = summary.sample_count
+    if samples is None:
+        return ""
+    reason = "that more would not change it is not shown"
+    if samples.converged:
+        stable = "rate about where it is" if summary.over else "margin on its side"
+        reason = f"more would leave the {stable}"
+    return f"{samples.spp} a pixel in the verification; {reason}"
+
+
+def _gradients_text(summary: AttackSummary) -> str:
+    """Return how many gradients the search took, and how much they agreed."""
+    gradients = summary.gradients
+    if gradients is None or not gradients.count:
+        return ""
+    text = f"{gradients.count} of the search"
+    if gradients.zero:
+        text += f", {gradients.zero} of them zero"
+    cosine = gradients.cosine_with_the_one_before
+    if cosine is not None and math.isfinite(cosine):
+        text += f", median cosine with the one before {cosine:.2f}"
+    return text
+
+
+def _rejected_text(summary: AttackSummary) -> str:
+    """Return what the policy did about outliers and failed steps."""
+    gradients = summary.gradients
+    if gradients is None or not (gradients.count or gradients.rejected):
+        return ""
+    return (
+        f"{count(gradients.cut, 'gradient')} with single outliers cut, "
+        f"{gradients.shortened} shortened as a whole, "
+        f"{count(gradients.rejected, 'step')} taken back"
+    )
+
+
+def _non_finite_text(summary: AttackSummary) -> str:
+    """Return how many values were not finite."""
+    non_finite = summary.non_finite
+    if not non_finite.objectives and not non_finite.gradient_elements:
+        return ""
+    objectives = count(non_finite.objectives, "objective")
+    elements = count(non_finite.gradient_elements, "number")
+    return f"{objectives}, {elements} of gradients"
+
+
+def _printability_text(summary: AttackSummary) -> str:
+    """Return the print terms of both scenes."""
+    printability = summary.printability
+    if printability is None:
+        return ""
+    texts = [
+        f"{name}: step between neighbours {terms.variation:.3g}, distance from "
+        f"printable colours {terms.off_print:.3g}"
+        for name, terms in (
+            ("clean", printability.clean),
+            ("answer", printability.answer),
+        )
+        if terms is not None
+    ]
+    unit = " (sRGB)" if printability.answer else ""
+    return "; ".join(texts) + unit
 
 
 def _short(value: float) -> str:
@@ -455,17 +491,16 @@ def _short(value: float) -> str:
 
 
 def transport_text(summary: AttackSummary) -> str:
+    """Return what predicted images of the search; empty if that is not known."""
     transport = summary.transport
     if transport is None:
         return ""
     if not transport.used:
-        return (
-            f"every picture was rendered: {transport.reason}"
-            if transport.reason
-            else "every picture was rendered"
-        )
-    what = "light on surfaces" if transport.way == "surface light" else "a matrix"
-    parts = [f"{what} predicted {count(summary.renders.get('products'), 'picture')}"]
+        text = "every picture was rendered"
+        return f"{text}: {transport.reason}" if transport.reason else text
+    predictor = "light on surfaces" if transport.way == "surface light" else "a matrix"
+    n_predicted = count(summary.renders.get("products"), "picture")
+    parts = [f"{predictor} predicted {n_predicted}"]
     if transport.error is not None:
         parts.append(
             "at the last comparison with a traced one it was off by "
@@ -479,4 +514,6 @@ def transport_text(summary: AttackSummary) -> str:
         parts.append(
             f"it and the comparisons took {words.seconds_text(transport.seconds)}"
         )
-    return "; ".join([*parts, *filter(None, [transport.reason])])
+    if transport.reason:
+        parts.append(transport.reason)
+    return "; ".join(parts)

@@ -1,6 +1,4 @@
-"""Checks gradients of a scene as it is, and plans a search over it: what `advsearch
-check` does.
-"""
+"""Check the gradients of a scene, and plan a search over it: `advsearch check`."""
 
 from __future__ import annotations
 
@@ -29,18 +27,16 @@ from advsearch.questions.check.result import (
 planning = gradients.planning
 SCENES = (("mug", None), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through; None is the default environment."""
-# samples a pixel of a working gradient of the linear loss, which is taken without
-# denoiser
+# samples per pixel of a gradient of the linear loss, which is taken without denoiser
 RAW_SPP = 16
-# samples a pixel of the dearest gradient of the model's loss that is tried
+# samples per pixel of the most expensive gradient of the model's loss
 MAX_SPP = 256
 REFERENCE_SPP = 64
-SEEDS = (6, 16)
-"""Samples a pixel of a reference render, and how many seeds it gets: until its noise is
-small.
-"""
-# seeds of a reference of the model's loss, whose renders have more samples
-FEW_SEEDS = (3, 6)
+"""Samples per pixel of a reference render."""
+N_SEEDS = (6, 16)
+"""Seeds of a reference, at least and at most: until its noise is small."""
+# the same for the model's loss, whose renders have more samples
+N_MODEL_SEEDS = (3, 6)
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
 Finding = CheckedRow | SearchPlan | results.PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
@@ -48,8 +44,12 @@ FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 @dataclass(frozen=True)
 class CheckedPart:
-    """One scene with its controls and one loss ("linear" or "model"): what is checked
-    in one go; numbered from 1.
+    """What is checked in one go: a scene with its controls, and a loss.
+
+    Attributes:
+        number: from 1.
+        config: of the scene and its controls.
+        loss: "linear" or "model".
     """
 
     number: int
@@ -58,16 +58,19 @@ class CheckedPart:
 
     @property
     def key(self) -> str:
+        """The name of its measurements."""
         return f"check {self.number}"
 
     @property
     def title(self) -> str:
+        """What the progress says of it."""
         return (
             f"{self.config.object} in {self.config.lit_by}, "
             f"{' and '.join(self.config.controls)}"
         )
 
     def make_row(self, measured: results.Measured, **fields: Any) -> CheckedRow:
+        """Return a measurement with what it is of, and with other `fields`."""
         config = self.config
         scene_fields = {
             "object": config.object,
@@ -78,41 +81,41 @@ class CheckedPart:
 
 
 def list_parts(config: CheckConfig) -> list[CheckedPart]:
+    """Return all parts of a check."""
     configs = list(list_bundled(config)) if config.all else [config]
-    pairs = [(part_config, loss) for part_config in configs for loss in config.losses]
-    return [
-        CheckedPart(number, part_config, loss)
-        for number, (part_config, loss) in enumerate(pairs, start=1)
-    ]
+    parts = list[CheckedPart]()
+    for part_config in configs:
+        for loss in config.losses:
+            parts.append(CheckedPart(len(parts) + 1, part_config, loss))
+    return parts
 
 
 def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
-    """Yield the settings of a check of each control by itself, on each bundled
-    scene.
-    """
+    """Yield the settings of a check of each control, on each bundled scene."""
     for object, environment in SCENES:
         skipped = set()
         if object == "bottle":
             skipped.add("contents")  # it is closed
         if environment is not None:
-            skipped.add("sky")  # it would take the environment's place
+            skipped.add("sky")  # it would replace the environment
         for control, control_type in workbench.CONTROLS.items():
-            # of one without, the scene names them
-            if control_type.parameters and control not in skipped:
-                scene_fields = {
-                    "object": object,
-                    "environment": environment,
-                    "label": None,
-                }
-                control_fields = {
-                    "controls": {control: {}},
-                    **workbench.settings_alone(config, control, {}),
-                }
-                yield config.model_copy(update={**scene_fields, **control_fields})
+            # A control without parameters gets them from the scene.
+            if not control_type.parameters or control in skipped:
+                continue
+            scene_fields = {
+                "object": object,
+                "environment": environment,
+                "label": None,
+            }
+            control_fields = {
+                "controls": {control: {}},
+                **workbench.settings_alone(config, control, {}),
+            }
+            yield config.model_copy(update={**scene_fields, **control_fields})
 
 
 class GradientCheck:
-    """One sitting of a check.
+    """One session of a check.
 
     What is measured is stored at once, so that a check that was stopped goes on where
     it was and ends with the same rows; only times differ.
@@ -127,22 +130,30 @@ class GradientCheck:
         self.parts_done = 0
 
     def run(self) -> CheckResult:
+        """Measure all parts, as far as the time allows, and return the result."""
         return self.measurements.collect(self._measure_parts(), self._make_result)
 
     def _make_result(self, findings: list[Finding]) -> CheckResult:
+        """Return the result of what is measured so far."""
+
         def select(kind: type[Any]) -> list[Any]:
             return [finding for finding in findings if isinstance(finding, kind)]
 
         configs = [part.config for part in self.parts]
+        controls = dict.fromkeys(name for config in configs for name in config.controls)
         return self.context.result(
             CheckResult,
             object=",".join(dict.fromkeys(config.object for config in configs)),
             environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
-            controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-            measured=self.parts_done, planned=len(self.parts), rows=select(CheckedRow),
-            plan=next(iter(select(SearchPlan)), None), bounces=next(iter(select(results.PathLength)), None),
-            gains=select(GainRow), texels=select(TexelRow),
-        )  # fmt: skip
+            controls=list(controls),
+            measured=self.parts_done,
+            planned=len(self.parts),
+            rows=select(CheckedRow),
+            plan=next(iter(select(SearchPlan)), None),
+            bounces=next(iter(select(results.PathLength)), None),
+            gains=select(GainRow),
+            texels=select(TexelRow),
+        )
 
     def _measure_parts(self) -> Iterator[Finding]:
         for part in self.parts:
@@ -154,6 +165,7 @@ class GradientCheck:
             self.parts_done += 1
 
     def _measure_part(self, part: CheckedPart) -> Iterator[Finding]:
+        """Measure a part, and store it when it is complete."""
         title = part.title
         if len(self.parts) > 1:
             title += f" ({part.number} of {len(self.parts)})"
@@ -163,20 +175,26 @@ class GradientCheck:
         for finding in measure(part, title):
             findings.append(finding.to_dict())
             yield finding
-            # whoever reads it can stop the check and find the row stored
+            # Reported after it is stored: a reader may stop the check then.
             if isinstance(finding, CheckedRow):
-                number = (
-                    f"{finding.value:.3g}"
-                    if finding.cosine is None
-                    else f"cosine {finding.cosine:.2f}"
-                )
-                what = f"{finding.object}, {finding.name} by {finding.estimator}"
-                self.progress.message(f"{what}: {number}, {finding.status}")
+                self._report_row(finding)
         self.measurements.put(part.key, findings)
 
+    def _report_row(self, row: CheckedRow) -> None:
+        """Report a measurement."""
+        value = (
+            f"cosine {row.cosine:.2f}" if row.cosine is not None else f"{row.value:.3g}"
+        )
+        self.progress.message(
+            f"{row.object}, {row.name} by {row.estimator}: {value}, {row.status}"
+        )
+
     def _measure_linear(self, part: CheckedPart, title: str) -> Iterator[Finding]:
-        """Measure derivatives of a smooth linear loss of the raw image, by every
-        estimator.
+        """Measure derivatives of a smooth linear loss of the raw image.
+
+        Args:
+            part: what is measured, by every estimator.
+            title: for the progress.
         """
         config = part.config
         problem, _ = workbench.problem_from_config(config, denoise="none")
@@ -185,41 +203,38 @@ class GradientCheck:
         renderer.plan = renderer.plan.at_a_pixel()
         loss = gradients.smooth_loss(renderer.formation.resolution, config.seed)
         spp = config.spp if isinstance(config.spp, int) else RAW_SPP
-        bench = self._make_bench(part, renderer, loss, spp)
-        for row in gradients.measure_derivatives(
-            bench, reference_spp=REFERENCE_SPP, seeds_of_reference=SEEDS, reference_factors=gradients.FACTORS[:2],
-            tried=gradients.list_attempts, stage=partial(self._begin_stage, title),
-        ):  # fmt: skip
+        rows = gradients.measure_derivatives(
+            self._make_bench(part, renderer, loss, spp),
+            reference_spp=REFERENCE_SPP,
+            seeds_of_reference=N_SEEDS,
+            reference_factors=gradients.FACTORS[:2],
+            tried=gradients.list_attempts,
+            stage=partial(self._begin_stage, title),
+        )
+        for row in rows:
             yield part.make_row(row)
 
     def _measure_model(self, part: CheckedPart, title: str) -> Iterator[Finding]:
-        """Plan a search by the model's own loss, and measure its derivatives as
-        planned.
+        """Plan a search by the model's own loss, and measure its derivatives as planned.
+
+        Args:
+            part: what is measured.
+            title: for the progress.
         """
         config = part.config
         problem, _ = workbench.problem_from_config(config)
         renderer = problem.renderer
-        counts = tuple(
-            count for count in (*planning.COUNTS, MAX_SPP) if count >= problem.spp
-        ) or (problem.spp,)
         bench = self._make_bench(part, renderer, problem.loss, problem.spp)
 
-        count = planning.plan_gradients(renderer.plan)
-        self.progress.stage(
-            f"{title}: comparing ways to differentiate", count, hint=HINT
-        )
+        n_gradients = planning.plan_gradients(renderer.plan)
+        stage_title = f"{title}: comparing ways to differentiate"
+        self.progress.stage(stage_title, n_gradients, hint=HINT)
         measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
         renderer.plan = planning.measured_plan(measure_bench, counted=True)
 
         planned_steps = {group.name: group.step for group in renderer.plan.groups}
-        max_samples = planning.cosine_samples(renderer.plan, counts=counts)
-        hint = f"counted in samples a pixel; {HINT}"
-        self.progress.stage(
-            f"{title}: the model's gradients", max_samples, hint=hint, at_most=True
-        )
-        cosine_bench = replace(bench, seed=config.seed, tick=self.progress.advance)
         rows = list[results.Measured]()
-        for row in planning.cosines(cosine_bench, counts=counts):
+        for row in self._measure_cosines(problem, bench, config.seed, title):
             rows.append(row)
             yield part.make_row(row)
         renderer.plan, tuned_spp = planning.tuned(renderer.plan, rows)
@@ -227,18 +242,39 @@ class GradientCheck:
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
-        factors = {
+        step_factors = {
             group.name: group.step / planned_steps[group.name]
             for group in renderer.plan.groups
             if planned_steps[group.name]
         }
-        for row in gradients.measure_derivatives(
-            replace(bench, spp=spp), reference_spp=planning.CONVERGED, seeds_of_reference=FEW_SEEDS,
+        derivatives = gradients.measure_derivatives(
+            replace(bench, spp=spp),
+            reference_spp=planning.CONVERGED,
+            seeds_of_reference=N_MODEL_SEEDS,
             stage=partial(self._begin_stage, title),
-        ):  # fmt: skip
-            # coordinates of one group have a number behind its name
-            name = f"{row.control}.{row.parameter.partition('.')[0]}"
-            yield part.make_row(row, factor=factors.get(name, 1.0))
+        )
+        for row in derivatives:
+            # Coordinates of one group have a number after its name.
+            group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
+            yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
+
+    def _measure_cosines(
+        self, problem: Problem, bench: gradients.Bench, seed: int, title: str
+    ) -> Iterator[results.Measured]:
+        """Yield the cosines of gradients with converged ones, by samples per pixel."""
+        plan = problem.renderer.plan
+        counts = tuple(
+            count for count in (*planning.COUNTS, MAX_SPP) if count >= problem.spp
+        )
+        counts = counts or (problem.spp,)
+        self.progress.stage(
+            f"{title}: the model's gradients",
+            planning.cosine_samples(plan, counts=counts),
+            hint=f"counted in samples a pixel; {HINT}",
+            at_most=True,
+        )
+        cosine_bench = replace(bench, seed=seed, tick=self.progress.advance)
+        yield from planning.cosines(cosine_bench, counts=counts)
 
     def _make_bench(
         self,
@@ -247,16 +283,23 @@ class GradientCheck:
         loss: gradients.Loss,
         spp: int,
     ) -> gradients.Bench:
+        """Return what measures gradients, and stores what it measures.
+
+        Args:
+            part: what is measured.
+            renderer: of the scene.
+            loss: that is differentiated.
+            spp: samples per pixel.
+        """
+
         def store(name: str, measure: Callable[[], Any]) -> Any:
             return self.measurements.get(f"{part.key} {name}", measure)
 
-        seed = seeds.stream(part.config.seed, "check")
-        u = gradients.interior_point(renderer)
         return gradients.Bench(
             renderer,
             loss,
-            u,
-            seed,
+            gradients.interior_point(renderer),
+            seeds.stream(part.config.seed, "check"),
             spp,
             store,
             lambda samples: self.progress.advance(1),
@@ -268,17 +311,19 @@ class GradientCheck:
     def _plan_search(
         self, problem: Problem, part: CheckedPart, spp: int
     ) -> Iterator[Finding]:
-        """Yield how a search gets its derivatives, how long its light paths are, and
-        what leaving things out saves.
+        """Yield the plan of a search, its longest light paths, and what it saves.
+
+        Args:
+            problem: of the scene.
+            part: what is measured.
+            spp: samples per pixel of the search.
         """
         config = part.config
         renderer = problem.renderer
+        left_out = ["nothing (`specialise=false`)"]
+        if config.specialise:
+            left_out = list_left_out(renderer)
         summary = problem.plan_summary(renderer.plan)
-        left_out = (
-            list_left_out(renderer)
-            if config.specialise
-            else ["nothing (`specialise=false`)"]
-        )
         yield SearchPlan(**{**vars(summary), "spp": spp, "left_out": left_out})
         if not config.specialise:
             return
@@ -287,39 +332,33 @@ class GradientCheck:
         hint = "`specialise=false` leaves it out"
         tick = self.progress.advance
 
-        def find_length() -> results.PathLength:
+        def measure_length() -> results.PathLength:
+            title = "finding how many bounces of light matter"
             max_images = planning.most_pictures(problem)
-            self.progress.stage(
-                "finding how many bounces of light matter",
-                max_images,
-                hint=hint,
-                at_most=True,
-            )
+            self.progress.stage(title, max_images, hint=hint, at_most=True)
             return planning.bounces_of(problem, config.seed, tick=tick)
 
-        def find_gains() -> list[GainRow]:
-            self.progress.stage(
-                "measuring what leaving things out saves",
-                MAX_GRADIENTS,
-                hint=hint,
-                at_most=True,
-            )
-            depth = length.depth
+        length = self.measurements.get_row(
+            f"{part.key} bounces", results.PathLength, measure_length
+        )
+        yield length
+
+        def measure_part_gains() -> list[GainRow]:
+            title = "measuring what leaving things out saves"
+            self.progress.stage(title, MAX_GRADIENTS, hint=hint, at_most=True)
             return measure_gains(
                 renderer,
                 problem.loss,
                 u,
                 seed=seed,
                 spp=problem.spp,
-                depth=depth,
+                depth=length.depth,
                 tick=tick,
             )
 
-        length = self.measurements.get_row(
-            f"{part.key} bounces", results.PathLength, find_length
+        yield from self.measurements.get_rows(
+            f"{part.key} gains", GainRow, measure_part_gains
         )
-        yield length
-        yield from self.measurements.get_rows(f"{part.key} gains", GainRow, find_gains)
         yield from self.measurements.get_rows(
             f"{part.key} texels",
             TexelRow,
@@ -328,9 +367,7 @@ class GradientCheck:
 
 
 def list_left_out(renderer: gradients.Renderer) -> list[str]:
-    """Return what a search with the renderer's plan does not compute at all, in
-    sentences.
-    """
+    """Return what a search with the renderer's plan does not compute at all."""
     used = {group.estimator for group in renderer.plan.groups}
     sentences = []
     if "material" not in used:

@@ -1,6 +1,4 @@
-"""Measures what a search leaves out of its renders: what that saves, and that it
-changes nothing.
-"""
+"""Measure what a search saves by what it leaves out, and that it changes nothing."""
 
 from __future__ import annotations
 
@@ -8,7 +6,7 @@ import math
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -30,9 +28,9 @@ WHAT = {
     ALL: "all of these",
 }
 """What is left out, in words, for each row."""
-AGREES = 1.2
-"""Difference, as a share of what another seed changes, up to which two images or
-gradients agree: 1 is expected where the random numbers are others.
+AGREEMENT_LIMIT = 1.2
+"""Difference, as a fraction of what another seed changes, up to which two images or
+gradients agree: 1 is expected if the random numbers are others.
 """
 REPEATS = 3  # timed gradients of each
 MAX_GRADIENTS = (2 + REPEATS) * (len(ITEMS) + 3)
@@ -46,67 +44,110 @@ views.
 
 
 def measure_gains(
-    renderer: gradients.Renderer, loss: gradients.Loss, u: Tensor, *, seed: int, spp: int, repeats: int = REPEATS,
-    depth: int | None = None, tick: Callable[[], None] = lambda: None,
-) -> list[GainRow]:  # fmt: skip
-    """Put back what a renderer leaves out, item by item and all at once, and measure a
-    gradient of a loss at u (d,).
+    renderer: gradients.Renderer,
+    loss: gradients.Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = REPEATS,
+    depth: int | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> list[GainRow]:
+    """Measure what a renderer saves by each item that it leaves out.
 
-    `depth` is the longest light path of the search, where it is shorter than the
-    scene's; `tick` is called after each gradient. There is one row for each item, one
-    for the bounces, and one for all.
+    Each item is put back, and then all at once, and a gradient is timed and compared.
+
+    Args:
+        renderer: of a search.
+        loss: that is differentiated.
+        u: (d,) where.
+        seed: of the renders.
+        spp: samples per pixel.
+        repeats: timed gradients of each.
+        depth: the longest light path of the search; None for the scene's.
+        tick: called after each gradient.
+
+    Returns:
+        A row for each item, one for the bounces if these are limited, and one for all.
     """
-    scene = renderer.scene
-    depth = scene.max_depth if depth is None else depth
-    renderers = {
-        "": renderer
-        if depth == scene.max_depth
-        else renderer.like(scene.like(max_depth=depth))
-    }
-    for item in ITEMS:
-        renderers[item] = renderer.like(
-            scene.like(max_depth=depth, leave_out=EVERYTHING - {item})
-        )
-    if depth < scene.max_depth:
-        renderers[BOUNCES] = renderer
-    renderers[ALL] = renderer.like(scene.like(leave_out=NOTHING))
-
+    variants = _make_variants(renderer, depth)
     images = defaultdict[str, list[Tensor]](list)
     slopes = defaultdict[str, list[Tensor]](list)
     times = defaultdict[str, list[float]](list)
-    for noise in (seed, seeds.stream(seed, "another")):  # the first compiles
-        for item, variant in renderers.items():
+    # The first gradient of each compiles.
+    for noise_seed in (seed, seeds.stream(seed, "another")):
+        for item, variant in variants.items():
             with torch.no_grad():
-                images[item].append(variant(u, noise, spp))
-            slopes[item].append(variant.gradient(loss, u, noise, spp)[1])
+                images[item].append(variant(u, noise_seed, spp))
+            slopes[item].append(variant.gradient(loss, u, noise_seed, spp)[1])
             tick()
     for number in range(repeats):
-        for item, variant in renderers.items():
-            start_time = time.perf_counter()
+        for item, variant in variants.items():
+            begin = time.perf_counter()
             variant.gradient(loss, u, seeds.stream(seed, "round", number), spp)
-            times[item].append(time.perf_counter() - start_time)
+            times[item].append(time.perf_counter() - begin)
             tick()
+    return [
+        _compare_item(item, images, slopes, times) for item in variants if item != ""
+    ]
 
-    rows = []
+
+def _make_variants(
+    renderer: gradients.Renderer, depth: int | None
+) -> dict[str, gradients.Renderer]:
+    """Return the renderer of a search, by "", and others that leave out less, by item.
+
+    Args:
+        renderer: whose paths have their full length.
+        depth: the longest light path of the search; None for the scene's.
+    """
+    scene = renderer.scene
+    depth = scene.max_depth if depth is None else depth
+    is_limited = depth != scene.max_depth
+    variants = {"": renderer}
+    if is_limited:
+        variants[""] = renderer.like(scene.like(max_depth=depth))
+    for item in ITEMS:
+        leave_out = EVERYTHING - {item}
+        variants[item] = renderer.like(scene.like(max_depth=depth, leave_out=leave_out))
+    if depth < scene.max_depth:
+        variants[BOUNCES] = renderer
+    variants[ALL] = renderer.like(scene.like(leave_out=NOTHING))
+    return variants
+
+
+def _compare_item(
+    item: str,
+    images: Mapping[str, list[Tensor]],
+    slopes: Mapping[str, list[Tensor]],
+    times: Mapping[str, list[float]],
+) -> GainRow:
+    """Compare the renderer with an item and that without, whose name is "".
+
+    Args:
+        item: its name.
+        images: at two seeds.
+        slopes: gradients at two seeds.
+        times: of gradients, in seconds.
+    """
+    image_difference = _relative_difference(images[""], images[item])
+    gradient_difference = _relative_difference(slopes[""], slopes[item])
     noise_without = _difference(images[""])
+    variance_gain = 1.0
+    if noise_without > 0.0:
+        variance_gain = (_difference(images[item]) / noise_without) ** 2
     seconds_without = statistics.median(times[""])
-    for item in list(renderers)[1:]:
-        image_difference = _relative_difference(images[""], images[item])
-        gradient_difference = _relative_difference(slopes[""], slopes[item])
-        variance_gain = (
-            (_difference(images[item]) / noise_without) ** 2
-            if noise_without > 0.0
-            else 1.0
-        )
-        seconds = statistics.median(times[item])
-        rows.append(
-            GainRow(
-                item=item, what=WHAT[item], time_gain=variance_gain * seconds / seconds_without,
-                picture_difference=image_difference, gradient_difference=gradient_difference,
-                safe=max(image_difference, gradient_difference) <= AGREES, seconds=seconds,
-            )
-        )  # fmt: skip
-    return rows
+    seconds = statistics.median(times[item])
+    return GainRow(
+        item=item,
+        what=WHAT[item],
+        time_gain=variance_gain * seconds / seconds_without,
+        picture_difference=image_difference,
+        gradient_difference=gradient_difference,
+        safe=max(image_difference, gradient_difference) <= AGREEMENT_LIMIT,
+        seconds=seconds,
+    )
 
 
 def _difference(pair: list[Tensor]) -> float:
@@ -116,59 +157,78 @@ def _difference(pair: list[Tensor]) -> float:
 
 
 def _relative_difference(without: list[Tensor], having: list[Tensor]) -> float:
-    """Return the difference at one seed over the root mean square of those that another
-    seed makes.
-    """
-    size = math.sqrt(
+    """Return the difference at one seed over the RMS difference that seeds make."""
+    noise = math.sqrt(
         statistics.fmean(_difference(pair) ** 2 for pair in (without, having))
     )
     difference = float((having[0] - without[0]).norm())
-    return difference / size if size > 0.0 else difference
+    return difference / noise if noise > 0.0 else difference
 
 
 def measure_texels(
     renderer: gradients.Renderer, u: Tensor, *, seed: int, spp: int = 16
 ) -> list[TexelRow]:
-    """Return, for every searched texture, how its texels compare with the pixels that
-    show them.
+    """Compare the texels of every searched texture with the pixels that show them.
+
+    Args:
+        renderer: of a search.
+        u: (d,) the configuration.
+        seed: of the renders.
+        spp: samples per pixel.
     """
-    scene = renderer.scene
     inputs = renderer.traced_inputs(u)
-    rows = []
+    rows = list[TexelRow]()
     for group in renderer.plan.groups:
-        names = (
-            sorted(renderer.routes.get(group.name, ()))
-            if group.parameter == "texels"
-            else []
-        )
-        for name in names:
-            bright, dark = (
-                {**inputs, name: torch.full_like(inputs[name], level)}
-                for level in (1.0, 0.0)
-            )
-            difference = (
-                scene.guides(bright, seed, spp)[0] - scene.guides(dark, seed, spp)[0]
-            )
-            pixels = int((difference.amax(dim=-1) > 0.0).sum())
-            with scene.shorter(2):
-                gradient = scene.adjoint(
-                    inputs, torch.ones(*scene.resolution, 3), seed, spp, wrt=[name]
-                )[name]
-            seen = int((gradient.abs().amax(dim=-1) > 0.0).sum())
-            side = max(inputs[name].shape[:2])
-            enough = side
-            while (
-                enough > 2
-                and seen * (enough / 2 / side) ** 2 >= TEXELS_PER_PIXEL * pixels
-            ):
+        if group.parameter != "texels":
+            continue
+        for name in sorted(renderer.routes.get(group.name, ())):
+            n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
+            n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)
+            size = max(inputs[name].shape[:2])
+            # halved as often as the pixels still resolve as much
+            enough = size
+            while enough > 2:
+                n_visible_of_half = n_visible * (enough / 2 / size) ** 2
+                if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
+                    break
                 enough //= 2
             rows.append(
                 TexelRow(
                     control=group.control,
-                    side=side,
-                    seen=seen,
-                    pixels=pixels,
+                    side=size,
+                    seen=n_visible,
+                    pixels=n_pixels,
                     enough=enough,
                 )
             )
     return rows
+
+
+def _count_pixels(
+    renderer: gradients.Renderer,
+    inputs: Mapping[str, Tensor],
+    name: str,
+    seed: int,
+    spp: int,
+) -> int:
+    """Count the pixels that show a texture: they differ if it is white or black."""
+    scene = renderer.scene
+    white = {**inputs, name: torch.full_like(inputs[name], 1.0)}
+    black = {**inputs, name: torch.full_like(inputs[name], 0.0)}
+    difference = scene.guides(white, seed, spp)[0] - scene.guides(black, seed, spp)[0]
+    return int((difference.amax(dim=-1) > 0.0).sum())
+
+
+def _count_visible_texels(
+    renderer: gradients.Renderer,
+    inputs: Mapping[str, Tensor],
+    name: str,
+    seed: int,
+    spp: int,
+) -> int:
+    """Count the texels that reach the camera directly: they have a derivative."""
+    scene = renderer.scene
+    with scene.shorter(2):
+        ones = torch.ones(*scene.resolution, 3)
+        gradient = scene.adjoint(inputs, ones, seed, spp, wrt=[name])[name]
+    return int((gradient.abs().amax(dim=-1) > 0.0).sum())

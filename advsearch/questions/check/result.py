@@ -1,4 +1,4 @@
-"""What `check` needs to know, and its result."""
+"""The settings and the result of `check`."""
 
 from __future__ import annotations
 
@@ -26,36 +26,42 @@ OF_ALL: Mapping[str, object] = {
     "controls": {"texture": {}},
     "set_": {},
 }
-"""What is as it is unless it is given, and has to be left so with `all`."""
+"""Defaults of the settings that `all` does not allow to be changed."""
 
 
 class CheckConfig(DerivativeConfig):
-    """Everything that decides what `check` does: gradients of a scene against
-    differences.
-    """
+    """The settings of `check`: gradients of a scene against differences."""
 
     command: ClassVar[str] = "check"
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
-    # fmt: off
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,
-        settings.Clash("all", lambda config: any(getattr(config, name) != value for name, value in OF_ALL.items()),
-              "takes scenes and controls of its own; leave `object`, `environment`, "
-              "`controls` and `set` out"),
-        settings.Clash("objective", lambda config: config.loss == "linear",
-              "is of the model's loss, which `loss=linear` leaves out; leave one of "
-              "the two out"),
+        settings.Clash(
+            "all",
+            lambda config: any(
+                getattr(config, name) != value for name, value in OF_ALL.items()
+            ),
+            "takes scenes and controls of its own; leave `object`, `environment`, "
+            "`controls` and `set` out",
+        ),
+        settings.Clash(
+            "objective",
+            lambda config: config.loss == "linear",
+            "is of the model's loss, which `loss=linear` leaves out; leave one of "
+            "the two out",
+        ),
     )
 
-    all: bool = setting(False, "check", "every control, on three bundled scenes; takes "
-                                        "hours")
+    all: bool = setting(
+        False, "check", "every control, on three bundled scenes; takes hours"
+    )
     loss: Literal["linear", "model", "both"] = setting(
-        "both", "check",
+        "both",
+        "check",
         "what is differentiated: a smooth linear loss of the raw picture, the model's "
         "own, or both in turn",
     )
-    # fmt: on
     seconds: float | None = setting(
         None,
         "check",
@@ -65,7 +71,7 @@ class CheckConfig(DerivativeConfig):
         unit="seconds",
         gt=0.0,
         le=1e9,
-    )  # fmt: skip
+    )
     run: str | None = setting_as_in(
         SceneConfig, "run", otherwise="runs/OBJECT-check-NNN"
     )
@@ -76,13 +82,12 @@ class CheckConfig(DerivativeConfig):
 
     @property
     def losses(self) -> tuple[str, ...]:
+        """The losses that are differentiated."""
         return ("linear", "model") if self.loss == "both" else (self.loss,)
 
 
 class CheckedRow(results.Measured):
-    """A derivative along a parameter, or the gradient of a whole control, beside its
-    reference.
-    """
+    """A derivative along a parameter, or the gradient of a control, and its reference."""
 
     object: str
     environment: str
@@ -129,9 +134,7 @@ class SearchPlan(results.PlannedGradient):
 
 
 class CheckResult(views.InNotebook, RunResult):
-    """Every derivative of a scene beside differences, and the plan of a search over it,
-    as far as they are measured.
-    """
+    """Every derivative of a scene, compared with differences, and the plan of a search."""
 
     command: ClassVar[str] = "check"
 
@@ -152,10 +155,12 @@ class CheckResult(views.InNotebook, RunResult):
 
     @property
     def falls_short(self) -> bool:
+        """Whether a gradient is biased or noisy."""
         return bool(short_names(self.rows))
 
     @property
     def brief(self) -> str:
+        """How many parts are measured."""
         return f"{self.measured} of {self.planned} parts"
 
 
@@ -171,7 +176,7 @@ READING = (
     "the converged gradient means that a gradient points the right way."
 )
 
-SINGLE: Mapping[str, views.Column] = {
+DERIVATIVE_COLUMNS: Mapping[str, views.Column] = {
     "object": "{0.object}",
     "parameter": "{0.name}",
     "estimator": "{0.estimator}",
@@ -183,7 +188,7 @@ SINGLE: Mapping[str, views.Column] = {
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
-WHOLE: Mapping[str, views.Column] = {
+GRADIENT_COLUMNS: Mapping[str, views.Column] = {
     "object": "{0.object}",
     "control": "{0.control}",
     "estimator": "{0.estimator}",
@@ -196,26 +201,27 @@ WHOLE: Mapping[str, views.Column] = {
 }
 
 
-def _step(group: results.GroupDerivative) -> str:
+def _step_text(group: results.GroupDerivative) -> str:
+    """Return the step of finite differences; empty without one."""
     if not group.step_reason:
         return ""
+    if group.step_in_unit is None:
+        return f"{group.step:.3g}"
     unit = "" if group.unit == "1" else f" {group.unit}"
-    return f"{group.step:.3g}" + (
-        "" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})"
-    )
+    return f"{group.step:.3g} ({group.step_in_unit:.3g}{unit})"
 
 
-GROUPS: Mapping[str, views.Column] = {
+GROUP_COLUMNS: Mapping[str, views.Column] = {
     "parameter": "{0.name}",
     "numbers": "{0.size}",
     "estimator": "{0.estimator}",
-    "step": _step,
+    "step": _step_text,
 }
-GAINS: Mapping[str, views.Column] = {
+GAIN_COLUMNS: Mapping[str, views.Column] = {
     "left out": "{0.what}",
     "a gradient with it takes": "x {0.time_gain:.2f}",
-    "picture differs": lambda row: _difference(row.picture_difference),
-    "gradient differs": lambda row: _difference(row.gradient_difference),
+    "picture differs": lambda row: _difference_text(row.picture_difference),
+    "gradient differs": lambda row: _difference_text(row.gradient_difference),
     "": lambda row: "" if row.safe else "MORE THAN ITS NOISE",
 }
 LOSSES = {
@@ -225,105 +231,117 @@ LOSSES = {
 
 
 def shown(result: CheckResult) -> ShownResult:
+    """Return the view of a check."""
     rows = result.rows
-    left = result.planned - result.measured
-    plan = result.plan
+    sections = [ResultPart(text=[READING] if rows else [])]
+    for loss, title in LOSSES.items():
+        derivatives = [
+            row for row in rows if row.loss == loss and row.quantity == "derivative"
+        ]
+        sections.append(ResultPart.table(derivatives, DERIVATIVE_COLUMNS, title=title))
+    gradient_rows = [row for row in rows if row.quantity == "gradient"]
+    sections += [
+        ResultPart.table(
+            gradient_rows,
+            GRADIENT_COLUMNS,
+            title="The model's loss, cosine with the converged gradient",
+        ),
+        ResultPart.table(
+            result.plan.groups if result.plan else [],
+            GROUP_COLUMNS,
+            title="How a search gets its derivatives",
+            text=_reason_texts(result),
+        ),
+        ResultPart("Left out", _left_out_texts(result)),
+        ResultPart.table(result.gains, GAIN_COLUMNS, title="What that saves"),
+    ]
+    facts = {}
+    if result.plan is not None:
+        facts = {
+            "renders a gradient": str(result.plan.renders_per_gradient),
+            "samples": str(result.plan.spp),
+        }
+    return ShownResult(_verdict(result), sections, facts)
+
+
+def _verdict(result: CheckResult) -> str:
+    """Return the result in a sentence or two."""
     sentences = []
-    if left:
-        stopped = (
-            "The time was up" if result.ending == results.OUT_OF_TIME else "Stopped"
-        )
+    has_parts_left = result.measured < result.planned
+    if has_parts_left:
+        stopped = "Stopped"
+        if result.ending == results.OUT_OF_TIME:
+            stopped = "The time was up"
         sentences.append(
             f"{stopped} after {result.measured} of {result.planned} parts (a scene, "
             "its controls and a loss)."
         )
-    if short := short_names(rows):
-        sentences.append(f"No estimator is good enough for {', '.join(short)}.")
-    elif rows:
-        sentences.append(
-            f"Every parameter {'so far ' if left else ''}has a good gradient."
-        )
-    groups, left_out = (plan.groups, [*plan.left_out]) if plan else ([], [])
-    reasons: dict[tuple[str, str], list[str]] = {}  # each once, with its parameters
+    names = short_names(result.rows)
+    if names:
+        sentences.append(f"No estimator is good enough for {', '.join(names)}.")
+    elif result.rows:
+        so_far = "so far " if has_parts_left else ""
+        sentences.append(f"Every parameter {so_far}has a good gradient.")
+    return " ".join(sentences)
+
+
+def _reason_texts(result: CheckResult) -> list[str]:
+    """Return why a search takes its estimators and steps: each reason once."""
+    groups = result.plan.groups if result.plan else []
+    names_by_reason: dict[tuple[str, str], list[str]] = {}
     for group in groups:
-        reasons.setdefault((group.estimator, group.reason), []).append(group.name)
+        key = (group.estimator, group.reason)
+        names_by_reason.setdefault(key, []).append(group.name)
     for group in groups:
         if group.step_reason:
-            reasons.setdefault(("step", group.step_reason), []).append(group.name)
-    if bounces := result.bounces:
-        longest = (
-            f"at most {bounces.depth} segments of {bounces.full}: {bounces.reason}"
-        )
-        left_out.append(f"light paths of a long search: {longest}")
-    for texels in result.texels:
-        seen = f"{texels.seen} are seen in {texels.pixels} pixels"
-        left_out.append(
-            f"texels of {texels.control}: {seen}, which resolve "
-            f"{texels.enough} of {texels.side} a side"
-        )
-    why = [
-        f"{what} of {', '.join(names)}: {reason}"
-        for (what, reason), names in reasons.items()
+            key = ("step", group.step_reason)
+            names_by_reason.setdefault(key, []).append(group.name)
+    return [
+        f"{choice} of {', '.join(names)}: {reason}"
+        for (choice, reason), names in names_by_reason.items()
     ]
-    whole = [row for row in rows if row.quantity == "gradient"]
-    facts = (
-        {}
-        if plan is None
-        else {
-            "renders a gradient": str(plan.renders_per_gradient),
-            "samples": str(plan.spp),
-        }
-    )
-    return ShownResult(
-        " ".join(sentences),
-        [
-            ResultPart(text=[READING] if rows else []),
-            *(
-                ResultPart.table(
-                    [
-                        row
-                        for row in rows
-                        if row.loss == name and row.quantity == "derivative"
-                    ],
-                    SINGLE,
-                    title=title,
-                )
-                for name, title in LOSSES.items()
-            ),
-            ResultPart.table(
-                whole,
-                WHOLE,
-                title="The model's loss, cosine with the converged gradient",
-            ),
-            ResultPart.table(
-                groups, GROUPS, title="How a search gets its derivatives", text=why
-            ),
-            ResultPart("Left out", left_out),
-            ResultPart.table(result.gains, GAINS, title="What that saves"),
-        ],
-        facts,
-    )
+
+
+def _left_out_texts(result: CheckResult) -> list[str]:
+    """Return what a search leaves out."""
+    texts = [*result.plan.left_out] if result.plan else []
+    bounces = result.bounces
+    if bounces:
+        texts.append(
+            f"light paths of a long search: at most {bounces.depth} segments of "
+            f"{bounces.full}: {bounces.reason}"
+        )
+    for texels in result.texels:
+        texts.append(
+            f"texels of {texels.control}: {texels.seen} are seen in {texels.pixels} "
+            f"pixels, which resolve {texels.enough} of {texels.side} a side"
+        )
+    return texts
 
 
 def short_names(rows: Sequence[CheckedRow]) -> list[str]:
     """Return the names of what no estimator is good enough for, each once.
 
     For each parameter and loss the row with the best status counts: an estimator that
-    no plan would take may fall short. Of the model's loss those of whole controls
-    count: what matters is where their gradient points.
+    no plan would take may fall short. Of the model's loss those of full controls count:
+    what matters is where their gradient points.
     """
     order = ("ok", "reference unusable", "noisy", "biased")
-    best: dict[tuple[str, ...], CheckedRow] = {}
+    best_rows: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
-        key = row.object, row.environment, row.loss, row.name
-        counts = row.loss == "linear" or row.quantity == "gradient"
-        if counts and (
-            key not in best or order.index(row.status) < order.index(best[key].status)
-        ):
-            best[key] = row
-    short = [row for row in best.values() if row.status in ("biased", "noisy")]
-    return list(dict.fromkeys(f"{row.name} ({row.status})" for row in short))
+        if row.loss != "linear" and row.quantity != "gradient":
+            continue
+        key = (row.object, row.environment, row.loss, row.name)
+        best = best_rows.get(key)
+        if best is None or order.index(row.status) < order.index(best.status):
+            best_rows[key] = row
+    names = dict.fromkeys(
+        f"{row.name} ({row.status})"
+        for row in best_rows.values()
+        if row.status in ("biased", "noisy")
+    )
+    return list(names)
 
 
-def _difference(share: float) -> str:
-    return "not at all" if share == 0.0 else f"by {share:.2g} of its noise"
+def _difference_text(fraction: float) -> str:
+    return "not at all" if fraction == 0.0 else f"by {fraction:.2g} of its noise"

@@ -11,9 +11,7 @@ from advsearch.questions.region.result import RegionConfig, RegionResult, claims
 
 
 def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the run around whose adversarial configuration a box grows brings:
-    scene, model and controls.
-    """
+    """Return the settings that come from the run of `around`: scene, model, controls."""
     return RegionConfig.shared(AttackConfig.from_yaml(file))
 
 

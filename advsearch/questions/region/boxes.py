@@ -1,6 +1,4 @@
-"""Boxes that grow around a point while a property stays the same, and what samples show
-of them.
-"""
+"""Grow boxes around a point while a property stays the same, and sample them."""
 
 from __future__ import annotations
 
@@ -12,16 +10,16 @@ from torch import Tensor
 
 from advsearch.extend import InputError, seeds, statistics
 
-LEVELS = 6  # How often the step of the faces is halved
-ATTEMPTS = 4  # Final checks at most
-PROBES = 8  # Random points at which what a face would win is probed
-USUAL_PROBED = 100  # Images of growing for each parameter, usually
+LEVELS = 6  # sizes of the step of the faces, each half of the one before
+ATTEMPTS = 4  # final checks at most
+PROBES = 8  # random points in the slab that a face would win
+USUAL_PROBED = 100  # images of growing for each parameter, usually
 MAX_PROBED = 400
-"""Images of growing for each parameter: that is more than twice what boxes, balls,
+"""Images of growing for each parameter, at most: more than twice what boxes, balls,
 planes and noise have taken.
 """
-MIN_STEP = 1e-3  # A face does not move by less
-# Share of the distance between the centre and an exception at which a face lies that
+MIN_STEP = 1e-3  # a face does not move by less
+# fraction of the distance between the centre and an exception at which a face lies that
 # excludes it
 PULLED_IN = 0.98
 
@@ -63,6 +61,7 @@ class GrownBox:
 
     @property
     def volume(self) -> float:
+        """The fraction of the unit box that the box takes up."""
         return float((self.high - self.low).prod())
 
 
@@ -121,7 +120,7 @@ class GrowingBox:
 
     Attributes:
         low, high: its corners (d,).
-        n_evaluated: points whose prediction was asked for.
+        n_evaluated: points that were evaluated.
     """
 
     def __init__(self, is_same: IsSame, center: Tensor, seed: int) -> None:
@@ -147,15 +146,14 @@ class GrowingBox:
             share /= 2.0
 
     def sample_exceptions(self, count: int) -> Tensor:
-        """Sample points of the box, and return those (n, d) that have another
-        prediction than the centre.
-        """
+        """Sample points of the box; return those (n, d) with another prediction."""
         points = self._sample(self.low, self.high, count)
         return points[[not self._evaluate(point) for point in points]]
 
     def exclude(self, point: Tensor) -> None:
-        """Move the face in that takes the least of the box away, so that a point lies
-        outside.
+        """Move a face in, so that a point lies outside.
+
+        It is the face that cuts off the least of the box.
         """
         if not bool(((point >= self.low) & (point <= self.high)).all()):
             return
@@ -171,8 +169,14 @@ class GrowingBox:
         face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
     def _push(self, face: int, share: float) -> bool:
-        """Move a face out if the slab that it wins has the centre's prediction; return
-        whether it moved.
+        """Move a face out if the slab that it wins has the centre's prediction.
+
+        Args:
+            face: its index: 2 * axis, and 1 more for the upper face.
+            share: of the distance to the bound.
+
+        Returns:
+            Whether it moved.
         """
         axis, is_upper = divmod(face, 2)
         room = float(1.0 - self.high[axis] if is_upper else self.low[axis])

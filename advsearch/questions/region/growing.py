@@ -1,6 +1,4 @@
-"""The box around a configuration in which the model's verdict stays, and a map of its
-margin.
-"""
+"""Grow the box in which the model's verdict stays, and draw a map of its margin."""
 
 from __future__ import annotations
 
@@ -105,9 +103,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
 
 
 def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
-    """Return the images that were rendered, and those that were predicted if there are
-    any.
-    """
+    """Return how many images were rendered, and how many predicted, if any."""
     findings = verifier.findings
     renders = {"verification": findings.verification_renders}
     if findings.transport is not None:
@@ -132,11 +128,9 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
         for index in range(group.size):
             name = f"{group.name}.{index}" if group.size > 1 else group.name
             coordinate_of[name] = group.begin + index
-    names = (
-        tuple(coordinate_of)
-        if config.vary is None
-        else settings.split_names(config.vary)
-    )
+    names = tuple(coordinate_of)
+    if config.vary is not None:
+        names = settings.split_names(config.vary)
     for name in names:
         if name not in coordinate_of:
             raise errors.UnknownNameError("parameter in `vary`", name, coordinate_of)
@@ -155,8 +149,9 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
 
 
 def read_centre(problem: Problem, config: RegionConfig) -> Tensor:
-    """Return the configuration around which the box grows (d,): the scene's own, or the
-    adversarial one of a run.
+    """Return the configuration (d,) around which the box grows.
+
+    It is the scene's own, or the adversarial one of a run.
     """
     centre: Tensor = problem.domain.start.clone()
     if config.around is None:
@@ -238,6 +233,7 @@ class RegionSearch:
         )
 
     def _begin_check(self) -> None:
+        """Begin the stage of the check; later checks belong to it."""
         if self._is_checking:
             return
         self._is_checking = True
@@ -250,8 +246,7 @@ class RegionSearch:
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at some values of the parameters (k,) is that of
-        the centre.
+        """Return whether the verdict at values (k,) is that of the centre.
 
         An image without the object is neither right nor wrong.
         """
@@ -305,32 +300,41 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
 def describe_box(
     problem: Problem, grown: boxes.GrownBox, varied: VariedParameters
 ) -> list[BoxSide]:
-    """Return the range of each parameter in its unit; of a number that nobody
-    describes, as shares of the range.
+    """Return the range of each parameter in its unit.
+
+    Of a number that no control describes, as fractions of the range.
+
+    Args:
+        problem: of the scene.
+        grown: the box.
+        varied: its parameters.
     """
-    low_values, high_values, centre_values = (
-        problem.describe(varied.place(values))
-        for values in (grown.low, grown.high, grown.center)
-    )
+    low_values = problem.describe(varied.place(grown.low))
+    high_values = problem.describe(varied.place(grown.high))
+    centre_values = problem.describe(varied.place(grown.center))
     sides = []
     for index, name in enumerate(varied.names):
-        vector_name, _, component = name.rpartition(".")
-        if name in low_values:
-            described = name
-            component = ""
+        described_name = name
+        component = ""
+        if name not in low_values:  # perhaps a component of a vector
+            described_name, _, component = name.rpartition(".")
+        if described_name in low_values:
+            side = BoxSide(
+                name=name,
+                unit=str(low_values[described_name].get("unit", "")),
+                low=read_component(low_values[described_name], component),
+                high=read_component(high_values[described_name], component),
+                centre=read_component(centre_values[described_name], component),
+            )
         else:
-            described = vector_name
-        if described in low_values:
-            low = read_component(low_values[described], component)
-            high = read_component(high_values[described], component)
-            centre = read_component(centre_values[described], component)
-            unit = str(low_values[described].get("unit", ""))
-        else:
-            low = float(grown.low[index])
-            high = float(grown.high[index])
-            centre = float(grown.center[index])
-            unit = "of the range"
-        sides.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
+            side = BoxSide(
+                name=name,
+                unit="of the range",
+                low=float(grown.low[index]),
+                high=float(grown.high[index]),
+                centre=float(grown.center[index]),
+            )
+        sides.append(side)
     return sides
 
 
@@ -347,8 +351,14 @@ def draw_map(
     box: Sequence[BoxSide],
     run: RunDirectory,
 ) -> MarginMap:
-    """Draw the margin over two parameters, with the line at which the verdict changes,
-    and the box.
+    """Draw the margin over two parameters, its zero line, and the box.
+
+    Args:
+        verifier: that evaluates the points.
+        size: points along each axis.
+        varied: the parameters.
+        box: its sides.
+        run: where the figure is saved.
     """
     hint = (
         f"{size * size} pictures of {verifier.findings.spp} samples a pixel; `map` "
@@ -358,7 +368,8 @@ def draw_map(
     steps = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:
-        return varied.place(torch.stack([steps[number % size], steps[number // size]]))
+        row, column = divmod(number, size)
+        return varied.place(torch.stack([steps[column], steps[row]]))
 
     transport = verifier.findings.transport
     trials = verifier.trials_of(
@@ -366,56 +377,51 @@ def draw_map(
     )
     margins = [-trial.score for trial in trials]
     rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]
+    x_range, y_range = find_ranges(verifier.problem, varied, box)
 
-    low_values, high_values = (
-        verifier.problem.describe(varied.place(torch.full((2,), end)))
-        for end in (0.0, 1.0)
-    )
-    axis_ranges = []
+    def draw(axes: Any) -> None:
+        draw_margins(axes, rows, x_range, y_range)
+        draw_outline(axes, *box)
+
+    for suffix, data in figures.figure_of(draw, (6.0, 4.6)).items():
+        run.write_file(f"images/map.{suffix}", data)
+    return MarginMap(axes=(x_range, y_range), margins=rows)
+
+
+def find_ranges(
+    problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
+) -> list[AxisRange]:
+    """Return the full range of each parameter, in its unit if it has one."""
+    low_values = problem.describe(varied.place(torch.full((2,), 0.0)))
+    high_values = problem.describe(varied.place(torch.full((2,), 1.0)))
+    ranges = []
     for side in box:
         low = 0.0
         high = 1.0
         if side.name in low_values:
             low = read_component(low_values[side.name])
             high = read_component(high_values[side.name])
-        axis_ranges.append(
-            AxisRange(name=side.name, unit=side.unit, low=low, high=high)
-        )
-    first_range, second_range = axis_ranges
-    first_side, second_side = box
+        ranges.append(AxisRange(name=side.name, unit=side.unit, low=low, high=high))
+    return ranges
 
-    def draw(axes: Any) -> None:
-        extent = (
-            first_range.low,
-            first_range.high,
-            second_range.low,
-            second_range.high,
-        )
-        first_title = figures.axis_title(first_range.name, first_range.unit)
-        second_title = figures.axis_title(second_range.name, second_range.unit)
-        figures.heat(axes, rows, extent, figures.MARGIN, first_title, second_title)
-        if min(margins) < 0.0 < max(margins):
-            axes.contour(
-                rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0
-            )
-        corners_x = [
-            first_side.low,
-            first_side.high,
-            first_side.high,
-            first_side.low,
-            first_side.low,
-        ]
-        corners_y = [
-            second_side.low,
-            second_side.low,
-            second_side.high,
-            second_side.high,
-            second_side.low,
-        ]
-        axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
-        axes.plot(first_side.centre, second_side.centre, "k+", label="centre")
-        axes.legend(loc="upper right", frameon=True)
 
-    for suffix, data in figures.figure_of(draw, (6.0, 4.6)).items():
-        run.write_file(f"images/map.{suffix}", data)
-    return MarginMap(axes=(first_range, second_range), margins=rows)
+def draw_margins(
+    axes: Any, rows: list[list[float]], x_range: AxisRange, y_range: AxisRange
+) -> None:
+    """Draw margins and the line at which the verdict changes on matplotlib axes."""
+    extent = (x_range.low, x_range.high, y_range.low, y_range.high)
+    x_title = figures.axis_title(x_range.name, x_range.unit)
+    y_title = figures.axis_title(y_range.name, y_range.unit)
+    figures.heat(axes, rows, extent, figures.MARGIN, x_title, y_title)
+    margins = [margin for row in rows for margin in row]
+    if min(margins) < 0.0 < max(margins):
+        axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
+
+
+def draw_outline(axes: Any, x_side: BoxSide, y_side: BoxSide) -> None:
+    """Draw the outline of the box and its centre on matplotlib axes."""
+    x_corners = [x_side.low, x_side.high, x_side.high, x_side.low, x_side.low]
+    y_corners = [y_side.low, y_side.low, y_side.high, y_side.high, y_side.low]
+    axes.plot(x_corners, y_corners, color="black", linestyle="--", label="region")
+    axes.plot(x_side.centre, y_side.centre, "k+", label="centre")
+    axes.legend(loc="upper right", frameon=True)

@@ -1,4 +1,4 @@
-"""Settings and result of `region`, and what is shown of it."""
+"""The settings and the result of `region`, and its view."""
 
 from __future__ import annotations
 
@@ -20,45 +20,56 @@ from advsearch.extend import (
 )
 
 FEWEST_SAMPLES = 8
-"""With fewer, not even a box without exceptions has one verdict in more than half of
-it, at the confidence of `questions.region.boxes.GrownBox.interval`.
+"""With fewer samples, not even a box without exceptions has one verdict in more than half
+of it, at the confidence of `questions.region.boxes.GrownBox.interval`.
 """
 
 
 class RegionConfig(SceneConfig):
-    """Everything that decides what `region` does: the box around a configuration in
-    which the verdict stays.
-    """
+    """The settings of `region`: a box around a configuration where the verdict stays."""
 
     command: ClassVar[str] = "region"
     without: ClassVar[tuple[str, ...]] = ("spp",)
 
-    # fmt: off
     around: str | None = setting(
-        None, "region",
+        None,
+        "region",
         "a run whose adversarial configuration is the centre; it brings scene, model "
         "and controls with it",
-        "the name or the folder of a run", otherwise="the scene as it is",
+        "the name or the folder of a run",
+        otherwise="the scene as it is",
     )
     vary: str | None = setting(
-        None, "region", "the parameters in which the box grows, separated by commas",
-        "names such as pose.yaw,camera.elevation", otherwise="all that the controls search, up to eight",
+        None,
+        "region",
+        "the parameters in which the box grows, separated by commas",
+        "names such as pose.yaw,camera.elevation",
+        otherwise="all that the controls search, up to eight",
     )
     samples: int = setting(
-        200, "region", "fresh samples that check the box", unit="renders", ge=FEWEST_SAMPLES, le=1_000_000
+        200,
+        "region",
+        "fresh samples that check the box",
+        unit="renders",
+        ge=FEWEST_SAMPLES,
+        le=1_000_000,
     )
     map: int = setting(
-        0, "region", "side of the map of the margin, where there are two parameters; 0 "
-                     "for none", unit="points",
-        ge=0, le=512,
+        0,
+        "region",
+        "side of the map of the margin, where there are two parameters; 0 for none",
+        unit="points",
+        ge=0,
+        le=512,
     )
     specialise: bool = setting_as_in(
-        AttackConfig, "specialise", group="region",
+        AttackConfig,
+        "specialise",
+        group="region",
         description="predict pictures from new viewpoints while the box grows, and "
-                    "those of the map",
+        "those of the map",
         switched="render every picture",
     )
-    # fmt: on
     verify_spp: int | None = setting_as_in(
         AttackConfig, "verify_spp", group="region", description="samples per pixel"
     )
@@ -135,6 +146,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
 
     @property
     def brief(self) -> str:
+        """The result in a few words."""
         return (
             f"{self.verdict} in {self.same} of {self.samples} samples of the box"
             if self.samples
@@ -143,7 +155,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
 
 
 def shown(result: RegionResult) -> ShownResult:
-    """Return what is shown of a region."""
+    """Return the view of a region."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
     box: Mapping[str, views.Column] = {
@@ -174,9 +186,9 @@ def claims(result: RegionResult) -> Iterator[views.Claim]:
         or result.verdict is None
     ):
         return
-    what = f"samples that are {result.verdict}"
+    description = f"samples that are {result.verdict}"
     extent = results.Extent.from_count(
-        what, result.same, result.samples, result.interval
+        description, result.same, result.samples, result.interval
     )
     sides = [
         f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip()

@@ -1,6 +1,4 @@
-"""Measure how often the model is right over a grid or a random sample of
-configurations.
-"""
+"""Measure how often a model is right over a grid or a sample of configurations."""
 
 from __future__ import annotations
 
@@ -25,10 +23,10 @@ from advsearch.questions.sweep.summary import SweepSummary
     claims=claims,
     page=page,
 )
-def sweep(asked: RunContext[SweepConfig]) -> SweepSummary:
+def sweep(context: RunContext[SweepConfig]) -> SweepSummary:
     """Measure how often the model is right."""
     from advsearch.questions.sweep.carry_out import sweep_from_config  # imports torch
 
     return sweep_from_config(
-        asked.config, progress=asked.progress, resumed=asked.resumed
+        context.config, progress=context.progress, resumed=context.resumed
     ).summary

@@ -1,7 +1,12 @@
-"""Axes of a grid: which parameter they move, and over which values.
+"""Axes of a grid, and the configurations of a sweep.
 
 An axis makes its parameter a discrete choice among its values, so a point of the grid
 is a point of an ordinary space.
+
+A configuration follows from the number of its image by arithmetic; nothing is stored.
+Every image has a draw of its own, so that images are independent; only pairs without
+and with an adversarial scene, frames of a drive, and samples of a point where nothing
+is sampled have the same one (`runs.tables.Units`).
 """
 
 from __future__ import annotations
@@ -10,7 +15,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,9 +35,22 @@ from advsearch.runs.results import VariedValue
 from advsearch.runs.tables import Units
 from advsearch.scene.description import ENVIRONMENT, SceneDescription
 
-MOST_VALUES = 100_000  # values of one axis, at most; more are for draws
-TURN = 360.0  # degrees after which a periodic parameter is the same again
-_OUTER = {
+MAX_AXIS_VALUES = 100_000
+FULL_TURN = 360.0  # degrees after which a periodic parameter repeats
+MAX_RANGE_PARTS = 10
+MIN_RANGE_PARTS = 2
+MIN_CELL_DRAWS = 5
+"""Draws that a cell of the map over two sampled parameters has on average, at least,
+where there are enough.
+"""
+# numbers of a group up to which Sobol points are used; larger ones (a texture) are
+# sampled pseudo-randomly
+MAX_SOBOL_SIZE = 64
+MAX_TABLE_COMPONENTS = 4  # of a parameter, up to which the table shows them
+MAX_CACHED_DESCRIPTIONS = 4096  # of controls at points of the grid
+Float64Array = NDArray[np.float64]
+# settings that take several values by themselves, and how
+_LISTED_SETTINGS = {
     "object": "`object` mug,bowl",
     "environment": "`environment` studio,noon",
     "model": "`model` a.pt2,b.pt2",
@@ -41,8 +59,13 @@ _OUTER = {
 
 @dataclass(frozen=True)
 class Axis:
-    """One parameter and its values. The instance has the name of its kind unless said
-    otherwise.
+    """A parameter and its values.
+
+    Attributes:
+        control: kind of the control.
+        instance: name of the control; that of its kind unless it has another.
+        parameter: what varies.
+        values: numbers or names.
     """
 
     control: str
@@ -52,35 +75,44 @@ class Axis:
 
     @property
     def name(self) -> str:
-        """How it is stored: ``pose.yaw``, or ``key.power`` of a light called key."""
+        """The stored name: ``pose.yaw``, or ``key.power`` of a light named key."""
         return f"{self.instance}.{self.parameter.name}"
 
     @property
     def is_time(self) -> bool:
+        """Whether the values are times of the frames of a path."""
         return (self.control, self.parameter.name) == ("path", "time")
 
     @property
     def unit(self) -> str:
-        return _unit(self.parameter)
+        return _stored_unit(self.parameter)
 
 
 def read_axes(
     grid: Mapping[str, object], controls: Sequence[Control]
 ) -> tuple[Axis, ...]:
-    """Return the axes of a grid beside the controls that are drawn by chance: name to
-    values, ``"FIRST:LAST:COUNT"`` or a list. A name is KIND.PARAMETER,
-    INSTANCE.PARAMETER of one of `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
+    """Parse the axes of a grid.
+
+    Args:
+        grid: parameter to values, ``"FIRST:LAST:COUNT"`` or a list. A parameter is
+            KIND.PARAMETER, INSTANCE.PARAMETER of one of `controls`,
+            KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
+        controls: the controls that are sampled.
+
+    Raises:
+        InputError, UnknownNameError: a name or its values cannot be used, or a
+            parameter is set twice.
     """
     instances = {control.name: control for control in controls}
     axes: dict[str, Axis] = {}
     for name, values in grid.items():
-        axis = _read_axis(name, values, instances)
+        axis = _parse_axis(name, values, instances)
         if axis.name in axes:
             raise InputError(
                 f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
             )
-        drawn = instances.get(axis.instance)
-        if drawn is not None and axis.parameter.name in drawn.specs:
+        sampled = instances.get(axis.instance)
+        if sampled is not None and axis.parameter.name in sampled.specs:
             raise InputError(
                 f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} "
                 "too; leave it out of one "
@@ -90,133 +122,181 @@ def read_axes(
     return tuple(axes.values())
 
 
-def _read_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis:
+def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis:
+    """Parse one axis; see `read_axes`.
+
+    Args:
+        name: of the parameter.
+        values: of it.
+        instances: the sampled controls by name.
+    """
     where = f"`grid` {name}"
-    head, dot, rest = name.partition(".")
-    parameter_name, colon, late = rest.partition(":")
-    kind, early_colon, early = head.partition(":")
-    instance = head if head in instances else families.instance_of(kind, late or early)
-    if head in _OUTER and not dot:
+    control_name, dot, rest = name.partition(".")
+    # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
+    # KIND.PARAMETER:INSTANCE.
+    parameter_name, colon, suffix = rest.partition(":")
+    kind, prefix_colon, prefix = control_name.partition(":")
+    if control_name in instances:
+        instance = control_name
+    else:
+        instance = families.instance_of(kind, suffix or prefix)
+    if control_name in _LISTED_SETTINGS and not dot:
         raise InputError(
-            f"{where}: several of them are given as a list: {_OUTER[head]}"
+            f"{where}: several of them are given as a list: "
+            f"{_LISTED_SETTINGS[control_name]}"
         )
-    control: Any = (
-        type(instances[instance]) if instance in instances else CONTROLS.get(kind)
-    )
+    control: Any = CONTROLS.get(kind)
+    if instance in instances:
+        control = type(instances[instance])
     if control is None:
         hint = (
             f"It stands in {where}; write `grid` CONTROL.PARAMETER=VALUES, such as "
             "pose.yaw=0:360:24."
         )
         raise families.unknown_control(kind, hint, instances)
-    # the scene names the parameter, and says later whether there is such a one
     if kind == BY_KEY:
-        key = name.partition(":")[2]
-        if not key:
-            raise InputError(
-                f"{where}: expected Mitsuba's name and values, as in "
-                f"{BY_KEY}:KEY=FIRST:LAST:COUNT"
-            )
-        (parameter,) = control.declared([key])
-        return Axis(BY_KEY, BY_KEY, parameter, axis_values(where, parameter, values))
-    of_instance = instances[instance].own if instance in instances else ()
-    known = {
-        parameter.name: parameter
-        for parameter in (*control.declared({parameter_name: values}), *of_instance)
-    }
+        return _parse_key_axis(name, values, control)
+
+    declared = [*control.declared({parameter_name: values})]
+    if instance in instances:
+        declared += instances[instance].own
+    parameters = {parameter.name: parameter for parameter in declared}
     if not parameter_name:
         raise InputError(
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
-            f"choose one of {', '.join(known)}"
+            f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance(where, late or early, colon or early_colon)
-    if parameter_name not in known:
+    families.check_instance(where, suffix or prefix, colon or prefix_colon)
+    if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
             parameter_name,
-            list(known),
+            list(parameters),
             f"In {where}.",
         )
-    parameter = known[parameter_name]
-    pictures = any(len(declared.shape) > 1 for declared in control.parameters)
-    if pictures or parameter.shape != ():
+    parameter = parameters[parameter_name]
+    _check_scalar(where, control, parameter, instance)
+    parsed_values = axis_values(where, parameter, values)
+    return Axis(control.kind, instance, parameter, parsed_values)
+
+
+def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
+    """Parse an axis over one of Mitsuba's own parameters.
+
+    The scene declares the parameter, and is checked for it later.
+    """
+    where = f"`grid` {name}"
+    key = name.partition(":")[2]
+    if not key:
+        raise InputError(
+            f"{where}: expected Mitsuba's name and values, as in "
+            f"{BY_KEY}:KEY=FIRST:LAST:COUNT"
+        )
+    (parameter,) = control.declared([key])
+    return Axis(BY_KEY, BY_KEY, parameter, axis_values(where, parameter, values))
+
+
+def _check_scalar(
+    where: str, control: Any, parameter: Parameter, instance: str
+) -> None:
+    """Check that a parameter is a single value, as an axis needs it."""
+    has_images = any(len(declared.shape) > 1 for declared in control.parameters)
+    if has_images or parameter.shape != ():
         raise InputError(
             f"{where}: expected a parameter that is one number or name, got one that "
             "is many numbers; draw it "
             f"by chance with `controls` {instance} `samples=100`"
         )
-    return Axis(
-        control.kind, instance, parameter, axis_values(where, parameter, values)
-    )
 
 
-def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
-    """Return the values of an axis, checked, from a text, a value, or a list; errors
-    name `where`. ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to
-    LAST, both included; of a periodic parameter over a whole turn, LAST would repeat
-    FIRST and is left out.
+def axis_values(
+    where: str, parameter: Parameter, raw_values: Any
+) -> tuple[Number, ...]:
+    """Parse and check the values of an axis.
+
+    ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both
+    included; of a periodic parameter over a full turn, LAST would repeat FIRST and is
+    left out.
+
+    Args:
+        where: how messages name the axis.
+        parameter: what varies.
+        raw_values: a string, a value, or a list.
+
+    Raises:
+        InputError: they are no values of the parameter, or not different.
     """
-    turns = parameter.periodic and parameter.unit == "degrees"
-    values: Sequence[Any] = given if isinstance(given, (list, tuple)) else [given]
-    if isinstance(given, str) and ":" in given and not parameter.options:
-        values = _spaced(where, given, turns)
+    is_angle = parameter.periodic and parameter.unit == "degrees"
+    values: Sequence[Any] = (
+        raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
+    )
+    if isinstance(raw_values, str) and ":" in raw_values and not parameter.options:
+        values = _parse_range(where, raw_values, is_angle)
     if not values:
         raise InputError(
             f"{where}: expected at least one value, got none; write "
             "FIRST:LAST:COUNT or a list"
         )
     _check_count(where, len(values))
-    spec = read(
-        where,
-        parameter,
-        {"choices": [one.item() if hasattr(one, "item") else one for one in values]},
-    )
+    choices = [value.item() if hasattr(value, "item") else value for value in values]
+    spec = read(where, parameter, {"choices": choices})
     assert isinstance(spec, OneOf)
-    seen: dict[Number, Number] = {}
-    for value in spec.values:
-        same = (
-            round(value % TURN, 9) % TURN
-            if turns and not isinstance(value, str)
-            else value
-        )
-        if same in seen:
-            first, again = (
-                one if isinstance(one, str) else f"{one:g}"
-                for one in (seen[same], value)
-            )
-            what = (
-                f"{again} twice"
-                if seen[same] == value
-                else f"{first} and {again}, the same angle"
-            )
-            raise InputError(
-                f"{where}: expected different values, got {what}; leave one of them out"
-            )
-        seen[same] = value
-    if not parameter.options and not any(
-        isinstance(value, str) for value in spec.values
-    ):
-        singles = sorted(np.float32(value) for value in spec.values)
-        if any(low == high for low, high in pairwise(singles)):
-            raise InputError(
-                f"{where}: expected values that differ in single precision, which "
-                "scenes have; space them wider"
-            )
+    _check_different(where, spec.values, is_angle)
+    has_names = any(isinstance(value, str) for value in spec.values)
+    if not parameter.options and not has_names:
+        _check_single_precision(where, spec.values)
     return spec.values
 
 
-def _spaced(where: str, text: str, turns: bool) -> list[float]:
+def _check_different(where: str, values: Sequence[Number], is_angle: bool) -> None:
+    """Check that no value comes twice, and no angle in two forms."""
+    first_values: dict[Number, Number] = {}
+    for value in values:
+        key = value
+        if is_angle and not isinstance(value, str):
+            key = round(value % FULL_TURN, 9) % FULL_TURN
+        if key not in first_values:
+            first_values[key] = value
+            continue
+        first = first_values[key]
+        if first == value:
+            repeated = f"{_format_value(value)} twice"
+        else:
+            repeated = (
+                f"{_format_value(first)} and {_format_value(value)}, the same angle"
+            )
+        raise InputError(
+            f"{where}: expected different values, got {repeated}; leave one of them out"
+        )
+
+
+def _check_single_precision(where: str, values: Sequence[Any]) -> None:
+    """Check that the values differ in single precision, which scenes have."""
+    singles = sorted(np.float32(value) for value in values)
+    if any(lower == upper for lower, upper in pairwise(singles)):
+        raise InputError(
+            f"{where}: expected values that differ in single precision, which "
+            "scenes have; space them wider"
+        )
+
+
+def _format_value(value: Number) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
+    """Return the values of ``FIRST:LAST:COUNT``; see `axis_values`."""
     expected = (
         f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values "
         f"separated by commas, got {text!r}"
     )
-    parts = text.split(":")
-    if len(parts) != 3:
+    fields = text.split(":")
+    if len(fields) != 3:
         raise InputError(expected)
     try:
-        first = float(parts[0])
-        last = float(parts[1])
-        count = int(parts[2])
+        first = float(fields[0])
+        last = float(fields[1])
+        count = int(fields[2])
     except ValueError:
         raise InputError(
             f"{expected}; FIRST and LAST are numbers and COUNT is a whole number"
@@ -237,22 +317,21 @@ def _spaced(where: str, text: str, turns: bool) -> list[float]:
             f"{where}: FIRST and LAST are the same in {text!r}; write "
             f"{first:g} for the one value"
         )
-    if turns and last - first > TURN:
+    if is_angle and last - first > FULL_TURN:
         raise InputError(
             f"{where}: {text!r} is more than a whole turn, so that values would "
             "repeat; write "
-            f"{first:g}:{first + TURN:g}:{count}"
+            f"{first:g}:{first + FULL_TURN:g}:{count}"
         )
-    whole = turns and last - first == TURN
-    return [
-        float(value) for value in np.linspace(first, last, count, endpoint=not whole)
-    ]
+    is_full_turn = is_angle and last - first == FULL_TURN
+    values = np.linspace(first, last, count, endpoint=not is_full_turn)
+    return [float(value) for value in values]
 
 
 def _check_count(where: str, count: int) -> None:
-    if count > MOST_VALUES:
+    if count > MAX_AXIS_VALUES:
         raise InputError(
-            f"{where}: expected at most {MOST_VALUES} values on an axis, got {count}; "
+            f"{where}: expected at most {MAX_AXIS_VALUES} values on an axis, got {count}; "
             "draw the parameter by chance "
             "instead, with `controls` and `samples`"
         )
@@ -261,68 +340,65 @@ def _check_count(where: str, count: int) -> None:
 def on_grid(
     controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescription
 ) -> tuple[Control, ...]:
-    """Return the controls with the axes among their parameters as discrete choices. The
-    other parameters of a control that is drawn keep being drawn; those of one that is
+    """Return the controls with the axes among their parameters as discrete choices.
+
+    The other parameters of a sampled control stay sampled; those of a control that is
     only in the grid stay as the scene has them.
+
+    Args:
+        controls: the sampled ones.
+        axes: of the grid.
+        scene: which decides the default ranges of a control.
     """
-    on = {control.name: control for control in controls}
+    control_by_name = {control.name: control for control in controls}
     for instance in dict.fromkeys(axis.instance for axis in axes):
-        moving = [axis for axis in axes if axis.instance == instance]
-        drawn = on.get(instance)
-        settings = dict[str, object]()
-        kind: Any = CONTROLS[moving[0].control] if drawn is None else type(drawn)
-        if drawn is not None:
-            settings = {
-                name: value
-                for name, value in drawn.settings().items()
-                if name not in ("kind", "name")
-            }
-            if not drawn.asked:  # the ranges that it has by default are spelled out
-                for parameter in map(drawn.within(scene).in_scene, drawn.parameters):
-                    if (
-                        parameter.name not in drawn.specs
-                        and parameter.search is not None
-                    ):
-                        options = (
-                            {"choices": list(parameter.options)}
-                            if parameter.options
-                            else None
-                        )
-                        settings[parameter.name] = options or list(parameter.search)
-        settings |= {
-            axis.parameter.name: {"choices": list(axis.values)} for axis in moving
-        }
-        on[instance] = kind(name=instance, **settings)
-    return tuple(on.values())
+        instance_axes = [axis for axis in axes if axis.instance == instance]
+        sampled = control_by_name.get(instance)
+        if sampled is None:
+            control_type: Any = CONTROLS[instance_axes[0].control]
+            settings = dict[str, object]()
+        else:
+            control_type = type(sampled)
+            settings = _sampled_settings(sampled, scene)
+        for axis in instance_axes:
+            settings[axis.parameter.name] = {"choices": list(axis.values)}
+        control_by_name[instance] = control_type(name=instance, **settings)
+    return tuple(control_by_name.values())
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# From the number of a picture to its configuration and what is stored of it:
-# arithmetic, nothing is kept. Every picture has a draw of its own, so that pictures are
-# independent; only pairs without and with an adversarial scene have the same ones,
-# frames of a drive, and samples of a point where nothing is drawn
-# (`runs.tables.Units`).
-
-MOST_PARTS = 10
-FEWEST_PARTS = 2
-LEAST_IN_A_CELL = 5
-"""Draws that a cell of the map over two drawn parameters has on average, at least,
-where there are enough.
-"""
-# numbers of a group up to which Sobol points are used; more (a texture) are drawn
-# pseudo-randomly
-MOST_QUASI = 64
-MOST_BINNED = 4  # numbers of a parameter up to which the table shows them
-MOST_KEPT = 4096  # descriptions of controls that are kept for points of the grid
-Doubles = NDArray[np.float64]
+def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
+    """Return the settings of a sampled control, with its default ranges spelled out."""
+    settings = control.settings()
+    settings = {
+        name: value for name, value in settings.items() if name not in ("kind", "name")
+    }
+    if control.asked:
+        # Ranges were set, so that its other parameters have no default range.
+        return settings
+    in_scene = control.within(scene).in_scene
+    for parameter in map(in_scene, control.parameters):
+        if parameter.name in control.specs or parameter.search is None:
+            continue
+        if parameter.options:
+            settings[parameter.name] = {"choices": list(parameter.options)}
+        else:
+            settings[parameter.name] = list(parameter.search)
+    return settings
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A drawn number, as the table shows it: its column among the draws, and what equal
-    parts of [0, 1] stand for: pairs of ends, or values of a list; if `settled`, in
-    every scene. Where values have weights, `shares` says which part each of more equal
-    shares stands for.
+    """A sampled number, as the table shows it.
+
+    Attributes:
+        name: of the parameter, with the index of a component.
+        unit: of the values.
+        column: its index among the draws.
+        parts: what equal parts of [0, 1] stand for: bounds of a range each, or values
+            of a list.
+        settled: whether `parts` are the same in every scene.
+        shares: the part that each of more equal shares of [0, 1] stands for, where
+            values have weights.
     """
 
     name: str
@@ -334,33 +410,83 @@ class Drawn:
 
     @property
     def varied(self) -> VariedValue:
-        ends = [end for part in self.parts if isinstance(part, list) for end in part]
-        if ends:
-            return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
-        return VariedValue(unit=self.unit, names=[str(one) for one in self.parts])
+        """What the value was sampled from, as a result has it."""
+        bounds = [
+            bound for part in self.parts if isinstance(part, list) for bound in part
+        ]
+        if bounds:
+            return VariedValue(unit=self.unit, low=min(bounds), high=max(bounds))
+        return VariedValue(unit=self.unit, names=[str(part) for part in self.parts])
 
     @property
     def edges(self) -> list[float] | None:
-        """The ends of the parts, ascending; None of a list."""
+        """The bounds of the parts, ascending; None of a list."""
         if not self.settled or not all(isinstance(part, list) for part in self.parts):
             return None
-        return sorted({end for part in self.parts for end in part})
+        return sorted({bound for part in self.parts for bound in part})
 
 
-def parts_of_ranges(pictures: int) -> int:
-    """Return into how many equal parts table, map and page cut the range of a drawn
-    parameter, by the pictures of the whole sweep.
+def parts_of_ranges(n_images: int) -> int:
+    """Return into how many parts tables and figures cut the range of a parameter.
+
+    Args:
+        n_images: images of the full sweep.
     """
-    return min(max(FEWEST_PARTS, math.isqrt(pictures // LEAST_IN_A_CELL)), MOST_PARTS)
+    parts = math.isqrt(n_images // MIN_CELL_DRAWS)
+    return min(max(MIN_RANGE_PARTS, parts), MAX_RANGE_PARTS)
+
+
+class _SampledBlock(NamedTuple):
+    """A block of coordinates that is sampled.
+
+    Attributes:
+        block: its budget.
+        coordinates: its place in a configuration.
+        columns: its draws.
+    """
+
+    block: Block
+    coordinates: slice
+    columns: slice
+
+
+class _GridCoordinate(NamedTuple):
+    """A coordinate whose values are those of an axis.
+
+    Attributes:
+        column: its index in a configuration.
+        axis: the index of the axis.
+    """
+
+    column: int
+    axis: int
 
 
 class Points:
-    """The configurations of one scene `among` several, so many samples at each point of
-    the grid, from a start that is the scene as it is. After so many scenes the draws
-    come again, so that what is compared has the same; 0 for never. `drawn` is what the
-    table shows of the draws, in `parts` of each range; `drawn_numbers` is the same for
-    all scenes. Neighbouring pictures are told by the number of the first in the scene,
-    and by how many the scenes `before` have.
+    """The configurations of one scene of a sweep.
+
+    Images are numbered with the points of the grid, its last axis fastest, then the
+    samples at each point.
+
+    Args:
+        space: the controls, bound to the scene; it starts from the scene as it is.
+        domain: the budgets of the controls.
+        axes: of the grid.
+        samples: at each point of the grid.
+        sampler: how the draws are made.
+        seed: of the draws.
+        scenes: after so many scenes the draws repeat, so that scenes that are compared
+            have the same ones; 0 for never.
+        among: scenes of the sweep.
+
+    Attributes:
+        count: images of the scene.
+        parts: into which tables cut the range of each sampled number.
+        drawn: the sampled numbers that tables show.
+        drawn_numbers: which numbers are sampled; the same for all scenes.
+        draws: whether anything is sampled: a control may have all its values from the
+            grid, as a path its time.
+        units: how rows follow from draws.
     """
 
     def __init__(
@@ -378,209 +504,294 @@ class Points:
         self.samples = samples
         self.count = self.grid.count * samples
         self.parts = parts_of_ranges(self.count * among)
-        frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
-        self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
-        self._axes = {axis.name: (number, axis) for number, axis in enumerate(axes)}
-        # where a coordinate lies, and the number of its axis
-        self._gridded: list[tuple[int, int]] = []
-        small = list[tuple[Block, slice, slice]]()
-        large = list[tuple[Block, slice, slice]]()
-        drawn = list[Drawn]()
-        controls = {control.name: control for control in space.controls}
-        for group, (block, part) in zip(space.groups, domain.parts(), strict=True):
-            control = controls[group.control]
-            if group.name in self._axes:
-                self._gridded.append((part.start, self._axes[group.name][0]))
-                continue
-            into = small if block.size <= MOST_QUASI else large
-            first = into[-1][2].stop if into else 0
-            into.append(
-                (block, part, slice(first, first + block.size + (block.norm == "l2")))
-            )
-            if block.size <= MOST_BINNED and block.norm != "l2" and control.slots:
-                drawn += self._shown(control, group.parameter, part, first)
-        self.drawn = tuple(drawn)
-        dimensions = [chosen[-1][2].stop if chosen else 0 for chosen in (small, large)]
-        self._columns = [number.column for number in drawn]
-        self._sizes = np.array(
-            [len(number.shares or number.parts) for number in drawn], dtype=np.int64
-        )
-        self._draws = Draws(dimensions[0], sampler, seed)
-        self._chances = (
-            (self._draws, small),
-            (Draws(dimensions[1], "random", seed, "large draws"), large),
-        )
-        # whether anything is: controls may have all from the grid, as a path its time
-        self.draws = sum(dimensions) > 0
-        draws, noise = (samples, 1) if self.draws else (1, samples)
-        self.units = Units(
-            self.grid.sizes, frames, draws, again=scenes * self.count, noise=noise
-        )
-        self.drawn_numbers = (
-            dimensions[0],
-            tuple((number.name, number.column, len(number.parts)) for number in drawn),
-        )
-        self._described: dict[tuple[object, ...], Mapping[str, Value]] = {}
+        self._lower = domain.lower.numpy()
+        self._upper = domain.upper.numpy()
+        self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
+        self._grid_coordinates: list[_GridCoordinate] = []
+        self._small_blocks: list[_SampledBlock] = []
+        self._large_blocks: list[_SampledBlock] = []
+        self.drawn = tuple(self._assign_blocks(domain))
+        self._columns = [number.column for number in self.drawn]
+        n_shares = [len(number.shares or number.parts) for number in self.drawn]
+        self._n_shares = np.array(n_shares, dtype=np.int64)
 
-    def _shown(
-        self, control: Control, name: str, part: slice, first: int
+        small_dimensions = _count_columns(self._small_blocks)
+        large_dimensions = _count_columns(self._large_blocks)
+        self._small_draws = Draws(small_dimensions, sampler, seed)
+        self._large_draws = Draws(large_dimensions, "random", seed, "large draws")
+        self.draws = small_dimensions + large_dimensions > 0
+        # Samples are draws, or differ in noise alone if nothing is sampled.
+        self.units = Units(
+            self.grid.sizes,
+            next((index for index, axis in enumerate(axes) if axis.is_time), None),
+            samples if self.draws else 1,
+            again=scenes * self.count,
+            noise=1 if self.draws else samples,
+        )
+        numbers = tuple(
+            (number.name, number.column, len(number.parts)) for number in self.drawn
+        )
+        self.drawn_numbers = (small_dimensions, numbers)
+        self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
+
+    def _assign_blocks(self, domain: Domain) -> Iterator[Drawn]:
+        """Assign each block to the grid, or to columns of the draws.
+
+        Yields the sampled numbers that tables show.
+        """
+        controls = {control.name: control for control in self.space.controls}
+        for group, (block, coordinates) in zip(
+            self.space.groups, domain.parts(), strict=True
+        ):
+            if group.name in self._axes:
+                axis_index, _ = self._axes[group.name]
+                self._grid_coordinates.append(
+                    _GridCoordinate(coordinates.start, axis_index)
+                )
+                continue
+            is_small = block.size <= MAX_SOBOL_SIZE
+            blocks = self._small_blocks if is_small else self._large_blocks
+            begin = _count_columns(blocks)
+            # A ball takes one number more, for the length.
+            n_columns = block.size + (block.norm == "l2")
+            columns = slice(begin, begin + n_columns)
+            blocks.append(_SampledBlock(block, coordinates, columns))
+            control = controls[group.control]
+            is_short = block.size <= MAX_TABLE_COMPONENTS and block.norm != "l2"
+            if is_short and control.slots:
+                yield from self._describe_sampled(
+                    control, group.parameter, coordinates, begin
+                )
+
+    def _describe_sampled(
+        self, control: Control, name: str, coordinates: slice, begin: int
     ) -> Iterator[Drawn]:
-        parameter, spec = _spec(control, name)
-        full = f"{control.name}.{name}"
+        """Yield the sampled numbers of a parameter, as tables show them.
+
+        Args:
+            control: bound to the scene.
+            name: of its parameter.
+            coordinates: of the parameter in a configuration.
+            begin: index of its first number among the draws.
+        """
+        parameter, spec = _find_spec(control, name)
+        full_name = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
             values = tuple(dict.fromkeys(spec.values))
-            shares = (
-                () if values == spec.values else tuple(map(values.index, spec.values))
+            shares: tuple[int, ...] = ()
+            if values != spec.values:  # a value with a weight comes several times
+                shares = tuple(map(values.index, spec.values))
+            yield Drawn(
+                full_name, _stored_unit(parameter), begin, values, shares=shares
             )
-            yield Drawn(full, _unit(parameter), first, values, shares=shares)
             return
-        for number, place in enumerate(range(part.start, part.stop)):
-            ends = torch.linspace(
-                float(self._lower[place]),
-                float(self._upper[place]),
+        for component, column in enumerate(range(coordinates.start, coordinates.stop)):
+            edges = torch.linspace(
+                float(self._lower[column]),
+                float(self._upper[column]),
                 self.parts + 1,
                 dtype=torch.float64,
             )
-            parts = tuple(
-                map(list, pairwise(spec.at(ends, log=parameter.log).tolist()))
-            )
+            edge_values = spec.at(edges, log=parameter.log).tolist()
+            suffix = f".{component}" if parameter.shape else ""
             yield Drawn(
-                full + (f".{number}" if parameter.shape else ""),
+                full_name + suffix,
                 parameter.unit,
-                first + number,
-                parts,
+                begin + component,
+                tuple(map(list, pairwise(edge_values))),
             )
 
     def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
-        """Return in which part of each of the `drawn` numbers neighbouring pictures of
-        a scene lie, (count, k), by the number of the first in the whole sweep.
+        """Return the part of each of k sampled numbers that images lie in.
+
+        Args:
+            first: number of the first image in the full sweep.
+            count: of neighbouring images of a scene.
+
+        Returns:
+            (count, k) indices among `parts` of each of `drawn`.
         """
-        shares = self._drawn(self._draws, first, count)
-        parts = np.minimum(
-            (shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1
-        )
+        draws = self._sample(self._small_draws, first, count)
+        shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
+        parts = np.minimum(shares, self._n_shares - 1)
         for column, number in enumerate(self.drawn):
             if number.shares:
                 parts[:, column] = np.take(number.shares, parts[:, column])
         return parts
 
     def noise(self, number: int) -> int:
-        """Return the number of the noise of the picture with this number in the whole
-        sweep.
-        """
+        """Return the number of the noise of an image, by its number in the sweep."""
         return number % self.units.again if self.units.again else number
 
-    def _drawn(self, draws: Draws, first: int, count: int) -> Doubles:
-        """The draws of neighbouring pictures, by the number of the first in the whole
-        sweep.
+    def _sample(self, draws: Draws, first: int, count: int) -> Float64Array:
+        """Return the draws (count, k) of neighbouring images.
+
+        Args:
+            draws: of k numbers.
+            first: number of the first image in the full sweep.
+            count: of images.
         """
         if self.units.frames is None:
             return draws.points(self.units.draw(first), count)
-        each = [
+        points = [
             draws.points(self.units.draw(number), 1)
             for number in range(first, first + count)
         ]
-        return np.concatenate(each) if each else draws.points(0, 0)
+        return np.concatenate(points) if points else draws.points(0, 0)
 
-    def _digits(self, first: int, count: int) -> tuple[NDArray[np.intp], ...]:
-        """The places (count,) of neighbouring pictures on each axis."""
-        places = np.arange(first, first + count) // self.samples
-        return np.unravel_index(places, self.grid.sizes) if self._axes else ()
+    def _axis_indices(self, first: int, count: int) -> tuple[NDArray[np.intp], ...]:
+        """Return the indices (count,) of neighbouring images on each axis.
+
+        Args:
+            first: number of the first image in the scene.
+            count: of images.
+        """
+        if not self._axes:
+            return ()
+        grid_points = np.arange(first, first + count) // self.samples
+        return np.unravel_index(grid_points, self.grid.sizes)
 
     def configurations(self, first: int, count: int, before: int = 0) -> Tensor:
-        """Return (count, d) float32."""
+        """Return the configurations (count, d) float32 of neighbouring images.
+
+        Args:
+            first: number of the first image in the scene.
+            count: of images.
+            before: images of the scenes before this one.
+        """
         u = np.repeat(self._start[None], count, axis=0)
-        digits = self._digits(first, count)
-        for column, number in self._gridded:
-            u[:, column] = (digits[number] + 0.5) / self.grid.sizes[number]
-        for draws, blocks in self._chances:
-            if blocks:
-                shares = self._drawn(draws, before + first, count)
-                for block, part, columns in blocks:
-                    u[:, part] = self._placed(block, part, shares[:, columns])
+        indices = self._axis_indices(first, count)
+        for column, axis in self._grid_coordinates:
+            u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
+        for draws, blocks in (
+            (self._small_draws, self._small_blocks),
+            (self._large_draws, self._large_blocks),
+        ):
+            if not blocks:
+                continue
+            samples = self._sample(draws, before + first, count)
+            for sampled in blocks:
+                u[:, sampled.coordinates] = self._transform(
+                    sampled, samples[:, sampled.columns]
+                )
         return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))
 
-    def _placed(self, block: Block, part: slice, shares: Doubles) -> Doubles:
-        """Coordinates inside the budget from uniform shares: uniform in the box, or in
-        the ball (Muller 1959).
+    def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
+        """Return coordinates inside the budget of a block from uniform numbers.
+
+        They are uniform in the box, or in the ball (Muller 1959).
+
+        Args:
+            sampled: the block, of k coordinates.
+            uniform: (n, k) in [0, 1]; of a ball (n, k + 1).
         """
+        block = sampled.block
         if block.options:
-            return np.asarray(
-                (np.minimum(np.floor(shares * block.options), block.options - 1) + 0.5)
-                / block.options
-            )
+            option = np.minimum(np.floor(uniform * block.options), block.options - 1)
+            return np.asarray((option + 0.5) / block.options)
         if block.norm != "l2" or block.epsilon is None:
-            low = self._lower[part].astype(np.float64)
-            high = self._upper[part].astype(np.float64)
-            return np.asarray(low + (high - low) * shares)
-        direction = ndtri(np.clip(shares[:, :-1], 1e-12, 1.0 - 1e-12))
-        length = block.epsilon * shares[:, -1:] ** (1.0 / block.size)
+            lower = self._lower[sampled.coordinates].astype(np.float64)
+            upper = self._upper[sampled.coordinates].astype(np.float64)
+            return np.asarray(lower + (upper - lower) * uniform)
+        direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
+        length = block.epsilon * uniform[:, -1:] ** (1.0 / block.size)
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
-        return np.asarray(self._start[part] + direction * (length / norm))
+        center = self._start[sampled.coordinates]
+        return np.asarray(center + direction * (length / norm))
 
     @property
     def environment(self) -> str | None:
-        """What lights all pictures in the place of the scene's environment; None if
-        that does, or if it varies.
+        """What lights all images instead of the scene's environment.
+
+        None if the scene's environment does, or if it varies.
         """
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
         return None if varies else self.space.environment
 
     def values(self, u: Tensor, first: int) -> list[dict[str, Value]]:
-        """Return what is stored of neighbouring pictures with their configurations:
-        parameter to value and unit, as `Space.describe` says it. One of the grid has
-        the value that was listed, not what single precision makes of it.
+        """Return the stored values of neighbouring images: parameter to value and unit.
+
+        As `Space.describe` returns them, except that a parameter of the grid has the
+        value that was listed, not its rounding to single precision.
+
+        Args:
+            u: (n, d) configurations.
+            first: number of the first image in the scene.
         """
         rows = [dict[str, Value]() for _ in u]
-        digits = self._digits(first, len(u))
-        for control, coordinates in zip(
-            self.space.controls, u.split(self.space.sizes, dim=1), strict=True
-        ):
-            if (type(control).describe, type(control).measured) == (
-                Control.describe,
-                Control.measured,
-            ):
-                for name, unit, column in self._by_column(control, coordinates, digits):
-                    for row, value in zip(rows, column, strict=True):
+        indices = self._axis_indices(first, len(u))
+        coordinates = u.split(self.space.sizes, dim=1)
+        for control, control_u in zip(self.space.controls, coordinates, strict=True):
+            if _is_described_by_base(control):
+                columns = self._describe_columns(control, control_u, indices)
+                for name, unit, values in columns:
+                    for row, value in zip(rows, values, strict=True):
                         row[name] = {"value": value, "unit": unit}
                 continue
-            moving = [
-                (number, axis)
-                for number, axis in self._axes.values()
-                if axis.instance == control.name
-            ]
-            for k, row in enumerate(rows):
-                places = [int(digits[number][k]) for number, _ in moving]
-                key = (control.name, *places)
-                described = self._described.get(key)
-                if described is None:
-                    whole = (
-                        self.space.describe(u[k], (control,))
-                        if control.refines
-                        else None
-                    )
-                    described = dict(
-                        control.describe(coordinates[k]) if whole is None else whole
-                    )
-                    for (_, axis), place in zip(moving, places, strict=True):
-                        described[axis.name] = {
-                            "value": axis.values[place],
-                            "unit": axis.unit,
-                        }
-                    # and of nothing else
-                    of_axes = not control.refines and len(moving) == len(control.groups)
-                    if of_axes and len(self._described) < MOST_KEPT:
-                        self._described[key] = described
-                row |= described
+            for image, row in enumerate(rows):
+                axis_points = self._find_axis_points(control, indices, image)
+                row |= self._describe_control(
+                    control, u[image], control_u[image], axis_points
+                )
         return rows
 
-    def _by_column(
-        self, control: Control, coordinates: Tensor, digits: Sequence[NDArray[np.intp]]
+    def _find_axis_points(
+        self, control: Control, indices: Sequence[NDArray[np.intp]], image: int
+    ) -> list[tuple[Axis, int]]:
+        """Return the axes of a control, with the index of the value in an image."""
+        return [
+            (axis, int(indices[axis_index][image]))
+            for axis_index, axis in self._axes.values()
+            if axis.instance == control.name
+        ]
+
+    def _describe_control(
+        self,
+        control: Control,
+        u: Tensor,
+        control_u: Tensor,
+        axis_points: Sequence[tuple[Axis, int]],
+    ) -> Mapping[str, Value]:
+        """Return the stored values of a control in one image.
+
+        Args:
+            control: which describes itself.
+            u: (d,) the configuration.
+            control_u: (k,) its coordinates of the control.
+            axis_points: the axes of the control, with the index of the value of each.
+        """
+        key = (control.name, *(index for _, index in axis_points))
+        cached = self._description_cache.get(key)
+        if cached is not None:
+            return cached
+        if control.refines:
+            description = dict(self.space.describe(u, (control,)))
+        else:
+            description = dict(control.describe(control_u))
+        for axis, index in axis_points:
+            description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
+        # Only a description that follows from the axes alone holds for other images.
+        is_of_axes = not control.refines and len(axis_points) == len(control.groups)
+        if is_of_axes and len(self._description_cache) < MAX_CACHED_DESCRIPTIONS:
+            self._description_cache[key] = description
+        return description
+
+    def _describe_columns(
+        self,
+        control: Control,
+        coordinates: Tensor,
+        indices: Sequence[NDArray[np.intp]],
     ) -> Iterator[tuple[str, str, list[Any]]]:
-        """Values of all configurations at once, parameter by parameter, with their
-        units: the same as `describe`, sixty times as fast.
+        """Yield name, unit and values (n,) of each parameter of a control.
+
+        The same as `describe` of each configuration, sixty times as fast.
+
+        Args:
+            control: which describes itself as `Control` does.
+            coordinates: (n, k) of the control.
+            indices: from `_axis_indices`.
         """
         begin = 0
         for group in control.groups:
@@ -588,36 +799,49 @@ class Points:
             columns = coordinates[:, begin : begin + group.size].T
             begin += group.size
             if name in self._axes:
-                number, axis = self._axes[name]
-                yield (
-                    name,
-                    axis.unit,
-                    [axis.values[place] for place in digits[number].tolist()],
-                )
+                axis_index, axis = self._axes[name]
+                points = indices[axis_index].tolist()
+                yield name, axis.unit, [axis.values[point] for point in points]
                 continue
-            parameter, spec = _spec(control, group.parameter)
-            for number, column in enumerate(columns):
+            parameter, spec = _find_spec(control, group.parameter)
+            unit = _stored_unit(parameter)
+            for component, column in enumerate(columns):
                 if isinstance(spec, OneOf):
-                    count = len(spec.values)
-                    values = [
-                        spec.values[min(count - 1, int(share * count))]
-                        for share in column.tolist()
-                    ]
-                    yield name, _unit(parameter), values
-                else:
-                    full = name + (f".{number}" if parameter.shape else "")
-                    yield (
-                        full,
-                        _unit(parameter),
-                        spec.at(column, log=parameter.log).tolist(),
-                    )
+                    yield name, unit, _select_options(spec, column)
+                    continue
+                suffix = f".{component}" if parameter.shape else ""
+                yield name + suffix, unit, spec.at(column, log=parameter.log).tolist()
 
 
-def _unit(parameter: Parameter) -> str:
+def _select_options(spec: OneOf, column: Tensor) -> list[Any]:
+    """Return the options that coordinates (n,) in [0, 1] stand for."""
+    count = len(spec.values)
+    return [
+        spec.values[min(count - 1, int(coordinate * count))]
+        for coordinate in column.tolist()
+    ]
+
+
+def _is_described_by_base(control: Control) -> bool:
+    """Return whether a control describes its values as the base class does."""
+    control_type = type(control)
+    return (
+        control_type.describe == Control.describe
+        and control_type.measured == Control.measured
+    )
+
+
+def _count_columns(blocks: Sequence[_SampledBlock]) -> int:
+    """Return how many numbers are drawn for blocks."""
+    return blocks[-1].columns.stop if blocks else 0
+
+
+def _stored_unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: Control, name: str) -> tuple[Parameter, Range | OneOf]:
+def _find_spec(bound: Control, name: str) -> tuple[Parameter, Range | OneOf]:
+    """Return a parameter of a bound control, and the range that it varies over."""
     slot = next(slot for slot in bound.slots if slot.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec

@@ -1,4 +1,4 @@
-"""`sweep`: the average case of a scene over a grid, over draws by chance, or both."""
+"""`sweep`: the average case of a scene over a grid, random draws, or both."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from advsearch.engine.loading import Controls, Scene, load_scene
 from advsearch.engine.naming import AnyModel, given_to, load_models, model_name
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
+from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.carry_out import LOADING, executor_for, is_named
@@ -61,8 +62,7 @@ from advsearch.tasks.together import each_thing
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-OUTER = ("object", "environment")
-OF_A_SCENE = (
+SCENE_SETTINGS = (
     "object",
     "environment",
     "up",
@@ -74,10 +74,9 @@ OF_A_SCENE = (
     "set_",
     "exposure",
 )
-"""Settings that a scene of the caller's own has."""
-WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"  # what a worker does
-# what the scene without the adversarial configuration of a run is called beside that
-# with it
+"""Settings that a scene has which the caller loaded."""
+WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
+# name of the scene without the adversarial configuration of a run
 CLEAN = "clean"
 AnyScene = Scene | str | Path
 
@@ -112,11 +111,11 @@ def sweep(
     progress: Watched = None,
     **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
-    """Render every configuration of a grid, and draws by chance, and say how often the
-    model is right.
+    """Measure how often the model is right over a grid, random draws, or both.
 
-    With `run` naming a sweep of the same settings that was stopped, it goes on where
-    that was stopped. All other arguments are the settings of `advsearch sweep`.
+    Every configuration is rendered and evaluated. With `run` naming a sweep of the same
+    settings that was stopped, it goes on where that was stopped. All other arguments
+    are the settings of `advsearch sweep`.
 
     Args:
         scene: from `load_scene`, or what that takes; or several. None takes that of
@@ -145,38 +144,103 @@ def sweep(
         run: folder to keep the run in; None keeps it in memory, which then grows with
             every configuration.
     """
-    options: dict[str, Any] = {
-        name: value for name, value in settings.items() if value is not None
-    }
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
-    if isinstance(adversarial_of, AttackResult):
-        if adversarial_of.run is None:
-            raise InputError(
-                "adversarial_of: expected an attack that was kept, got "
-                "one that was not; give it a `run`"
-            )
-        adversarial_of = adversarial_of.run
-    brought = dict[str, Any]()
-    if adversarial_of is not None:
-        file = find_run(str(adversarial_of)) / CONFIG
-        brought = SweepConfig.of_attack(file, {"grid": grid, "controls": controls})
-    if scene is None and not brought:
+    attack_run = _find_attack_run(adversarial_of)
+    defaults = _load_defaults(attack_run, scene, grid, controls)
+    scenes = _as_list(defaults["object"] if scene is None else scene)
+    default_model = defaults.get("model", "reference")
+    networks = _as_list(default_model if model is None else model)
+    controls = controls or defaults.get("controls", ())
+    if task == "classification":
+        task = defaults.get("task", task)
+    if callable(task):
+        task = make_task(task)
+    loaded = _name_loaded(scenes)
+    set_options: dict[str, Any] = {
+        name: value for name, value in settings.items() if value is not None
+    }
+    described: dict[str, object] = {
+        "model": ",".join(model_name(network) for network in networks),
+        "task": as_setting(task) if isinstance(task, Task) else task,
+        "controls": loading.settings_of(controls),
+        "grid": dict(grid or {}),
+        "samples": samples,
+        "adversarial_of": attack_run,
+        "metrics": judging.metrics_as_settings(metrics or {}),
+    }
+    if loaded:
+        naming.check_not_of_scene(set_options)
+    described |= _describe_scenes(scenes, loaded)
+    run_setting = {"run": None if run is None else str(run)}
+    config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
+    config = config.with_only_here(
+        _find_python_only(config, networks, loaded, task, tracker, controls)
+    )
+    _check_config(config)
+    progress = watcher(progress)
+    are_named = all(isinstance(network, (str, Path)) for network in networks)
+    has_objects = bool(loaded) or bool(loading.only_here(controls))
+    if has_objects or not are_named or isinstance(task, OwnTask):
+        naming.check_not_spread(set_options)
+    return _run_config(
+        config,
+        scenes=loaded,
+        models=networks,
+        task=task if isinstance(task, Task) else config.task,
+        controls=controls,
+        metrics=metrics,
+        tracker=tracker,
+        progress=progress,
+    )
+
+
+def _find_attack_run(
+    adversarial_of: str | Path | AttackResult | None,
+) -> str | Path | None:
+    """Return the run of an attack. Raises InputError: it was not kept in one."""
+    if not isinstance(adversarial_of, AttackResult):
+        return adversarial_of
+    if adversarial_of.run is None:
+        raise InputError(
+            "adversarial_of: expected an attack that was kept, got "
+            "one that was not; give it a `run`"
+        )
+    return adversarial_of.run
+
+
+def _load_defaults(
+    attack_run: str | Path | None, scene: object, grid: object, controls: object
+) -> dict[str, Any]:
+    """Return the settings that a sweep takes from the run of an attack.
+
+    Raises:
+        InputError: there is neither a scene nor a run.
+    """
+    defaults = dict[str, Any]()
+    if attack_run is not None:
+        file = find_run(str(attack_run)) / CONFIG
+        defaults = SweepConfig.of_attack(file, {"grid": grid, "controls": controls})
+    if scene is None and not defaults:
         raise InputError(
             "scene: expected what load_scene returns or takes, got nothing; name one"
         )
-    if scene is not None:
-        brought = {
-            name: value for name, value in brought.items() if name not in OF_A_SCENE
-        }
-    scenes = _several(brought["object"] if scene is None else scene)
-    networks = _several(brought.get("model", "reference") if model is None else model)
-    controls = controls or brought.get("controls", ())
-    task = brought.get("task", task) if task == "classification" else task
-    task = make_task(task) if callable(task) else task
+    if scene is None:
+        return defaults
+    return {
+        name: value for name, value in defaults.items() if name not in SCENE_SETTINGS
+    }
+
+
+def _name_loaded(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
+    """Return the scenes that are loaded: all of them or none.
+
+    Raises:
+        InputError: there are some of each.
+    """
     loaded = tuple(
         NamedScene(
             scene.description.object_name, scene.description.environment_name, scene
@@ -189,99 +253,133 @@ def sweep(
             "scene: expected scenes from load_scene or names of objects, "
             "got some of each"
         )
-    described: dict[str, object] = {
-        "model": ",".join(model_name(one) for one in networks),
-        "task": as_setting(task) if isinstance(task, Task) else task,
-        "controls": loading.settings_of(controls),
-        "grid": dict(grid or {}),
-        "samples": samples,
-        "adversarial_of": adversarial_of,
-        "metrics": judging.metrics_as_settings(metrics or {}),
-    }
-    if loaded:
-        naming.check_not_of_scene(options)
-        described |= loading.scene_as_settings(loaded[0].scene)
-        described |= {
-            what: ",".join(dict.fromkeys(getattr(place, what) for place in loaded))
-            for what in OUTER
-        }
-        described |= {"size": None, "set": {}} if len(loaded) > 1 else {}
-    else:
-        names = (
-            ",".join(split_names(one)) if isinstance(one, str) else str(one)
-            for one in scenes
-        )
-        described["object"] = ",".join(names)
-    config = SweepConfig(
-        **{**brought, **described, **options, "run": None if run is None else str(run)}
-    )
+    return loaded
+
+
+def _describe_scenes(
+    scenes: Sequence[Any], loaded: Sequence[NamedScene]
+) -> dict[str, object]:
+    """Return the settings that describe the scenes.
+
+    Args:
+        scenes: as they were passed.
+        loaded: those that are loaded: all of them or none.
+    """
+    if not loaded:
+        names = [
+            ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
+            for scene in scenes
+        ]
+        return {"object": ",".join(names)}
+    settings: dict[str, object] = dict(loading.scene_as_settings(loaded[0].scene))
+    for name in ("object", "environment"):
+        values = dict.fromkeys(getattr(scene, name) for scene in loaded)
+        settings[name] = ",".join(values)
+    if len(loaded) > 1:
+        settings |= {"size": None, "set": {}}
+    return settings
+
+
+def _find_python_only(
+    config: SweepConfig,
+    models: Sequence[AnyModel],
+    scenes: Sequence[NamedScene],
+    task: AnyTask,
+    tracker: object,
+    controls: Controls,
+) -> list[PythonOnly]:
+    """Return what exists in this session only, so that no command can repeat it."""
     parts = [
-        PythonOnly("model", model_name(one))
-        for one in networks
-        if naming.exists_here(one)
+        PythonOnly("model", model_name(model))
+        for model in models
+        if naming.exists_here(model)
     ]
-    parts += (
-        [PythonOnly("scene")] if any(place.scene.only_here for place in loaded) else []
-    )
-    parts += (
-        [PythonOnly("task", task.name)]
-        if isinstance(task, Task) and not is_named(task, make_task)
-        else []
-    )
+    if any(scene.scene.only_here for scene in scenes):
+        parts.append(PythonOnly("scene"))
+    if isinstance(task, Task) and not is_named(task, make_task):
+        parts.append(PythonOnly("task", task.name))
     parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
-    parts += [PythonOnly("tracker")] if tracker is not None else []
-    config = config.with_only_here(
-        [*parts, *(PythonOnly("control", name) for name in loading.only_here(controls))]
-    )
+    if tracker is not None:
+        parts.append(PythonOnly("tracker"))
+    parts += [PythonOnly("control", name) for name in loading.only_here(controls)]
+    return parts
+
+
+def _check_config(config: SweepConfig) -> None:
+    """Check that workers can load the metrics, and that files have a run directory.
+
+    Raises:
+        InputError: they cannot, or there is none.
+    """
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
-    for name, what in {
+    stored_things = {
         "keep_pictures": "them",
         "aov": "the layers",
         "surface": "the map",
-    }.items():
-        if config.run is None and getattr(config, name) not in ("none", None, False):
+    }
+    for name, thing in stored_things.items():
+        is_stored = getattr(config, name) not in ("none", None, False)
+        if config.run is None and is_stored:
             raise InputError(
                 f"{name}: expected `run` beside it, the folder that keeps "
-                f"{what}; name one"
+                f"{thing}; name one"
             )
-    progress = watcher(progress)
-    named = all(
-        isinstance(network, (str, Path)) for network in networks
-    ) and not isinstance(task, OwnTask)
-    if loaded or loading.only_here(controls) or not named:
-        naming.check_not_spread(options)
-    resumed = None  # or the folder of a sweep of the same settings that was stopped
-    if config.run is not None:
-        path = run_path(config.run)
-        recipe = run_path(config.run) / CONFIG
-        if not config.overwrite and is_run(path) and recipe.is_file():
-            before = SweepConfig.from_yaml(recipe, config.asked)
-            resumed = (
-                path
-                if before.plain() == config.to_repeat().plain() and not finished(path)
-                else None
-            )
-        if resumed is None:
-            check_free(config.run, overwrite=config.overwrite)
-    asked = task if isinstance(task, Task) else config.task
-    with (
-        begun(config)
-        if config.run is not None and resumed is None
-        else nullcontext(resumed) as begun_in
-    ):
-        job = _job(
-            config, loaded or _places(config), naming.several(networks), asked, controls
-        )
+
+
+def _run_config(
+    config: SweepConfig,
+    *,
+    scenes: tuple[NamedScene, ...],
+    models: Sequence[Any],
+    task: AnyTask,
+    controls: Controls,
+    metrics: Mapping[str, str | Metric] | None,
+    tracker: Callable[[], Step] | None,
+    progress: Progress,
+) -> SweepResult:
+    """Load and run a sweep, in its run directory if it has one.
+
+    Args:
+        config: the settings.
+        scenes: those that are loaded; none loads the ones that the settings name.
+        models: as the caller passed them, and so on.
+    """
+    resumed = _find_resumable(config)
+    if config.run is not None and resumed is None:
+        check_free(config.run, overwrite=config.overwrite)
+    context: Any = nullcontext(resumed)
+    if config.run is not None and resumed is None:
+        context = begun(config)
+    with context as directory:
+        named_scenes = scenes or _places(config)
+        job = _make_job(config, named_scenes, naming.several(models), task, controls)
         job = replace(
             job,
             metrics=load_metrics(config.metrics, metrics),
             tracker=tracker or job.tracker,
         )
         if config.run is not None:
-            return _kept(config, job, progress, begun_in)
+            return _run_in_directory(config, job, progress, directory)
         with executor_for(config, WORKER, progress) as executor:
             return Sweep(job, None, progress, executor).carry_out()
+
+
+def _find_resumable(config: SweepConfig) -> Path | None:
+    """Return the directory of a sweep of the same settings that was stopped.
+
+    None if there is no such sweep.
+    """
+    if config.run is None:
+        return None
+    path = run_path(config.run)
+    config_file = path / CONFIG
+    if config.overwrite or not is_run(path) or not config_file.is_file():
+        return None
+    stored = SweepConfig.from_yaml(config_file, config.asked)
+    if stored.plain() != config.to_repeat().plain() or finished(path):
+        return None
+    return path
 
 
 def sweep_from_config(
@@ -290,69 +388,94 @@ def sweep_from_config(
     progress: Progress | None = None,
     resumed: Path | None = None,
 ) -> SweepResult:
-    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
+    """Run the sweep that a configuration describes, in its run directory; see `sweep`.
+
+    Args:
+        config: the settings.
+        progress: None reports nothing.
+        resumed: the run directory, to continue a sweep that was stopped.
+    """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _kept(config, job_of(config), progress, resumed)
+    return _run_in_directory(config, job_of(config), progress, resumed)
 
 
-def _beside_adversarial(
+def _add_adversarial_arm(
     config: SweepConfig,
-    places: Sequence[NamedScene],
-    drawn: Sequence[Control],
+    named_scenes: Sequence[NamedScene],
+    sampled: Sequence[Control],
     axes: Sequence[Axis],
 ) -> tuple[NamedScene, ...]:
+    """Return the clean scenes, then the same with an adversarial configuration.
+
+    Without `adversarial_of` these are the scenes as they are.
+
+    Args:
+        config: the settings.
+        named_scenes: the scenes.
+        sampled: controls that are sampled.
+        axes: of the grid.
+
+    Raises:
+        InputError: the attack has no adversarial configuration, or what it sets varies.
+    """
     if config.adversarial_of is None:
-        return tuple(places)
-    folder = find_run(config.adversarial_of)
-    summary = attack_of(folder)
-    theirs = AttackConfig.from_yaml(folder / CONFIG)
+        return tuple(named_scenes)
+    directory = find_run(config.adversarial_of)
+    summary = attack_of(directory)
+    attack_config = AttackConfig.from_yaml(directory / CONFIG)
     if summary.adversarial is None:
         raise InputError(
-            f"adversarial_of: {folder} ended with {summary.ending!r}, so that there is "
-            "no adversarial configuration "
+            f"adversarial_of: {directory} ended with {summary.ending!r}, so that there "
+            "is no adversarial configuration "
             "to sweep"
         )
-    held = given_to(theirs, theirs.controls)
-    varied = {control.name for control in drawn} | {axis.instance for axis in axes}
-    if twice := sorted(varied & {control.name for control in held}):
+    held = given_to(attack_config, attack_config.controls)
+    varied_names = {control.name for control in sampled}
+    varied_names |= {axis.instance for axis in axes}
+    held_names = {control.name for control in held}
+    clashes = sorted(varied_names & held_names)
+    if clashes:
         raise InputError(
-            f"adversarial_of: the adversarial configuration of {folder} sets "
-            f"{twice[0]}, so it can't vary; leave it "
+            f"adversarial_of: the adversarial configuration of {directory} sets "
+            f"{clashes[0]}, so it can't vary; leave it "
             "out of `grid` and `controls`"
         )
-    u = torch.from_numpy(read_configuration(folder))
-    name = folder.resolve().name
-    clean = [replace(place, held=held, beside_clean=CLEAN) for place in places]
-    return (
-        *clean,
-        *(
-            replace(place, u=u, beside_clean=f"{name}'s" if name == CLEAN else name)
-            for place in clean
-        ),
-    )
+    u = torch.from_numpy(read_configuration(directory))
+    name = directory.resolve().name
+    if name == CLEAN:
+        name = f"{name}'s"
+    clean = [
+        replace(named_scene, held=held, beside_clean=CLEAN)
+        for named_scene in named_scenes
+    ]
+    adversarial = [
+        replace(named_scene, u=u, beside_clean=name) for named_scene in clean
+    ]
+    return (*clean, *adversarial)
 
 
-def _several(given: Any) -> list[Any]:
-    listed = list(given) if isinstance(given, (list, tuple)) else [given]
-    if not listed:
+def _as_list(value: Any) -> list[Any]:
+    """Return scenes or models as a list. Raises InputError: there is none."""
+    values = list(value) if isinstance(value, (list, tuple)) else [value]
+    if not values:
         raise InputError(
             "scene and model: expected at least one of each, got an empty list"
         )
-    return listed
+    return values
 
 
 def job_of(config: SweepConfig) -> Job:
-    job = _job(config, _places(config), config.models, config.task, config.controls)
+    """Load everything that a configuration names."""
+    named_scenes = _places(config)
+    job = _make_job(config, named_scenes, config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
 
 
 def scenes_of(config: SweepConfig) -> OpenScenes:
-    """Return what renders pictures of a sweep again; everything that it names is looked
-    at first.
-    """
+    """Return what renders images of a sweep again, after checking all that it names."""
     job = job_of(config)
     check_all(job)
     return OpenScenes(job)
@@ -362,55 +485,101 @@ def row_parameters(config: SweepConfig) -> set[str]:
     """Load everything that a sweep names, and return the parameters of its rows."""
     job = scenes_of(config).job
     space = job.space(job.places[0], job.sizes[0])
-    halfway = torch.full_like(space.start, 0.5)
-    return {name for u in (space.start, halfway) for name in space.describe(u)}
+    middle = torch.full_like(space.start, 0.5)
+    # A choice may describe other parameters than another one.
+    return {name for u in (space.start, middle) for name in space.describe(u)}
 
 
-def _job(
+def _make_job(
     config: SweepConfig,
-    places: Sequence[NamedScene],
+    named_scenes: Sequence[NamedScene],
     models: Sequence[AnyModel],
     task: AnyTask,
     controls: Controls,
 ) -> Job:
-    # where no control does, one is added
-    travels = ("path", "shutter", "rolling") if config.path is not None else ()
-    naming.check_run_settings(config.model_copy(update=dict.fromkeys(travels)))
-    drawn = given_to(config, controls)
+    """Load models and tasks, and check that they can be swept over these scenes.
+
+    Args:
+        config: the settings.
+        named_scenes: the clean scenes.
+        models: names, files or modules.
+        task: of all models.
+        controls: which are sampled.
+
+    Raises:
+        InputError: something in the settings does not fit together.
+    """
+    # A control that travels along the path is added where none does.
+    travel_settings = ("path", "shutter", "rolling") if config.path is not None else ()
+    naming.check_run_settings(config.model_copy(update=dict.fromkeys(travel_settings)))
+    sampled = given_to(config, controls)
     grid = config.grid
     if config.path is not None:
-        drawn, grid = with_frames(config, drawn)
-    axes = read_axes(grid, drawn)
-    if config.samples is not None and not drawn:
+        sampled, grid = with_frames(config, sampled)
+    axes = read_axes(grid, sampled)
+    if config.samples is not None and not sampled:
         raise InputError(
             "samples: expected `controls` beside it, which says what is drawn by "
             "chance; add `controls=pose`, say, or "
             "leave `samples` out"
         )
-    if not axes and not drawn and len(places) * len(models) == 1:
+    if not axes and not sampled and len(named_scenes) * len(models) == 1:
         raise InputError(
             "grid: expected something that varies, got nothing; add an axis such as "
             "`grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
         )
-    places = _beside_adversarial(config, places, drawn, axes)
-    check_scenes(places, drawn, axes)
-    sized = all(place.scene.description.object.metres is not None for place in places)
-    axes = tuple(
-        replace(one, parameter=measured_in(one.parameter, sized))
-        if one.control == CameraControl.kind
-        else one
-        for one in axes
+    named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
+    check_scenes(named_scenes, sampled, axes)
+    axes = _with_camera_units(axes, named_scenes)
+    networks, tasks, warnings = _load_models_and_tasks(
+        config, named_scenes, models, task
     )
-    made = make_task(task)
+    warnings += _find_scene_notes(named_scenes, sampled, axes)
+    job = Job(config, named_scenes, networks, tasks, sampled, axes, aovs_of(config.aov))
+    for named_scene in named_scenes:
+        warnings += job.space(named_scene, job.sizes[0]).notes(
+            named_scene.scene.description
+        )
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
+
+
+def _with_camera_units(
+    axes: Sequence[Axis], named_scenes: Sequence[NamedScene]
+) -> tuple[Axis, ...]:
+    """Return the axes, those of cameras in metres if all objects have a size."""
+    are_sized = all(
+        named_scene.scene.description.object.metres is not None
+        for named_scene in named_scenes
+    )
+    return tuple(
+        replace(axis, parameter=measured_in(axis.parameter, are_sized))
+        if axis.control == CameraControl.kind
+        else axis
+        for axis in axes
+    )
+
+
+def _load_models_and_tasks(
+    config: SweepConfig,
+    named_scenes: Sequence[NamedScene],
+    models: Sequence[AnyModel],
+    task: AnyTask,
+) -> tuple[tuple[Model, ...], tuple[Task, ...], list[str]]:
+    """Load the models, and make a task for each.
+
+    Returns:
+        The models, the tasks, and remarks on both.
+    """
+    shared_task = make_task(task)
     _check_different([model_name(model) for model in models])
-    networks, warnings = load_models(models, made, config)
-    # what a file or a function gives may have another's name
-    _check_different([model.name for model in networks])
-    scenes = [place.scene for place in places]
+    networks, warnings = load_models(models, shared_task, config)
+    # A file or a function may return a model that has the name of another one.
+    _check_different([network.name for network in networks])
+    scenes = [named_scene.scene for named_scene in named_scenes]
     tasks = tuple(
         judging.calibrate_task(
-            made.on(network),
+            shared_task.on(network),
             network,
             scenes,
             config.label,
@@ -419,45 +588,61 @@ def _job(
         )
         for network in networks
     )
-    warnings += [remark for task in tasks for remark in task.remarks]
-    tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
-    own = {place.object: place.scene.description.object.label for place in places}
-    warnings += judging.one_label_for_several(networks, config.label, own)
-    for place in places:
-        described = place.scene.description
-        for control in on_grid(drawn, axes, described):
-            described = (
-                control.prepare(described) if control.kind == ENVIRONMENT else described
-            )
-        warnings += described.notes
-    job = Job(config, tuple(places), networks, tasks, drawn, axes, aovs_of(config.aov))
-    for place in places:
-        warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
-    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
+    warnings += [remark for network_task in tasks for remark in network_task.remarks]
+    if config.judge == ALL:
+        tasks = tuple(map(each_thing, tasks))
+    labels = {
+        named_scene.object: named_scene.scene.description.object.label
+        for named_scene in named_scenes
+    }
+    warnings += judging.one_label_for_several(networks, config.label, labels)
+    return networks, tasks, warnings
+
+
+def _find_scene_notes(
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
+) -> list[str]:
+    """Return the notes on the scenes, with the environments that controls choose."""
+    notes = list[str]()
+    for named_scene in named_scenes:
+        description = named_scene.scene.description
+        for control in on_grid(controls, axes, description):
+            if control.kind == ENVIRONMENT:
+                description = control.prepare(description)
+        notes += description.notes
+    return notes
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
+    """Load the scenes of a configuration: every object in every environment.
+
+    A scene that a Python caller passed is returned as it is.
+    """
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:
         return (NamedScene(config.object, passed.description.environment_name, passed),)
     objects = naming.different(config.objects, "object")
     environments = naming.different(config.environments, "environment")
-    asked = environments[0] if config.environment else None
-    scenes = {name: naming.scene_of(config, name, asked) for name in objects}
-    if asked is None:
+    first_environment = environments[0] if config.environment else None
+    scenes = {
+        name: naming.scene_of(config, name, first_environment) for name in objects
+    }
+    if first_environment is None:
         return tuple(
             NamedScene(name, scene.description.environment_name, scene)
             for name, scene in scenes.items()
         )
-    lights = {asked: scenes[objects[0]].description.environment}
+    first_scene = scenes[objects[0]].description
+    maps = {first_environment: first_scene.environment}
     for name in environments[1:]:
-        lights[name] = load_scene(
-            scenes[objects[0]].description.object, name
-        ).description.environment
+        scene = load_scene(first_scene.object, name)
+        maps[name] = scene.description.environment
     return tuple(
-        NamedScene(name, light, scenes[name].lit_by(lights[light]))
+        NamedScene(name, environment, scenes[name].lit_by(maps[environment]))
         for name in objects
-        for light in lights
+        for environment in maps
     )
 
 
@@ -470,20 +655,26 @@ def _check_different(names: Sequence[str]) -> None:
         )
 
 
-def _kept(
+def _run_in_directory(
     config: SweepConfig, job: Job, progress: Progress, resumed: Path | None
 ) -> SweepResult:
+    """Run a sweep in its run directory, or continue it in the one of before."""
     with (
         RunDirectory.of(config, resumed) as run,
         executor_for(config, WORKER, progress) as executor,
     ):
-        functions = {f"metric {name}": one for name, one in job.metrics.items()}
-        check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
+        functions: dict[str, Callable[..., Any] | None] = {
+            f"metric {name}": function for name, function in job.metrics.items()
+        }
+        functions["task"] = function_of(job.tasks[0])
+        check_made_of(run, job.models, functions)
         return Sweep(job, run, progress, executor).carry_out()
 
 
 def sweep_worker(settings: JsonObject) -> Call:
-    """Return what evaluates the queries of the sweep that the settings describe: what a
-    worker does.
+    """Return the function by which a worker evaluates queries of a sweep.
+
+    Args:
+        settings: of the sweep.
     """
     return worker_call(OpenScenes(job_of(SweepConfig(**settings))).named)

@@ -1,10 +1,9 @@
-"""What is shown and claimed of the result of `sweep`: shares, drives, the surface, and
-from how far away it is seen.
+"""The view and the claims of the result of `sweep`.
 
-How far away a detector sees an object is the distance at which half of a sweep's
-pictures show it: where the falling line through the shares (isotonic regression, Ayer
-et al. 1955, linear in the logarithm of the distance) crosses one half. Its interval is
-exact: each of m shares is judged by the binomial test of one half at 0.025 / m on each
+The *detection distance* of an object is the distance at which half of a sweep's images
+show it: where the falling line through the fractions (isotonic regression, Ayer et al.
+1955, linear in the logarithm of the distance) crosses one half. Its interval is exact:
+each of m fractions is compared with one half by the binomial test at 0.025 / m on each
 side.
 """
 
@@ -17,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advsearch.errors import InputError
 from advsearch.options import Outcome
@@ -25,6 +25,7 @@ from advsearch.questions.sweep.summary import (
     AxisRow,
     DriveRates,
     OverDrives,
+    PairedRates,
     SurfaceMap,
     SurfacePart,
     SweepMap,
@@ -65,94 +66,104 @@ from advsearch.runs.results import INTERRUPTED, CountedPredictions
 from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
-# ---- The figure of a sweep: a map over two axes, or the accuracy over the only one
-# ----------------------------------
-
-MOST_TICKS = 16  # values of an axis that are written
+MAX_TICKS = 16  # values of an axis that have a label
 
 
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
-    """Return width and height of a sweep's figure in inches, with room for the names of
-    a map's values, those below aslant where they are long; None where there is neither
-    a map nor one axis.
+    """Return width and height of a sweep's figure in inches.
+
+    A map has room for the names of its values, with long ones below aslant. None if
+    there is neither a map nor a single axis.
     """
     if not summary.cells:
         return (5.6, 3.6) if _only_axis(summary) else None
-    (wide, below), (high, beside) = (
-        (min(len(axis.values), MOST_TICKS), max(map(len, _ticks(axis.values)[1])))
-        for axis in summary.cells.axes
-    )
-    aslant = below if _long(summary.cells.axes[0].values) else 0
-    return 3.2 + 0.34 * wide + 0.09 * max(
-        beside - 8, aslant - 8, 0
-    ), 1.8 + 0.3 * high + 0.065 * max(aslant - 8, 0)
+    x_axis, y_axis = summary.cells.axes
+    n_columns = min(len(x_axis.values), MAX_TICKS)
+    n_rows = min(len(y_axis.values), MAX_TICKS)
+    aslant_length = 0
+    if _are_long(x_axis.values):
+        aslant_length = _longest_label(x_axis.values)
+    left_length = _longest_label(y_axis.values)
+    # characters that a figure of the usual size has room for
+    extra_left = max(left_length - 8, aslant_length - 8, 0)
+    extra_below = max(aslant_length - 8, 0)
+    width = 3.2 + 0.34 * n_columns + 0.09 * extra_left
+    height = 1.8 + 0.3 * n_rows + 0.065 * extra_below
+    return width, height
+
+
+def _longest_label(values: Sequence[Any]) -> int:
+    return max(map(len, _ticks(values)[1]))
 
 
 def sweep_figure(summary: SweepSummary) -> Figures:
-    """Draw a sweep: a map over two axes, or the accuracy over the only one; nothing
-    where there is none.
+    """Draw a sweep: a map over two axes, or the accuracy over the only one.
 
-    A cell shows the accuracy there; where no cell has more than one configuration, the
-    margin.
+    A cell shows the accuracy there; if no cell has more than one configuration, the
+    margin. Nothing is drawn if there is neither.
     """
     size = figure_size(summary)
-    return (
-        {} if size is None else figure_of(lambda axes: sweep_axes(summary, axes), size)
-    )
+    if size is None:
+        return {}
+    return figure_of(lambda axes: sweep_axes(summary, axes), size)
 
 
 def sweep_axes(summary: SweepSummary, axes: Any) -> None:
-    """Draw a sweep on matplotlib axes, as `sweep_figure` does; nothing where there is
-    neither a map nor one axis.
-    """
+    """Draw a sweep on matplotlib axes, as `sweep_figure` does."""
     if summary.cells:
-        _cells(axes, summary, summary.cells)
+        _draw_map(axes, summary, summary.cells)
     elif _only_axis(summary):
-        _along(axes, summary, _only_axis(summary))
+        _draw_accuracy(axes, summary, _only_axis(summary))
 
 
 def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
-    """The values of the only axis of a sweep; none where there are more, or too many
-    values.
+    """Return the values of the only axis of a sweep.
+
+    There are none if it has more axes, or too many values. Axes with listed values go
+    before those with parts of a range.
     """
-    rows = [
-        row for row in summary.axes if not isinstance(row.value, (list, tuple))
-    ] or summary.axes
-    return (
-        rows
-        if len({row.axis for row in rows}) == 1 and len(rows) <= MOST_POINTS
-        else ()
+    rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
+    rows = rows or summary.axes
+    names = {row.axis for row in rows}
+    return rows if len(names) == 1 and len(rows) <= MOST_POINTS else ()
+
+
+def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
+    """Draw the map of a sweep on matplotlib axes."""
+    x_axis, y_axis = cells.axes
+    extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
+    counts = np.array(cells.configurations, dtype=float)
+    if counts.max() > 1:
+        measure = ACCURACY
+        no_values = np.full(counts.shape, np.nan)
+        values = np.divide(cells.correct, counts, out=no_values, where=counts > 0)
+    else:
+        measure = MARGIN
+        values = np.array(cells.margin, dtype=float)
+    heat(
+        axes,
+        values.tolist(),
+        extent,
+        measure,
+        axis_title(x_axis.axis, x_axis.unit),
+        axis_title(y_axis.axis, y_axis.unit),
     )
+    rotation = 45 if _are_long(x_axis.values) else 0
+    axes.set_xticks(*_ticks(x_axis.values), rotation=rotation)
+    axes.set_yticks(*_ticks(y_axis.values))
+    title = _subject(summary)
+    n_more_axes = len(cells.over)
+    if n_more_axes:
+        title += f", over {n_more_axes} more {'axes' if n_more_axes > 1 else 'axis'}"
+    axes.set_title(title)
 
 
-def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
-    first, second = cells.axes
-    seen = cells.configurations
-    correct = cells.correct
-    margin = cells.margin
-    extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
-    labels = axis_title(first.axis, first.unit), axis_title(second.axis, second.unit)
-    several = max(map(max, seen)) > 1
-    counts = np.array(seen, dtype=float)
-    values = np.array(margin, dtype=float)
-    if several:
-        values = np.divide(
-            correct, counts, out=np.full(counts.shape, np.nan), where=counts > 0
-        )
-    heat(axes, values.tolist(), extent, ACCURACY if several else MARGIN, *labels)
-    axes.set_xticks(*_ticks(first.values), rotation=45 if _long(first.values) else 0)
-    axes.set_yticks(*_ticks(second.values))
-    more = len(cells.over)
-    over = f", over {more} more {'axes' if more > 1 else 'axis'}" if more else ""
-    axes.set_title(f"{_who(summary)}{over}")
-
-
-def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    at = range(len(rows))
-    accuracy = [row.accuracy for row in rows]
-    # of one draw there is none
+def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
+    """Draw the accuracy at each value of an axis, with intervals, on matplotlib axes."""
+    values = [row.value for row in rows]
+    # A single draw has no interval.
     intervals = [
-        (place, *row.interval) for place, row in enumerate(rows) if row.interval
+        (index, *row.interval) for index, row in enumerate(rows) if row.interval
     ]
     if intervals:
         axes.vlines(
@@ -162,58 +173,61 @@ def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
             linewidth=5,
             label="95 % interval",
         )
-    axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
-    axes.set_xticks(
-        *_ticks([row.value for row in rows]),
-        rotation=45 if _long([r.value for r in rows]) else 0,
-    )
+    accuracy = [row.accuracy for row in rows]
+    axes.plot(range(len(rows)), accuracy, "o", color=BLUE, label="accuracy")
+    axes.set_xticks(*_ticks(values), rotation=45 if _are_long(values) else 0)
     axes.set(
         xlabel=axis_title(rows[0].axis, rows[0].unit),
         ylabel="accuracy",
         ylim=(-0.03, 1.03),
     )
     axes.margins(x=0.08)
-    axes.set_title(_who(summary))
+    axes.set_title(_subject(summary))
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
 
 def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
-    def name(value: Any) -> str:
-        if isinstance(value, (list, tuple)):
-            return " to ".join(f"{end:.3g}" for end in value)
-        return short_name(value) if isinstance(value, str) else f"{value:.4g}"
-
-    places = list(range(0, len(values), -(-len(values) // MOST_TICKS)))
-    return places, [name(values[place]) for place in places]
+    """Return the indices of the values of an axis that are labelled, and the labels."""
+    step = math.ceil(len(values) / MAX_TICKS)
+    indices = list(range(0, len(values), step))
+    return indices, [_tick_label(values[index]) for index in indices]
 
 
-def _who(summary: SweepSummary) -> str:
-    return ", ".join(
-        short_name(name)
-        for name in (*split_names(summary.object), *split_names(summary.model))
-    )
+def _tick_label(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return " to ".join(f"{bound:.3g}" for bound in value)
+    return short_name(value) if isinstance(value, str) else f"{value:.4g}"
 
 
-def _long(values: Sequence[Any]) -> bool:
-    return sum(len(text) + 1 for text in _ticks(values)[1]) > 50
+def _subject(summary: SweepSummary) -> str:
+    """Return the names of the objects and the models."""
+    names = (*split_names(summary.object), *split_names(summary.model))
+    return ", ".join(map(short_name, names))
+
+
+def _are_long(values: Sequence[Any]) -> bool:
+    """Return whether the labels of an axis are too long to stand side by side."""
+    return sum(len(label) + 1 for label in _ticks(values)[1]) > 50
 
 
 READING = (
     "How often it is right at each value, over all others, with the 95 % interval:"
 )
-BAR = 20  # width of a bar in characters
-# values of an axis that are all shown; of more, half as many: those where the model
-# does worst
-MOST_ROWS = 24
-MOST_LISTED = 96  # values of an axis that a page lists as a table; of more, none
+BAR_LENGTH = 20  # in characters
+# values of an axis that a text lists; of more, half as many: those where the model is
+# worst
+MAX_TEXT_ROWS = 24
+MAX_PAGE_ROWS = 96  # values of an axis that a page lists as a table; of more, none
 
 
-def _difference(part: SurfacePart) -> str:
+def _difference_text(part: SurfacePart) -> str:
     low, high = part.interval
-    # none where pictures share draws
-    interval = f" ({low:+.0%} to {high:+.0%})" if low == low else ""
-    return f"{part.difference:+.0%}{interval}".replace("%", " %")
+    difference = f"{part.difference:+.0%}"
+    has_interval = not math.isnan(low)  # images that share draws have none
+    if has_interval:
+        difference += f" ({low:+.0%} to {high:+.0%})"
+    return difference.replace("%", " %")
 
 
 AXIS_COLUMNS: dict[str, Column] = {
@@ -226,160 +240,177 @@ AXIS_COLUMNS: dict[str, Column] = {
     "accuracy": lambda row: percent(row.accuracy),
     "95 % interval": lambda row: wording.interval_text(row.interval),
 }
-CHANGED = "Shown again, changed:"
+CHANGES_TITLE = "Shown again, changed:"
 CHANGE_COLUMNS: dict[str, Column] = {
     "model": "{0.model}",
-    "what it says": lambda one: one.claim.replace("_", " "),
-    "when": lambda one: (BLIND | HARMLESS)[one.when],
+    "what it says": lambda rates: rates.claim.replace("_", " "),
+    "when": lambda rates: (BLIND | HARMLESS)[rates.when],
     "as claimed": "{0.correct} of {0.configurations}",
-    "95 % interval": lambda one: wording.interval_text(one.interval),
+    "95 % interval": lambda rates: wording.interval_text(rates.interval),
 }
 SURFACE_COLUMNS: dict[str, Column] = {
     "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
-    "place (x, y, z)": lambda one: ", ".join(f"{x:.3g}" for x in one.place),
+    "place (x, y, z)": lambda part: ", ".join(f"{x:.3g}" for x in part.place),
     "face": "{0.face}",
-    "wrong where seen": lambda one: wrong_text(one.seen),
-    "wrong where not": lambda one: wrong_text(one.hidden),
-    "difference": _difference,
+    "wrong where seen": lambda part: wrong_text(part.seen),
+    "wrong where not": lambda part: wrong_text(part.hidden),
+    "difference": _difference_text,
     "p": "{0.p:.2g}",
 }
 
 
 def shown(summary: SweepSummary) -> ShownResult:
-    sections = list[ResultPart]()
-    if summary.beside is not None and summary.ending != INTERRUPTED:
-        for pair in summary.beside.pairs:
-            sides = (("clean", pair.clean), (summary.beside.answer, pair.answer))
-            rows = [
-                [
-                    name,
-                    f"right in {side.correct} of {side.configurations}",
-                    *_share(side),
-                ]
-                for name, side in sides
-            ]
-            if any(side.outcomes for _, side in sides):
-                outcomes = [
-                    wording.outcomes_text(side.outcomes, summary.task)
-                    for _, side in sides
-                ]
-                rows = [[*row, text] for row, text in zip(rows, outcomes, strict=True)]
-            sections.append(ResultPart(rows=rows))
-    if far := distance_of(summary):
-        sections.append(ResultPart(text=[distance_sentence(far)]))
-    sections += [
-        ResultPart(drive_title(rates), heads=DRIVE_HEADS, rows=drive_rows(rates))
-        for rates in summary.drives or ()
-    ]
-    sections.append(
-        ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGED)
-    )
-    axes: dict[str, list[AxisRow]] = {}
-    for row in summary.axes:
-        axes.setdefault(row.axis, []).append(row)
-    if axes.keys() - {"answer"}:
-        both = (
-            "Of the clean scene and the adversarial one together: "
-            f"{READING[0].lower()}{READING[1:]}"
-        )
-        sections.append(ResultPart(text=[both if summary.beside else READING]))
-        sections += [
-            _table(name, rows, summary.task)
-            for name, rows in axes.items()
-            if name != "answer"
-        ]
-    if summary.surface is not None:
-        said = "\n".join(surface_sentences(summary.surface))
-        sections.append(
-            ResultPart("What is seen of the surface when the model is wrong:", [said])
-        )
-    if (size := figure_size(summary)) is not None:
+    """Return the view of a sweep."""
+    axes = _group_axes(summary)
+    sections = [*_text_sections(summary, axes)]
+    size = figure_size(summary)
+    if size is not None:
         sections.append(
             ResultPart(
                 draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"
             )
         )
     sections += (replace(part, only="page") for part in _page_parts(summary, axes))
-    configuration = there = ""
-    if (worst := summary.worst) is not None:
-        outer = [
-            name for name in ("object", "environment", "model") if name in worst.values
-        ]
-        named = [short_name(worst.values[name].value) for name in outer]
-        values = {
-            name: wording.value_text(one.value)
-            for name, one in worst.values.items()
-            if name not in outer
-        }
-        configuration = ", ".join(
-            [*named, *(f"{name} {value}" for name, value in values.items())]
-        )
-        rate = (
-            f"wrong in {wording.rate_text(worst.verified)}"
-            if worst.verified
-            else "not verified"
-        )
-        margin = f"margin ({margin_text(summary.task)}) {worst.claimed.margin:.3g}"
-        there = (
-            f"prediction {prediction_text(summary.task, worst.claimed)}; "
-            f"{margin}; "
-            f"{rate}"
-        )
+    run_images = f"{summary.run}/images"
+    has_drive_file = bool(summary.drives and summary.run)
     facts = {
-        "worst": configuration,
-        "there": there,
+        "worst": _worst_configuration(summary),
+        "there": _worst_prediction(summary),
         "renders": str(summary.renders["sweep"]),
-        "worst drive": f"{summary.run}/images/drive.webp"
-        if summary.drives and summary.run
-        else "",
-        "map of the surface": f"{summary.run}/images/surface.png"
-        if summary.surface
-        else "",
+        "worst drive": f"{run_images}/drive.webp" if has_drive_file else "",
+        "map of the surface": f"{run_images}/surface.png" if summary.surface else "",
     }
-    counted = summary.configurations > 0
-    ended_early = (
-        not summary.out_of_view if not counted else summary.looked_at < summary.planned
-    )
+    if summary.configurations > 0:
+        ended_early = summary.looked_at < summary.planned
+    else:
+        ended_early = not summary.out_of_view
     return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
+
+
+def _group_axes(summary: SweepSummary) -> dict[str, list[AxisRow]]:
+    """Return the rows of each axis by its name."""
+    axes: dict[str, list[AxisRow]] = {}
+    for row in summary.axes:
+        axes.setdefault(row.axis, []).append(row)
+    return axes
+
+
+def _text_sections(
+    summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]
+) -> Iterator[ResultPart]:
+    """Yield the sections of text and tables.
+
+    Args:
+        summary: of the sweep.
+        axes: from `_group_axes`.
+    """
+    if summary.beside is not None and summary.ending != INTERRUPTED:
+        for pair in summary.beside.pairs:
+            yield _arms_table(summary.beside.answer, pair, summary.task)
+    distance = distance_of(summary)
+    if distance:
+        yield ResultPart(text=[distance_sentence(distance)])
+    for rates in summary.drives or ():
+        yield ResultPart(drive_title(rates), heads=DRIVE_HEADS, rows=drive_rows(rates))
+    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE)
+    if axes.keys() - {"answer"}:
+        introduction = READING
+        if summary.beside:
+            introduction = (
+                "Of the clean scene and the adversarial one together: "
+                f"{READING[0].lower()}{READING[1:]}"
+            )
+        yield ResultPart(text=[introduction])
+        for name, rows in axes.items():
+            if name != "answer":
+                yield _axis_table(name, rows, summary.task)
+    if summary.surface is not None:
+        sentences = "\n".join(surface_sentences(summary.surface))
+        title = "What is seen of the surface when the model is wrong:"
+        yield ResultPart(title, [sentences])
+
+
+def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
+    """Return a table of one model without and with an adversarial configuration.
+
+    Args:
+        answer: name of the adversarial run.
+        pair: of the model.
+        task: its name.
+    """
+    arms = (("clean", pair.clean), (answer, pair.answer))
+    has_outcomes = any(counts.outcomes for _, counts in arms)
+    rows = []
+    for name, counts in arms:
+        right = f"right in {counts.correct} of {counts.configurations}"
+        row = [name, right, *_accuracy_cells(counts)]
+        if has_outcomes:
+            row.append(wording.outcomes_text(counts.outcomes, task))
+        rows.append(row)
+    return ResultPart(rows=rows)
+
+
+def _worst_configuration(summary: SweepSummary) -> str:
+    """Return the names and values of the worst configuration; empty without one."""
+    if summary.worst is None:
+        return ""
+    values = summary.worst.values
+    outside = [name for name in ("object", "environment", "model") if name in values]
+    texts = [short_name(values[name].value) for name in outside]
+    for name, described in values.items():
+        if name not in outside:
+            texts.append(f"{name} {wording.value_text(described.value)}")
+    return ", ".join(texts)
+
+
+def _worst_prediction(summary: SweepSummary) -> str:
+    """Return what the model predicts of the worst configuration; empty without one."""
+    worst = summary.worst
+    if worst is None:
+        return ""
+    verified = "not verified"
+    if worst.verified:
+        verified = f"wrong in {wording.rate_text(worst.verified)}"
+    margin = f"margin ({margin_text(summary.task)}) {worst.claimed.margin:.3g}"
+    prediction = prediction_text(summary.task, worst.claimed)
+    return f"prediction {prediction}; {margin}; {verified}"
 
 
 def _page_parts(
     summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]
 ) -> Iterator[ResultPart]:
-    """What a page shows beside its explorer: from how far away, whole drives, the
-    surface, and each axis in numbers.
+    """Yield what a page shows besides its explorer.
+
+    These are the detection distance, full drives, the surface, and each axis in
+    numbers.
+
+    Args:
+        summary: of the sweep.
+        axes: from `_group_axes`.
     """
-    if far := distance_of(summary):
-        said = distance_sentence(far)
+    distance = distance_of(summary)
+    if distance:
+        sentence = distance_sentence(distance)
         yield ResultPart(
             "How far away it is seen",
-            [said],
-            draw=partial(distance_axes, far),
-            note=said,
+            [sentence],
+            draw=partial(distance_axes, distance),
+            note=sentence,
         )
-    for number, one in enumerate(summary.drives or ()):
-        title, figure = (
-            ("Whole drives", "images/drive.png") if number == 0 else ("", "")
-        )
+    for index, rates in enumerate(summary.drives or ()):
+        is_first = index == 0
         yield ResultPart(
-            title,
-            [drive_title(one)],
+            "Whole drives" if is_first else "",
+            [drive_title(rates)],
             heads=DRIVE_HEADS,
-            rows=drive_rows(one),
-            figure=figure,
+            rows=drive_rows(rates),
+            figure="images/drive.png" if is_first else "",
         )
-    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGED)
+    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE)
     if summary.surface is not None:
-        text = [" ".join(surface_sentences(summary.surface))]
-        yield ResultPart("The surface that was seen", text, figure="images/surface.png")
-        for table in (one for one in summary.surface.tables if one.strongest):
-            who = f"{short_name(table.object)}, {short_name(table.model)}"
-            title = f"{who}: the {table.part}s that are told most clearly"
-            yield ResultPart.table(
-                table.strongest, SURFACE_COLUMNS, title=title, folded=True
-            )
+        yield from _surface_parts(summary.surface)
     for name, rows in axes.items():
-        if len(rows) <= MOST_LISTED:
+        if len(rows) <= MAX_PAGE_ROWS:
             columns = dict(AXIS_COLUMNS)
             if any(row.outcomes for row in rows):
                 columns["the others"] = lambda row: wording.outcomes_text(
@@ -390,62 +421,82 @@ def _page_parts(
             )
 
 
+def _surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
+    """Yield what a page shows of the surface."""
+    text = " ".join(surface_sentences(surface))
+    title = "The surface that was seen"
+    yield ResultPart(title, [text], figure="images/surface.png")
+    for table in surface.tables:
+        if table.strongest:
+            names = f"{short_name(table.object)}, {short_name(table.model)}"
+            title = f"{names}: the {table.part}s that are told most clearly"
+            yield ResultPart.table(
+                table.strongest, SURFACE_COLUMNS, title=title, folded=True
+            )
+
+
 def _verdict(summary: SweepSummary) -> str:
-    seen = summary.configurations
-    correct = summary.correct
-    if summary.out_of_view and not seen:
-        return "The object is in no picture."
-    if not seen:
+    """Return the result in a sentence or two."""
+    if not summary.configurations:
+        if summary.out_of_view:
+            return "The object is in no picture."
         return "Interrupted before the first configuration."
     rate = rate_text(summary)
+    outcomes = outcomes_clause(summary)
     if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
-        looked_at = f"{summary.looked_at} of {summary.planned} configurations"
         return (
-            f"Interrupted after {looked_at}: right in {correct} "
-            f"({rate}){outcomes_clause(summary)}."
+            f"Interrupted after {summary.looked_at} of {summary.planned} "
+            f"configurations: right in {summary.correct} ({rate}){outcomes}."
         )
     if summary.beside and summary.beside.pairs:
         return " ".join(
             beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs
         )
-    outcomes = outcomes_clause(summary)
+    configurations = count(summary.configurations, "configuration")
     return (
-        f"The model is right in {correct} of {count(seen, 'configuration')} "
+        f"The model is right in {summary.correct} of {configurations} "
         f"({rate}){of_grid(summary)}{outcomes}."
     )
 
 
 def outcomes_clause(summary: SweepSummary) -> str:
-    """Return what becomes of the object in the other configurations, as the end of a
-    sentence; empty where only a prediction is known.
+    """Return the outcomes of wrong predictions, as the end of a sentence.
+
+    Empty if only a prediction is known.
     """
     text = wording.outcomes_text(summary.outcomes, summary.task)
     return f"; of the others, {text}" if text else ""
 
 
 def of_grid(summary: SweepSummary) -> str:
-    """Return what has to be said of the share over a grid, where nothing is drawn."""
-    return (
-        ""
-        if summary.sampler is not None or not summary.grid
-        else " of this grid; another has another share"
-    )
+    """Return the caution about an accuracy over a grid, where nothing is sampled."""
+    if summary.sampler is not None or not summary.grid:
+        return ""
+    return " of this grid; another has another share"
 
 
-def _share(counts: CountedPredictions) -> tuple[str, str]:
+def _accuracy_cells(counts: CountedPredictions) -> tuple[str, str]:
     return percent(counts.accuracy), wording.interval_text(counts.interval)
 
 
-def _table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
+def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
+    """Return a table of the accuracy by the values of an axis, with bars.
+
+    Args:
+        name: of the axis.
+        rows: its values; of very many, only the worst are listed.
+        task: name of the task.
+    """
+    title = name
+    if rows[0].unit not in ("", "name", "1"):
+        title += f", {rows[0].unit}"
     listed = list(rows)
-    title = name + (
-        f", {rows[0].unit}" if rows[0].unit not in ("", "name", "1") else ""
-    )
-    if len(rows) > MOST_ROWS:
-        worst = sorted(
-            range(len(rows)), key=lambda number: rows[number].accuracy or 0.0
-        )[: MOST_ROWS // 2]
-        listed = [rows[number] for number in sorted(worst)]
+    if len(rows) > MAX_TEXT_ROWS:
+        by_accuracy = sorted(
+            range(len(rows)), key=lambda index: rows[index].accuracy or 0.0
+        )
+        worst = by_accuracy[: MAX_TEXT_ROWS // 2]
+        listed = [rows[index] for index in sorted(worst)]
         title += (
             f" (the {len(listed)} of {len(rows)} values where the model is right "
             "least often)"
@@ -453,151 +504,174 @@ def _table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
-        bar = ("#" * round((row.accuracy or 0.0) * BAR)).ljust(BAR, ".")
-        share, interval = _share(row)
+        bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
+        accuracy, interval = _accuracy_cells(row)
         cells = [
             wording.value_text(row.value),
-            bar,
-            share,
+            bar.ljust(BAR_LENGTH, "."),
+            accuracy,
             f"{row.correct} of {row.configurations}",
             interval,
         ]
-        lines.append(
-            [*cells, wording.outcomes_text(row.outcomes, task)]
-            if has_outcomes
-            else cells
-        )
+        if has_outcomes:
+            cells.append(wording.outcomes_text(row.outcomes, task))
+        lines.append(cells)
     return ResultPart(title, rows=lines)
 
 
 def claims(result: SweepSummary) -> Iterator[Claim]:
-    """Yield the share of right predictions, and how often the worst of the
-    configurations is wrong.
+    """Yield what a finished sweep measured.
+
+    That is the fraction of right predictions, the detection distance, the rates over
+    drives, and how often the worst of the configurations is wrong.
     """
     if result.accuracy is None or result.ending != "finished":
         return
-    thing = (
-        f"frames of {result.drives[0].drives} drives"
-        if result.drives
-        else "configurations"
-    )
-    how = f"{thing} drawn by chance from the ranges that are named"
-    note = ""
+    population, note = _describe_population(result)
+    if result.beside:
+        for pair in result.beside.pairs:
+            yield from _arm_claims(result.beside.answer, pair, population, note)
+        if result.beside.pairs:
+            return
+    yield from _accuracy_claims(result, population, note)
+    distance = distance_of(result)
+    if distance:
+        yield claim("measured", distance_sentence(distance), None)
+    for rates in result.drives or ():
+        heads = "mean, with its interval over drives, then the worst drive"
+        values = "; ".join(_drive_row_text(*row) for row in drive_rows(rates))
+        yield claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
+    verified = result.worst.verified if result.worst else None
+    if verified is not None:
+        yield claim(
+            "measured",
+            "In the worst of these configurations the model is wrong in "
+            f"{wording.rate_text(verified)}. No search looked for a worse one.",
+            extent_of("wrong", verified),
+        )
+
+
+def _describe_population(result: SweepSummary) -> tuple[str, str]:
+    """Return what the rates of a sweep are over, and a caution about the interval."""
+    configurations = "configurations"
+    if result.drives:
+        configurations = f"frames of {result.drives[0].drives} drives"
     if result.sampler is None and not result.grid:
-        how = thing
-        note = (
+        return configurations, (
             " How these were chosen is not known; the interval takes them as a sample."
         )
-    elif result.sampler is None:
-        how = (
-            "points of the grid"
-            if not result.drives
-            else (f"{thing}, whose ways and moments are given")
-        )
-        note = (
+    if result.sampler is None:
+        points = "points of the grid"
+        if result.drives:
+            points = f"{configurations}, whose ways and moments are given"
+        return points, (
             " Nothing is said of what lies between or beside these points, and another "
             "grid gives another share; the "
             "interval takes them as a sample."
         )
-    elif (
-        result.drives
-    ):  # the frames are the grid, and what a drive has besides is drawn
-        how = (
-            f"{thing}; what else differs between drives is drawn at random "
+    if result.drives:
+        # The frames are the grid; what else differs between drives is sampled.
+        sampled_drives = (
+            f"{configurations}; what else differs between drives is drawn at random "
             f"({result.sampler})"
         )
-        note = " The interval is over drives, as if these were independent." * (
-            result.sampler != "random"
-        )
-    elif result.sampler != "random" or result.grid:
-        how = f"configurations drawn at random ({result.sampler})" + (
-            " at each point of a grid" * bool(result.grid)
-        )
+        note = ""
+        if result.sampler != "random":
+            note = " The interval is over drives, as if these were independent."
+        return sampled_drives, note
+    if result.sampler != "random" or result.grid:
+        sampled = f"configurations drawn at random ({result.sampler})"
+        if result.grid:
+            sampled += " at each point of a grid"
         note = " The interval is that of independent draws, which these are not."
-    if result.beside:
-        for pair in result.beside.pairs:  # the share of both together is of neither
-            adversarial = f"the adversarial scene of {result.beside.answer}"
-            for what, counts in (
-                ("the clean scene", pair.clean),
-                (adversarial, pair.answer),
-            ):
-                own = _extent(
-                    f"configurations of {what} in which {pair.model} is right", counts
-                )
-                yield claim(
-                    "measured",
-                    f"With {what} {pair.model} is right in "
-                    f"{share_text(own)} {how}.{note}",
-                    own,
-                )
-            yield claim("measured", beside_text(result.beside.answer, pair), None)
-    if result.beside and result.beside.pairs:
-        return
-    several = {
-        name: sum(row.axis == name for row in result.axes)
-        for name in ("object", "environment")
+        return sampled, note
+    return f"{configurations} drawn by chance from the ranges that are named", ""
+
+
+def _arm_claims(
+    answer: str, pair: PairedRates, population: str, note: str
+) -> Iterator[Claim]:
+    """Yield the accuracy without and with an adversarial configuration.
+
+    Args:
+        answer: name of the adversarial run.
+        pair: of one model.
+        population: what the rates are over.
+        note: a caution about the interval.
+    """
+    arms = {
+        "the clean scene": pair.clean,
+        f"the adversarial scene of {answer}": pair.answer,
     }
-    # which are not drawn
-    each = [
-        f"each of the {count} {name}s" for name, count in several.items() if count > 1
-    ]
-    how += f", as many in {' and '.join(each)}" if each else ""
-    # models are shown the same pictures, so that predictions of several are not
-    # independent
-    models: dict[str, CountedPredictions] = {
+    for arm, counts in arms.items():
+        extent = _accuracy_extent(
+            f"configurations of {arm} in which {pair.model} is right", counts
+        )
+        accuracy = share_text(extent)
+        yield claim(
+            "measured",
+            f"With {arm} {pair.model} is right in {accuracy} {population}.{note}",
+            extent,
+        )
+    yield claim("measured", beside_text(answer, pair), None)
+
+
+def _accuracy_claims(
+    result: SweepSummary, population: str, note: str
+) -> Iterator[Claim]:
+    """Yield the accuracy of each model.
+
+    Args:
+        result: of the sweep.
+        population: what the rates are over.
+        note: a caution about the interval.
+    """
+    # Objects and environments are not sampled.
+    fixed = list[str]()
+    for name in ("object", "environment"):
+        n_values = sum(row.axis == name for row in result.axes)
+        if n_values > 1:
+            fixed.append(f"each of the {n_values} {name}s")
+    if fixed:
+        population += f", as many in {' and '.join(fixed)}"
+    counts_by_model: dict[str, CountedPredictions] = {
         f"The model {row.value}": row for row in result.axes if row.axis == "model"
     }
-    for who, counts in (
-        models
-        if len(split_names(result.model)) > 1 and models
-        else {"The model": result}
-    ).items():
-        extent = _extent("configurations in which the model is right", counts)
+    # Models get the same images, so that predictions of several are not independent.
+    if len(split_names(result.model)) <= 1 or not counts_by_model:
+        counts_by_model = {"The model": result}
+    for model, counts in counts_by_model.items():
+        extent = _accuracy_extent("configurations in which the model is right", counts)
         outcomes = wording.outcomes_text(counts.outcomes, result.task)
         others = f" Of the others: {outcomes}." if outcomes else ""
         yield claim(
             "measured",
-            f"{who} is right in {share_text(extent)} {how}.{others}{note}",
+            f"{model} is right in {share_text(extent)} {population}.{others}{note}",
             extent,
         )
-    if far := distance_of(result):
-        yield claim("measured", distance_sentence(far), None)
-    for drive in result.drives or ():
-        told = [
-            f"{name}: {mean}{'' if ends == '-' else f' (95 % interval {ends})'}, "
-            f"{least}"
-            for name, mean, ends, least in drive_rows(drive)
-        ]
-        heads = "mean, with its interval over drives, then the worst drive"
-        yield claim(
-            "measured", f"{drive_title(drive)} ({heads}): {'; '.join(told)}.", None
-        )
-    worst = result.worst.verified if result.worst else None
-    if worst is not None:
-        text = (
-            "In the worst of these configurations the model is wrong in "
-            f"{wording.rate_text(worst)}."
-        )
-        yield claim(
-            "measured",
-            f"{text} No search looked for a worse one.",
-            extent_of("wrong", worst),
-        )
 
 
-def _extent(what: str, counts: CountedPredictions) -> Extent:
+def _drive_row_text(name: str, mean: str, interval: str, worst: str) -> str:
+    """Return a row of `drive_rows` as a clause."""
+    interval_text = "" if interval == "-" else f" (95 % interval {interval})"
+    return f"{name}: {mean}{interval_text}, {worst}"
+
+
+def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
     return counted(
-        what, counts.correct, counts.configurations, counts.interval, counts.accuracy
+        description,
+        counts.correct,
+        counts.configurations,
+        counts.interval,
+        counts.accuracy,
     )
 
 
-DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")  # what stands above the rows
+DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
 
 
 def rate_text(summary: SweepSummary) -> str:
-    """Return the share of right predictions with its interval, and what that is over
-    where there are drives.
-    """
+    """Return the accuracy with its interval, and whether that is over drives."""
     over = ", over drives" if summary.drives else ""
     return (
         f"{percent(summary.accuracy)}, 95 % interval "
@@ -605,115 +679,117 @@ def rate_text(summary: SweepSummary) -> str:
     )
 
 
-def drive_title(one: DriveRates) -> str:
-    repeats = f", {one.repeats} times each with other noise" if one.repeats > 1 else ""
-    what = (
-        f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} "
-        f"s{repeats}, {one.model}"
+def drive_title(rates: DriveRates) -> str:
+    """Return how many drives there are, of how many frames, and the model."""
+    repeats = (
+        f", {rates.repeats} times each with other noise" if rates.repeats > 1 else ""
     )
-    return what if one.answer is None else f"{what}, with {one.answer}"
+    title = (
+        f"{count(rates.drives, 'drive')} of {rates.frames} frames in {rates.seconds:g} "
+        f"s{repeats}, {rates.model}"
+    )
+    return title if rates.answer is None else f"{title}, with {rates.answer}"
 
 
-def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
-    tracks = one.tracks
-    never = f", never in {one.never_seen}" if one.never_seen else ""
-    told: list[tuple[str, OverDrives | None, str, str]] = [
-        ("frames in which it is right", one.right, " %", ""),
-        ("first right at a distance of", one.first_seen, f" {one.unit}", never),
-        ("longest gap", one.longest_gap, " s", ""),
-        ("changes a second", one.flicker, "", ""),
-        ("frames without its track", tracks.lost if tracks else None, " %", ""),
+def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
+    """Return the rates over drives: name, mean, 95 % interval and worst drive."""
+    tracks = drive_rates.tracks
+    never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
+    rates: list[tuple[str, OverDrives | None, str, str]] = [
+        ("frames in which it is right", drive_rates.right, " %", ""),
         (
-            "frames with a loose track instead",
-            tracks.loose if tracks else None,
-            " %",
-            "",
+            "first right at a distance of",
+            drive_rates.first_seen,
+            f" {drive_rates.unit}",
+            never,
         ),
-        ("identity switches", tracks.switches if tracks else None, "", ""),
-        ("longest gap of its track", tracks.longest_gap if tracks else None, " s", ""),
+        ("longest gap", drive_rates.longest_gap, " s", ""),
+        ("changes a second", drive_rates.flicker, "", ""),
     ]
+    if tracks is not None:
+        rates += [
+            ("frames without its track", tracks.lost, " %", ""),
+            ("frames with a loose track instead", tracks.loose, " %", ""),
+            ("identity switches", tracks.switches, "", ""),
+            ("longest gap of its track", tracks.longest_gap, " s", ""),
+        ]
     rows = []
-    for name, number, unit, more in told:
-        if number is not None:
-            factor = 100.0 if unit == " %" else 1.0
-            (low, high) = number.interval or (0.0, 0.0)
-            interval = (
-                f"{low * factor:.3g} to {high * factor:.3g}{unit}"
-                if number.interval
-                else "-"
-            )
-            rows.append(
-                (
-                    name,
-                    f"{number.mean * factor:.3g}{unit}{more}",
-                    interval,
-                    f"{number.worst * factor:.3g}{unit}",
-                )
-            )
+    for name, value, unit, remark in rates:
+        if value is None:
+            continue
+        factor = 100.0 if unit == " %" else 1.0
+        interval = "-"
+        if value.interval:
+            low, high = value.interval
+            interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
+        mean = f"{value.mean * factor:.3g}{unit}{remark}"
+        worst = f"{value.worst * factor:.3g}{unit}"
+        rows.append((name, mean, interval, worst))
     return rows
 
 
 def surface_sentences(surface: SurfaceMap) -> list[str]:
+    """Return which cells of each surface go with wrong predictions, in a sentence."""
     sentences = []
-    for table in (table for table in surface.tables if table.part == "cell"):
+    for table in surface.tables:
+        if table.part != "cell":
+            continue
         cells = count(table.compared, table.part)
-        least = surface.least
-        said = (
-            f"of {cells} that were compared, {table.worse} go with wrong "
-            f"predictions and {table.better} with right"
-        )
-        said += " ones."
         if not table.compared:
-            said = (
-                f"no {table.part} was seen in {least} pictures and hidden in as "
-                "many, so nothing is compared."
+            text = (
+                f"no {table.part} was seen in {surface.least} pictures and hidden in "
+                "as many, so nothing is compared."
             )
         elif not table.worse + table.better:
-            said = f"none of {cells} that were compared is told from chance."
-        elif table.strongest:
-            first = table.strongest[0]
-            said += (
-                f" The clearest, at u {first.u:.2f} and v {first.v:.2f}: wrong in "
-                f"{wrong_text(first.seen)} that see"
+            text = f"none of {cells} that were compared is told from chance."
+        else:
+            text = (
+                f"of {cells} that were compared, {table.worse} go with wrong "
+                f"predictions and {table.better} with right ones."
             )
-            said += f" it, {wrong_text(first.hidden)} that do not."
-        sentences.append(
-            f"{short_name(table.object)}, {short_name(table.model)}: {said}"
-        )
+            if table.strongest:
+                first = table.strongest[0]
+                text += (
+                    f" The clearest, at u {first.u:.2f} and v {first.v:.2f}: wrong in "
+                    f"{wrong_text(first.seen)} that see it, "
+                    f"{wrong_text(first.hidden)} that do not."
+                )
+        names = f"{short_name(table.object)}, {short_name(table.model)}"
+        sentences.append(f"{names}: {text}")
     return sentences
 
 
-def wrong_text(counted: CountedPredictions) -> str:
-    return f"{counted.configurations - counted.correct} of {counted.configurations}"
+def wrong_text(counts: CountedPredictions) -> str:
+    n_wrong = counts.configurations - counts.correct
+    return f"{n_wrong} of {counts.configurations}"
 
 
-DISTANCE = "camera.distance"  # the axis
+DISTANCE = "camera.distance"  # name of the axis
 HALF = 0.5
 
 
 @dataclass(frozen=True)
 class SeenFrom:
-    """The distance at which an object is first seen by somebody who comes nearer.
+    """The distance at which an object is first detected by a camera that comes nearer.
 
     Attributes:
         unit: "metres" or "object sizes".
-        distances: (m,) at which there are pictures, the nearest first.
-        shares: (m,) of the pictures that are right.
+        distances: (m,) at which there are images, the nearest first.
+        shares: (m,) of the images that are right.
         intervals: (m,) theirs, 95 %.
-        distance: the estimate; None where it is seen at all distances, or at none. Of a
-            share that does not fall with the distance the last one: beyond the dips
-            that are shown.
-        low: lower end of its interval; None where pictures do not bound it.
-        high: upper end, likewise.
-        lacking: how many pictures at a distance any bound takes, where none has so
-            many.
-        loose: (m,) pictures in which a loose box is on it, which are not right, and no
-            misses either; empty where nothing is known of them.
-        counts: (m,) pictures.
-        dips: distances at which it is seen less often than beyond them, the nearest
+        distance: the estimate; None if it is detected at all distances, or at none. If
+            the fraction does not fall with the distance, the last one: beyond the dips
+            that are not chance.
+        low: lower bound of its interval; None if images do not bound it.
+        high: upper bound, likewise.
+        lacking: how many images at a distance any bound takes, if none has as many.
+        loose: (m,) images in which a loose box is on it, which count neither as right
+            nor as missed; empty if that is not known.
+        counts: (m,) images.
+        dips: distances at which it is detected less often than beyond them, the nearest
             first.
-        everywhere: whether the falling line nowhere crosses one half, for it is seen in
-            that much at all distances.
+        everywhere: whether the falling line nowhere crosses one half, because it is
+            detected in that many images at all distances.
     """
 
     unit: str
@@ -731,193 +807,239 @@ class SeenFrom:
 
     @property
     def is_monotone(self) -> bool:
-        """Whether no dip is shown."""
+        """Whether all dips may be chance."""
         return not any(dip.is_shown for dip in self.dips)
 
 
 def distance_of(summary: SweepSummary) -> SeenFrom | None:
-    """Return how far away one model sees one object; None where the sweep does not
-    tell.
+    """Return how far away a detector sees an object.
+
+    None if the sweep does not measure it: one model, one object, several distances and
+    independent images are needed.
     """
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
-    several = (
-        "," in summary.object or "," in summary.model or summary.beside is not None
+    is_detection = summary.task.partition("=")[0] == "detection"
+    is_single = (
+        "," not in summary.object
+        and "," not in summary.model
+        and summary.beside is None
     )
-    # frames of a drive are not independent, nor are samples of a point where nothing is
-    # drawn
-    several = several or summary.drives is not None or summary.units is not None
-    known = (
-        summary.task.partition("=")[0] == "detection" and len(rows) > 1 and not several
-    )
-    return seen_from(rows) if known else None
+    # Frames of a drive are not independent, nor are samples of a point where nothing is
+    # sampled.
+    are_independent = summary.drives is None and summary.units is None
+    if not (is_detection and is_single and are_independent and len(rows) > 1):
+        return None
+    return seen_from(rows)
 
 
 def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
-    """Return the distance at which an object is first seen, from the rows of one axis:
-    a distance, or both ends of a range of it, and the counts there. Raises InputError
-    where there are fewer than two distances.
-    """
-    from scipy.special import bdtr, bdtrc  # takes a tenth of a second
+    """Compute the distance at which an object is first detected.
 
+    Args:
+        rows: counts by a distance, or by the bounds of a range of it.
+
+    Raises:
+        InputError: there are fewer than two distances.
+    """
     if len(rows) < 2:
         raise InputError(
             "detection distance: expected at least two distances, got "
             f"{len(rows)}; sweep over more"
         )
-    middles = [
-        math.sqrt(math.prod(row.value))
-        if isinstance(row.value, tuple)
-        else float(row.value)
-        for row in rows
-    ]
-    distances, rows = zip(
-        *sorted(zip(middles, rows, strict=True), key=lambda pair: pair[0]), strict=True
-    )
-    at, k, n = (
-        np.array(column)
-        for column in (
-            distances,
-            [r.correct for r in rows],
-            [r.configurations for r in rows],
-        )
-    )
-    chance = 0.025 / len(rows)
-    low = max(at[bdtrc(k - 1.0, n, HALF) < chance], default=None)
-    high = min(
-        at[(bdtr(k * 1.0, n, HALF) < chance) & (at > (low or 0.0))], default=None
-    )
+    rows = sorted(rows, key=_center_distance)
+    distances = tuple(_center_distance(row) for row in rows)
+    k = np.array([row.correct for row in rows])
+    n = np.array([row.configurations for row in rows])
+    # of a binomial test on each side, at one of the distances
+    significance = 0.025 / len(rows)
+    low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
+    # The line is fitted beyond the last dip that is not chance.
     first = max(
         (distances.index(dip.distance) + 1 for dip in dips if dip.is_shown), default=0
     )
-    least = math.floor(-math.log2(chance)) + 1
-    outcomes = [getattr(row, "outcomes", None) or {} for row in rows]
     falling = _fit_falling(k[first:], n[first:])
-    crosses = bool(falling[0] >= HALF > falling[-1])
+    min_images = math.floor(-math.log2(significance)) + 1
     return SeenFrom(
         unit=rows[0].unit,
         distances=distances,
         shares=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
-        distance=float(np.exp(np.interp(-HALF, -falling, np.log(at[first:]))))
-        if crosses
-        else None,
-        low=None if low is None else float(low),
-        high=None if high is None else float(high),
-        lacking=None if (n >= least).any() else least,
-        loose=tuple(one.get(Outcome.LOOSE.value, 0) for one in outcomes)
-        if any(outcomes)
-        else (),
+        distance=_find_crossing(np.array(distances[first:]), falling),
+        low=low,
+        high=high,
+        lacking=None if (n >= min_images).any() else min_images,
+        loose=_count_loose(rows),
         counts=tuple(n.tolist()),
         dips=dips,
         everywhere=bool(falling[-1] >= HALF),
     )
 
 
-def distance_sentence(found: SeenFrom) -> str:
-    """Say it: "Seen from 38 m, 31 to 44 m ...", then what contradicts it, and the loose
-    boxes.
+def _bound_distance(
+    distance: NDArray[np.float64],
+    k: NDArray[np.int64],
+    n: NDArray[np.int64],
+    significance: float,
+) -> tuple[float | None, float | None]:
+    """Return the bounds of the detection distance; None if images do not bound it.
+
+    Args:
+        distance: (m,) ascending.
+        k: (m,) images that are right.
+        n: (m,) images.
+        significance: of a one-sided binomial test of one half.
     """
-    unit = "m" if found.unit == "metres" else found.unit
-    low, high, distance = (
-        None if number is None else f"{number:.3g}"
-        for number in (found.low, found.high, found.distance)
-    )
-    ends = "no bound"
-    if low and high:
-        ends = f"{low} to {high} {unit}"
-    elif low or high:
-        ends = f"at least {low} {unit}" if low else f"at most {high} {unit}"
-    what = f"{ends} with 95 % confidence"
-    what += (
-        ""
-        if found.lacking is None
-        else (f" (that takes at least {found.lacking} pictures at each distance)")
-    )
-    dips = _dips_sentences(found, unit)
-    loose = _loose_sentence(found, unit)
-    if not found.is_monotone:
-        beyond = "Beyond that it is right in less than half of the pictures"
+    from scipy.special import bdtr, bdtrc  # takes a tenth of a second
+
+    is_above_half = bdtrc(k - 1.0, n, HALF) < significance
+    is_below_half = bdtr(k * 1.0, n, HALF) < significance
+    low = max(distance[is_above_half], default=None)
+    is_beyond_low = distance > (low or 0.0)
+    high = min(distance[is_below_half & is_beyond_low], default=None)
+    return None if low is None else float(low), None if high is None else float(high)
+
+
+def _find_crossing(
+    distance: NDArray[np.float64], falling: NDArray[np.float64]
+) -> float | None:
+    """Return where a falling line crosses one half; None if it does not.
+
+    Args:
+        distance: (m,) ascending; the line is linear in its logarithm.
+        falling: (m,) the line.
+    """
+    if not falling[0] >= HALF > falling[-1]:
+        return None
+    return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
+
+
+def _center_distance(row: AxisRow) -> float:
+    """Return the distance of a row; of a range its center, in logarithms."""
+    if isinstance(row.value, tuple):
+        return math.sqrt(math.prod(row.value))
+    return float(row.value)
+
+
+def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
+    """Return the loose boxes of each row; empty if no outcome is known."""
+    outcomes = [getattr(row, "outcomes", None) or {} for row in rows]
+    if not any(outcomes):
+        return ()
+    return tuple(counts.get(Outcome.LOOSE.value, 0) for counts in outcomes)
+
+
+def distance_sentence(estimate: SeenFrom) -> str:
+    """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
+
+    Dips, which contradict it, and loose boxes follow.
+    """
+    unit = "m" if estimate.unit == "metres" else estimate.unit
+    distance = None if estimate.distance is None else f"{estimate.distance:.3g}"
+    interval = _interval_clause(estimate, unit)
+    dips = _dips_sentences(estimate, unit)
+    loose = _loose_sentence(estimate, unit)
+    farthest = f"{estimate.distances[-1]:.3g} {unit}"
+    if not estimate.is_monotone:
         if distance is not None:
             beyond = f"Beyond that the share falls below a half at {distance} {unit}"
-        elif found.everywhere:
+        elif estimate.everywhere:
             beyond = (
                 "Beyond that it is right in at least half of the pictures, up to "
-                f"{found.distances[-1]:.3g} {unit}"
+                f"{farthest}"
             )
-        return " ".join(filter(None, [*dips, f"{beyond}; {what}.", loose]))
+        else:
+            beyond = "Beyond that it is right in less than half of the pictures"
+        return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
     if distance is not None:
-        said = f"Seen from {distance} {unit} in half of the pictures, {what}."
-    elif found.everywhere:
-        farthest = f"{found.distances[-1]:.3g} {unit}"
-        said = (
+        sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
+    elif estimate.everywhere:
+        sentence = (
             "Seen in at least half of the pictures up to the farthest distance, "
-            f"{farthest}; {what}."
+            f"{farthest}; {interval}."
         )
     else:
-        said = (
-            f"Not seen in half of the pictures, even from {found.distances[0]:.3g} "
-            f"{unit}; {what}."
+        sentence = (
+            f"Not seen in half of the pictures, even from {estimate.distances[0]:.3g} "
+            f"{unit}; {interval}."
         )
-    return " ".join(filter(None, [said, *dips, loose]))
+    return " ".join(filter(None, [sentence, *dips, loose]))
 
 
-def _dips_sentences(found: SeenFrom, unit: str) -> list[str]:
-    """Say where it is seen less often than beyond: what is shown, or else the deepest
-    of what may be chance.
+def _interval_clause(estimate: SeenFrom, unit: str) -> str:
+    """Return the interval of the detection distance."""
+    low = None if estimate.low is None else f"{estimate.low:.3g}"
+    high = None if estimate.high is None else f"{estimate.high:.3g}"
+    if low and high:
+        bounds = f"{low} to {high} {unit}"
+    elif low:
+        bounds = f"at least {low} {unit}"
+    elif high:
+        bounds = f"at most {high} {unit}"
+    else:
+        bounds = "no bound"
+    clause = f"{bounds} with 95 % confidence"
+    if estimate.lacking is not None:
+        clause += f" (that takes at least {estimate.lacking} pictures at each distance)"
+    return clause
+
+
+def _dips_sentences(estimate: SeenFrom, unit: str) -> list[str]:
+    """Return where an object is detected less often than beyond.
+
+    All dips that are not chance, or else the deepest of those that may be.
     """
-
-    def text(dip: Dip) -> str:
-        here = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
-        beyond = (
-            f"{dip.beyond[0]} of {dip.beyond[1]} beyond it up to {dip.until:.3g} {unit}"
-        )
-        return f"{here}, {beyond} (p = {dip.p:.2g})"
-
-    shown = [dip for dip in found.dips if dip.is_shown]
-    if shown:
-        return [
-            "No one distance from which on it is seen: right in "
-            f"{'; '.join(map(text, shown))}."
-        ]
-    until = found.distances[-1] if found.everywhere else found.distance or 0.0
+    proven = [dip for dip in estimate.dips if dip.is_shown]
+    if proven:
+        clauses = "; ".join(_dip_clause(dip, unit) for dip in proven)
+        return [f"No one distance from which on it is seen: right in {clauses}."]
+    until = estimate.distances[-1] if estimate.everywhere else estimate.distance or 0.0
     below_half = [
         dip
-        for dip in found.dips
+        for dip in estimate.dips
         if dip.seen[0] < HALF * dip.seen[1]
         # a rise beyond the estimate counts too
         and (dip.distance < until or dip.beyond[0] >= HALF * dip.beyond[1])
     ]
     if not below_half:
         return []
-    deepest = min(below_half, key=lambda dip: dip.p)
-    return [f"Nearer it is right less often: in {text(deepest)}, which may be chance."]
+    deepest = _dip_clause(min(below_half, key=lambda dip: dip.p), unit)
+    return [f"Nearer it is right less often: in {deepest}, which may be chance."]
 
 
-def _loose_sentence(found: SeenFrom, unit: str) -> str:
-    """Say in how many pictures a loose box is on it, and at which distances; empty
-    where nothing is known of it.
+def _dip_clause(dip: Dip, unit: str) -> str:
+    at_dip = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
+    beyond = (
+        f"{dip.beyond[0]} of {dip.beyond[1]} beyond it up to {dip.until:.3g} {unit}"
+    )
+    return f"{at_dip}, {beyond} (p = {dip.p:.2g})"
+
+
+def _loose_sentence(estimate: SeenFrom, unit: str) -> str:
+    """Return in how many images a loose box is on the object, by distance.
+
+    Empty if there is none.
     """
-    total = sum(found.loose)
-    if not total:
+    if not sum(estimate.loose):
         return ""
-    each = zip(found.distances, found.loose, found.counts, strict=True)
-    listed = [
-        f"{loose} of {count} at {at:.3g} {unit}" for at, loose, count in each if loose
+    clauses = [
+        f"{n_loose} of {n_images} at {distance:.3g} {unit}"
+        for distance, n_loose, n_images in zip(
+            estimate.distances, estimate.loose, estimate.counts, strict=True
+        )
+        if n_loose
     ]
     return (
         "Not counted as seen, but not missed either, are loose boxes: "
-        f"{', '.join(listed)}."
+        f"{', '.join(clauses)}."
     )
 
 
-def distance_axes(found: SeenFrom, axes: Any) -> None:
-    """Draw the share of pictures in which it is seen over the distance on matplotlib
-    axes, with intervals.
-    """
-    low, high = zip(*found.intervals, strict=True)
+def distance_axes(estimate: SeenFrom, axes: Any) -> None:
+    """Draw the fraction of detections over the distance on matplotlib axes."""
+    low, high = zip(*estimate.intervals, strict=True)
     axes.fill_between(
-        found.distances,
+        estimate.distances,
         low,
         high,
         color=BLUE,
@@ -925,27 +1047,29 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
         linewidth=0,
         label="95 % interval",
     )
-    axes.plot(found.distances, found.shares, color=BLUE, marker="o", label="seen in")
-    if any(found.loose):
-        or_loosely = [
-            share + loose / count
-            for share, loose, count in zip(
-                found.shares, found.loose, found.counts, strict=True
+    axes.plot(
+        estimate.distances, estimate.shares, color=BLUE, marker="o", label="seen in"
+    )
+    if any(estimate.loose):
+        with_loose = [
+            fraction + n_loose / n_images
+            for fraction, n_loose, n_images in zip(
+                estimate.shares, estimate.loose, estimate.counts, strict=True
             )
         ]
         axes.plot(
-            found.distances,
-            or_loosely,
+            estimate.distances,
+            with_loose,
             color=GREY,
             marker=".",
             linestyle=":",
             label="or in a loose box",
         )
     axes.axhline(HALF, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
-    if found.distance is not None:
-        axes.axvline(found.distance, color=GREY, linewidth=1)
+    if estimate.distance is not None:
+        axes.axvline(estimate.distance, color=GREY, linewidth=1)
     axes.set(
-        xlabel=f"distance ({found.unit})",
+        xlabel=f"distance ({estimate.unit})",
         ylabel="share of pictures",
         ylim=(-0.02, 1.02),
     )

@@ -1,15 +1,17 @@
-"""Drives: what a sweep over the frames of a path says of whole drives, everything that
-varies but the time, and the worst of them. Frames are not independent, so intervals are
-over drives, and hold for any number of them: each number has ends that it cannot pass,
-known from the plan (`attacks.trials`). Where nothing is drawn, samples of a drive
-differ in noise alone: they are one drive, whose numbers are the means of theirs.
+"""Rates of a sweep over full drives, and the worst of them.
+
+A drive is everything that varies but the time of the frames along a path. Frames are
+not independent, so intervals are over drives, and hold for any number of them: each
+value has bounds that are known from the plan (`attacks.trials`). Where nothing is
+sampled, samples of a drive differ in noise alone: they are one drive, whose values are
+the means of theirs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,59 +39,75 @@ from advsearch.statistics.clustered import mean_interval, per_unit
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import LEAST_OVERLAP
 
-ANIMATED = 60
-MOST_LISTED = 1000  # drives of a model whose own numbers are kept
-UNKNOWN = -1
-HIDDEN = 2
+MAX_ANIMATED_FRAMES = 60
+MAX_LISTED_DRIVES = 1000  # drives of a model that a result lists
+# flags of a frame, besides 1 (right) and 0 (not right)
+UNKNOWN = -1  # there is no row
+HIDDEN = 2  # nothing of the object is in the image
 Flags = npt.NDArray[np.int8]
 
 
 def with_frames(
-    config: SweepConfig, drawn: tuple[Control, ...]
+    config: SweepConfig, sampled: tuple[Control, ...]
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
-    """Return the controls with what travels along the path of the configuration, and
-    the grid with its frames last.
+    """Return the controls and the grid of a sweep over the frames of a path.
+
+    A control that travels along the path is added if there is none, and the times of
+    the frames become the last axis of the grid.
+
+    Args:
+        config: with a `path`.
+        sampled: the controls that are sampled.
     """
-    travelling: Any = next((one for one in drawn if one.travels), None)
+    travelling: Any = next((control for control in sampled if control.travels), None)
     if travelling is None:
-        (added,) = given_to(config, {"path": {}})
-        drawn = (*drawn, added)
-        travelling = added
-    name = f"{travelling.name}.time"
+        (travelling,) = given_to(config, {"path": {}})
+        sampled = (*sampled, travelling)
+    time_name = f"{travelling.name}.time"
+    path_name = f"{travelling.name}.{Control.WAY}"
     seconds = travelling.seconds
-    frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
-    grid = config.grid if name in config.grid else {**config.grid, name: frames}
-    which = f"{travelling.name}.{Control.WAY}"
-    ways = next((one.options for one in travelling.own if one.name == Control.WAY), ())
-    if (
-        ways
-        and config.samples is None
-        and which not in grid
-        and Control.WAY not in travelling.specs
-    ):
-        # nothing is drawn: each of them is looked at
-        grid = {which: list(ways), **grid}
-    return drawn, grid
+    grid = config.grid
+    if time_name not in grid:
+        n_frames = max(2, round(seconds * config.fps) + 1)
+        grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
+    paths = next(
+        (
+            parameter.options
+            for parameter in travelling.own
+            if parameter.name == Control.WAY
+        ),
+        (),
+    )
+    is_path_free = path_name not in grid and Control.WAY not in travelling.specs
+    if paths and config.samples is None and is_path_free:
+        # Nothing is sampled, so every path is swept.
+        grid = {path_name: list(paths), **grid}
+    return sampled, grid
 
 
 def time_axis(axes: Sequence[Axis]) -> int | None:
-    """Return the number of the axis whose values are frames; None where there is none,
-    or one frame.
+    """Return the index of the axis whose values are frames.
+
+    None if there is none, or a single frame.
     """
-    return next(
-        (
-            place
-            for place, axis in enumerate(axes)
-            if axis.is_time and len(axis.values) > 1
-        ),
-        None,
-    )
+    for index, axis in enumerate(axes):
+        if axis.is_time and len(axis.values) > 1:
+            return index
+    return None
 
 
 def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
-    """Return the nearest and the farthest distance, as rows say it, that any drive of a
-    sweep can have at the times of an axis: on each of the paths, also one that was not
-    drawn, and in each scene. None of a path that says none.
+    """Return the nearest and the farthest distance that a drive of a sweep can have.
+
+    These are bounds from the plan: over all paths, also those that were not sampled,
+    all times of an axis, and all scenes.
+
+    Args:
+        job: the sweep.
+        axis: the time of the control that travels.
+
+    Returns:
+        The distances in the unit of the rows; None if the control does not know any.
     """
     times = torch.tensor([float(value) for value in axis.values])
     lowest = math.inf
@@ -97,7 +115,11 @@ def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
     for scene in range(len(job.places)):
         for points in job.bound(scene).values():
             control: Any = next(
-                (one for one in points.space.controls if one.name == axis.instance),
+                (
+                    control
+                    for control in points.space.controls
+                    if control.name == axis.instance
+                ),
                 None,
             )
             if control is None or not control.travels:
@@ -108,225 +130,349 @@ def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
     return lowest, highest
 
 
+class _CompleteDrives(NamedTuple):
+    """The n drives of which all frames are known, in which the object is visible.
+
+    Attributes:
+        flags: (n, frames) 1 where the model is right, 0 where it is not, HIDDEN.
+        distance: (n, frames) to the object; NaN where that is not known.
+        steps: (n, frames) numbers of the rows.
+    """
+
+    flags: Flags
+    distance: npt.NDArray[np.float64]
+    steps: npt.NDArray[np.int64]
+
+
 class Drives:
-    """The frames of every drive of a sweep."""
+    """The frames of every drive of a sweep.
+
+    Attributes:
+        times: (frames,) of the frames, ascending, in seconds.
+        seconds: time of the last frame.
+    """
 
     _units = Units()
-    # from the plan: the ends of a sample are no ends of what it is from
-    _distances: tuple[float, float] | None = None
+    # from the plan: bounds that the sample has are none of what it is drawn from
+    _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
-        place = time_axis(job.axes)
-        assert place is not None
+        axis_index = time_axis(job.axes)
+        assert axis_index is not None
         self._job = job
-        axis = job.axes[place]
+        axis = job.axes[axis_index]
         self._units = next(iter(job.bound(0).values())).units
-        self._distances = planned_distances(job, axis)
+        self._distance_bounds = planned_distances(job, axis)
         shape = (
             len(job.places),
-            *(len(one.values) for one in job.axes),
+            *(len(axis.values) for axis in job.axes),
             job.samples,
             len(job.models),
         )
-        right: Flags = np.full(shape, UNKNOWN, np.int8)
-        away = np.full(shape[:-1], np.nan)
-        self._ways: dict[int, str] = {}
-        self._frames: dict[int, DetectedFrame] = {}
-        right_names = {
-            (number, model): task.names(task.right_classes(job.facts(place, {})))
-            for number, place in enumerate(job.places)
-            for model, task in enumerate(job.tasks)
-            if isinstance(task, Detection)
-        }
-        which = f"{axis.instance}.{Control.WAY}"
-        distance = f"{axis.instance}.distance"
-        self._unit = "object sizes"
-        for row in rows:
-            picture, model = divmod(row.step, len(job.models))
-            right.flat[row.step] = (
-                HIDDEN if row.label == OUT_OF_VIEW else bool(row.correct)
-            )
-            if distance in row.values:
-                away.flat[picture] = float(str(row.values[distance]["value"]))
-                self._unit = row.values[distance]["unit"]
-            names = right_names.get((picture // job.per_scene, model))
-            if names is not None and isinstance(row.payload, dict):
-                self._frames[row.step] = frame_of(row.payload, names)
-            if which in row.values:
-                self._ways[row.step] = str(row.values[which]["value"])
+        flags: Flags = np.full(shape, UNKNOWN, np.int8)
+        distance = np.full(shape[:-1], np.nan)
+        self._path_of_step: dict[int, str] = {}
+        self._frame_of_step: dict[int, DetectedFrame] = {}
+        self._distance_unit = "object sizes"
+        self._read_rows(rows, axis.instance, flags, distance)
+
         times = np.array([float(value) for value in axis.values])
         order = np.argsort(times)
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])
-        self._right, self._numbers, self._away = (
-            np.moveaxis(of, place + 1, -1)[..., order]
-            for of in (right, np.arange(right.size).reshape(shape), away)
-        )
+        steps = np.arange(flags.size).reshape(shape)
+        # The frames become the last axis, in the order of their times.
+        self._flags = np.moveaxis(flags, axis_index + 1, -1)[..., order]
+        self._steps = np.moveaxis(steps, axis_index + 1, -1)[..., order]
+        self._distance = np.moveaxis(distance, axis_index + 1, -1)[..., order]
 
-    def _whole(
-        self, places: list[int], model: int
-    ) -> tuple[Flags, npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """Of the drives with all their frames (n, frames): whether a model is right,
-        how far away it is, and rows.
+    def _read_rows(
+        self,
+        rows: Iterable[Row],
+        instance: str,
+        flags: Flags,
+        distance: npt.NDArray[np.float64],
+    ) -> None:
+        """Read what the rows state of each frame.
+
+        Args:
+            rows: of the sweep.
+            instance: name of the control that travels.
+            flags: (scenes, ..., models), which is filled.
+            distance: (scenes, ...), which is filled.
         """
-        right, numbers = (
-            of[places][..., model, :].reshape(-1, len(self.times))
-            for of in (self._right, self._numbers)
-        )
-        whole = (right != UNKNOWN).all(axis=1) & (right != HIDDEN).any(axis=1)
-        return (
-            right[whole],
-            self._away[places].reshape(right.shape)[whole],
-            numbers[whole],
-        )
+        job = self._job
+        right_names = self._find_right_names()
+        path_name = f"{instance}.{Control.WAY}"
+        distance_name = f"{instance}.distance"
+        for row in rows:
+            image, model = divmod(row.step, len(job.models))
+            is_hidden = row.label == OUT_OF_VIEW
+            flags.flat[row.step] = HIDDEN if is_hidden else bool(row.correct)
+            if distance_name in row.values:
+                distance.flat[image] = float(str(row.values[distance_name]["value"]))
+                self._distance_unit = row.values[distance_name]["unit"]
+            names = right_names.get((image // job.per_scene, model))
+            if names is not None and isinstance(row.payload, dict):
+                self._frame_of_step[row.step] = frame_of(row.payload, names)
+            if path_name in row.values:
+                self._path_of_step[row.step] = str(row.values[path_name]["value"])
+
+    def _find_right_names(self) -> dict[tuple[int, int], Collection[str]]:
+        """Return the names of the right classes by scene and model, of detectors."""
+        job = self._job
+        right_names: dict[tuple[int, int], Collection[str]] = {}
+        for scene, named_scene in enumerate(job.places):
+            for model, task in enumerate(job.tasks):
+                if isinstance(task, Detection):
+                    classes = task.right_classes(job.facts(named_scene, {}))
+                    right_names[scene, model] = task.names(classes)
+        return right_names
+
+    def _select_complete(self, scenes: list[int], model: int) -> _CompleteDrives:
+        """Select the drives in some scenes that have all their frames."""
+        n_frames = len(self.times)
+        flags = self._flags[scenes][..., model, :].reshape(-1, n_frames)
+        steps = self._steps[scenes][..., model, :].reshape(-1, n_frames)
+        distance = self._distance[scenes].reshape(flags.shape)
+        is_known = (flags != UNKNOWN).all(axis=1)
+        is_visible = (flags != HIDDEN).any(axis=1)
+        selected = is_known & is_visible
+        return _CompleteDrives(flags[selected], distance[selected], steps[selected])
 
     def rates(self) -> list[DriveRates]:
-        """Return what is said of the drives of each model, without and with an
-        adversarial scene. Frames without the object are neither right nor a gap.
+        """Compute the rates over drives of each model, by adversarial scene.
+
+        Frames without the object count neither as right nor as part of a gap. Models
+        without a complete drive are left out.
         """
         rates = list[DriveRates]()
-        places = self._job.places
-        seconds = self.seconds
-        frames = len(self.times)
-        step = seconds / (frames - 1)
-        for beside_clean in dict.fromkeys(place.beside_clean for place in places):
-            those = [
-                number
-                for number, place in enumerate(places)
-                if place.beside_clean == beside_clean
+        named_scenes = self._job.places
+        for answer in dict.fromkeys(
+            named_scene.beside_clean for named_scene in named_scenes
+        ):
+            scenes = [
+                scene
+                for scene, named_scene in enumerate(named_scenes)
+                if named_scene.beside_clean == answer
             ]
-            for model, network in enumerate(self._job.models):
-                flags, away, numbers = self._whole(those, model)
-                if not len(flags):
-                    continue
-                right = flags == 1
-                shown = flags != HIDDEN
-                share = right.sum(axis=1) / shown.sum(axis=1)
-                seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
-                at_first = away[np.arange(len(right)), right.argmax(axis=1)]
-                first = at_first[seen]
-                gaps = np.array([longest(drive) for drive in flags == 0]) * step
-                together = shown[:, 1:] & shown[:, :-1]
-                changes = ((right[:, 1:] != right[:, :-1]) & together).sum(
-                    axis=1
-                ) / seconds
-                drive = np.asarray(
-                    self._units.draw(numbers[:, 0] // len(self._job.models))
-                )
-                n_drives = len(np.unique(drive))
-                known = len(first) > 0 and bool(np.isfinite(first).all())
-                drives = DriveRates(
-                    model=network.name,
-                    answer=beside_clean or None,
-                    drives=n_drives,
-                    repeats=-(-len(right) // n_drives),
-                    frames=frames,
-                    seconds=seconds,
-                    right=over_drives(share, min, drive=drive),
-                    longest_gap=over_drives(gaps, max, (0.0, frames * step), drive),
-                    first_seen=over_drives(first, min, self._distances, drive[seen])
-                    if known
-                    else None,
-                    unit=self._unit,
-                    never_seen=n_drives - len(np.unique(drive[seen])),
-                    flicker=over_drives(
-                        changes, max, (0.0, (frames - 1) / seconds), drive
-                    ),
-                    tracks=self._tracks(model, numbers, drive),
-                    each=[
-                        OneDrive(
-                            row=begin,
-                            path=self._ways.get(begin),
-                            right=float(share[k]),
-                            first_seen=float(at_first[k])
-                            if seen[k] and np.isfinite(at_first[k])
-                            else None,
-                            longest_gap=float(gaps[k]),
-                            flicker=float(changes[k]),
-                        )
-                        for k, begin in enumerate(numbers[:MOST_LISTED, 0].tolist())
-                    ],
-                )
-                rates.append(drives)
+            for model in range(len(self._job.models)):
+                drives = self._select_complete(scenes, model)
+                if len(drives.flags):
+                    rates.append(self._compute_rates(drives, model, answer))
         return rates
 
-    def _tracks(
-        self, model: int, numbers: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]
+    def _compute_rates(
+        self, drives: _CompleteDrives, model: int, answer: str
+    ) -> DriveRates:
+        """Compute the rates of one model over drives; `answer` may be empty."""
+        n_frames = len(self.times)
+        first_distance = _first_right_distance(drives)
+        each = self._describe_drives(drives, first_distance)
+        has_right = np.asarray((drives.flags == 1).any(axis=1))
+
+        # Rows of one draw differ in noise alone: they are one drive.
+        first_images = drives.steps[:, 0] // len(self._job.models)
+        drive = np.asarray(self._units.draw(first_images))
+        n_drives = len(np.unique(drive))
+        n_right_drives = len(np.unique(drive[has_right]))
+        max_gap = n_frames * self._frame_interval
+        max_flicker = (n_frames - 1) / self.seconds
+        return DriveRates(
+            model=self._job.models[model].name,
+            answer=answer or None,
+            drives=n_drives,
+            repeats=math.ceil(len(drives.flags) / n_drives),
+            frames=n_frames,
+            seconds=self.seconds,
+            right=over_drives(_right_fraction(drives.flags), min, drive_of_value=drive),
+            longest_gap=over_drives(
+                self._longest_gaps(drives.flags), max, (0.0, max_gap), drive
+            ),
+            first_seen=self._first_detection(
+                first_distance[has_right], drive[has_right]
+            ),
+            unit=self._distance_unit,
+            never_seen=n_drives - n_right_drives,
+            flicker=over_drives(
+                self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
+            ),
+            tracks=self._compute_track_rates(model, drives.steps, drive),
+            each=each,
+        )
+
+    def _describe_drives(
+        self, drives: _CompleteDrives, first_distance: npt.NDArray[np.float64]
+    ) -> list[OneDrive]:
+        """Return the values of the first drives, each by itself.
+
+        Args:
+            drives: n of them.
+            first_distance: (n,) at the first right frame; NaN if there is none.
+        """
+        right_fraction = _right_fraction(drives.flags)
+        longest_gap = self._longest_gaps(drives.flags)
+        flicker = self._changes_per_second(drives.flags)
+        first_steps = drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
+        return [
+            OneDrive(
+                row=step,
+                path=self._path_of_step.get(step),
+                right=float(right_fraction[index]),
+                first_seen=_finite_or_none(first_distance[index]),
+                longest_gap=float(longest_gap[index]),
+                flicker=float(flicker[index]),
+            )
+            for index, step in enumerate(first_steps)
+        ]
+
+    @property
+    def _frame_interval(self) -> float:
+        """Seconds from one frame to the next."""
+        return self.seconds / (len(self.times) - 1)
+
+    def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
+        """Return the seconds (n,) of the longest run of wrong frames of each drive."""
+        runs = np.array([longest(is_wrong) for is_wrong in flags == 0])
+        return runs * self._frame_interval
+
+    def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
+        """Return how often each drive (n,) changes between right and wrong a second."""
+        is_right = flags == 1
+        is_visible = flags != HIDDEN
+        both_visible = is_visible[:, 1:] & is_visible[:, :-1]
+        is_change = (is_right[:, 1:] != is_right[:, :-1]) & both_visible
+        return np.asarray(is_change.sum(axis=1) / self.seconds)
+
+    def _first_detection(
+        self, distance: npt.NDArray[np.float64], drive: npt.NDArray[np.int64]
+    ) -> OverDrives | None:
+        """Return the mean distance at the first right frame.
+
+        None if there is no such frame, or a distance is not known.
+
+        Args:
+            distance: (n,) of drives that have a right frame.
+            drive: (n,) their draws.
+        """
+        if not len(distance) or not np.isfinite(distance).all():
+            return None
+        return over_drives(distance, min, self._distance_bounds, drive)
+
+    def _compute_track_rates(
+        self, model: int, steps: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]
     ) -> TrackRates | None:
-        """What a tracker makes of drives, by the numbers (n, frames) of their rows and
-        of the `drive` (n,) that these are of; None without boxes in all.
+        """Compute what a tracker makes of the boxes of drives.
+
+        Args:
+            model: its index.
+            steps: (n, frames) numbers of the rows.
+            drive: (n,) the draw of each drive.
+
+        Returns:
+            The rates; None unless the model detects and every frame has its boxes.
         """
         task = self._job.tasks[model]
-        frames = len(self.times)
         tracker = self._job.tracker
-        if not isinstance(task, Detection) or not all(
-            number in self._frames for number in numbers.flat
-        ):
+        if not isinstance(task, Detection):
             return None
-        seen = [[self._frames[number] for number in row] for row in numbers.tolist()]
-        drives = [
-            tracked(frames_of_drive, tracker, task.iou) for frames_of_drive in seen
-        ]
-        least = min(LEAST_OVERLAP, task.iou)
-        loosely = [
-            tracked(frames_of_drive, tracker, least).lost for frames_of_drive in seen
-        ]
-        step = self.seconds / (frames - 1)
-        lost, switches, gaps = (
-            np.array(values, dtype=float) for values in zip(*drives, strict=True)
+        if any(step not in self._frame_of_step for step in steps.flat):
+            return None
+        frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
+        drives = [tracked(drive_frames, tracker, task.iou) for drive_frames in frames]
+        loose_iou = min(LEAST_OVERLAP, task.iou)
+        lost_loosely = np.array(
+            [tracked(drive_frames, tracker, loose_iou).lost for drive_frames in frames]
         )
+        lost = np.array([drive.lost for drive in drives], dtype=float)
+        switches = np.array([drive.switches for drive in drives], dtype=float)
+        longest_gap = np.array([drive.gap for drive in drives], dtype=float)
+        n_frames = len(self.times)
+        seconds_bounds = (0.0, n_frames * self._frame_interval)
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
-            lost=over_drives(lost, max, drive=drive),
-            loose=over_drives(lost - np.array(loosely), max, drive=drive),
-            switches=over_drives(switches, max, (0.0, frames - 1.0), drive),
-            longest_gap=over_drives(gaps * step, max, (0.0, frames * step), drive),
+            lost=over_drives(lost, max, drive_of_value=drive),
+            loose=over_drives(lost - lost_loosely, max, drive_of_value=drive),
+            switches=over_drives(switches, max, (0.0, n_frames - 1.0), drive),
+            longest_gap=over_drives(
+                longest_gap * self._frame_interval, max, seconds_bounds, drive
+            ),
         )
 
     def keep_worst(self, scenes: OpenScenes, run: RunDirectory) -> None:
-        """Write a strip and an animation of the drive in which the first model is right
-        least often, with its marks.
+        """Save a strip and an animation of the first model's worst drive.
+
+        That is the drive with the fewest right frames; its images have the marks of the
+        task.
+
+        Args:
+            scenes: of the sweep.
+            run: where they are written.
         """
-        flags, _, numbers = self._whole([*range(len(self._job.places))], 0)
-        if len(flags):
-            share = (flags == 1).sum(axis=1) / (flags != HIDDEN).sum(axis=1)
-            worst = numbers[share.argmin()] // len(self._job.models)
-            pictures = []
-            for number in worst[evenly(len(worst), ANIMATED)].tolist():
-                view, (query, *_) = scenes.asked(number)
-                picture = view.picture(query)
-                drawn = marked(
-                    picture.numpy(), view.problems[0].marks(picture, query.u)
-                )
-                pictures.append(np.asarray(drawn, dtype=np.float32))
-            write_drive(run, "drive", pictures, self.seconds)
+        drives = self._select_complete([*range(len(self._job.places))], 0)
+        if not len(drives.flags):
+            return
+        worst = _right_fraction(drives.flags).argmin()
+        numbers = drives.steps[worst] // len(self._job.models)
+        frames = []
+        for number in numbers[evenly(len(numbers), MAX_ANIMATED_FRAMES)].tolist():
+            scene, (query, *_) = scenes.asked(number)
+            image = scene.picture(query)
+            marks = scene.problems[0].marks(image, query.u)
+            frames.append(np.asarray(marked(image.numpy(), marks), dtype=np.float32))
+        write_drive(run, "drive", frames, self.seconds)
 
 
 def longest(flags: npt.NDArray[np.bool_]) -> int:
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((ends[1::2] - ends[::2]).max(initial=0))
+    """Return the length of the longest run of true flags (n,)."""
+    changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
+    return int((bounds[1::2] - bounds[::2]).max(initial=0))
+
+
+def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
+    """Return the distance (n,) at the first right frame; NaN if there is none."""
+    is_right = drives.flags == 1
+    first_frame = is_right.argmax(axis=1)
+    distance = drives.distance[np.arange(len(first_frame)), first_frame]
+    return np.where(is_right.any(axis=1), distance, np.nan)
+
+
+def _right_fraction(flags: Flags) -> npt.NDArray[np.float64]:
+    """Return the fraction (n,) of the visible frames (n, frames) that are right."""
+    n_right = (flags == 1).sum(axis=1)
+    n_visible = (flags != HIDDEN).sum(axis=1)
+    return np.asarray(n_right / n_visible)
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def over_drives(
     values: npt.NDArray[np.float64],
     worst: Callable[[list[float]], float],
-    ends: tuple[float, float] | None = (0.0, 1.0),
-    drive: npt.NDArray[np.int64] | None = None,
+    bounds: tuple[float, float] | None = (0.0, 1.0),
+    drive_of_value: npt.NDArray[np.int64] | None = None,
 ) -> OverDrives:
-    """Return the mean over drives of a number (n,), its 95 % interval, and the worst
-    number. The numbers of one `drive` (n,) differ in noise alone, so that their mean is
-    the drive's; None: each number is of a drive of its own. `ends` are what a number is
-    between whatever a model says, from the plan; where these are not known, and of one
-    drive, there is no interval.
+    """Compute the mean of a value over drives, its 95 % interval, and the worst value.
+
+    There is no interval if the bounds are not known, or for a single drive.
+
+    Args:
+        values: (n,).
+        worst: selects the worst of them: `min` or `max`.
+        bounds: bounds of the values whatever a model predicts, from the plan.
+        drive_of_value: (n,) the drive of each value; values of one differ in noise alone, so
+            that their mean is the drive's. None: each has a drive of its own.
     """
-    means = (
-        values
-        if drive is None
-        else per_unit(values, drive) / per_unit(np.ones(len(values)), drive)
-    )
-    interval = (
-        mean_interval(means, *ends) if ends is not None and len(means) > 1 else None
-    )
-    return OverDrives(
-        mean=float(means.mean()), interval=interval, worst=worst(values.tolist())
-    )
+    means = values
+    if drive_of_value is not None:
+        means = per_unit(values, drive_of_value) / per_unit(
+            np.ones(len(values)), drive_of_value
+        )
+    interval = None
+    if bounds is not None and len(means) > 1:
+        interval = mean_interval(means, *bounds)
+    worst_value = worst(values.tolist())
+    return OverDrives(mean=float(means.mean()), interval=interval, worst=worst_value)

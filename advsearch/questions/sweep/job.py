@@ -1,6 +1,4 @@
-"""Sweeps. Here: what one is asked for, found and loaded: scenes, models, controls and
-axes.
-"""
+"""What a sweep evaluates: its scenes, models, controls and axes, and their images."""
 
 from __future__ import annotations
 
@@ -8,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -43,14 +42,22 @@ from advsearch.tasks import Facts, Judgement, Task
 from advsearch.viewer import thumbnails
 
 KIND = "sweep"  # rows of the sweep, and the stream of their seeds
-SAMPLES = 100  # draws where there is no grid and nothing is said
+DEFAULT_SAMPLES = 100  # of a sweep without a grid
+ImageSize: TypeAlias = tuple[int, int]  # (height, width)
 
 
 @dataclass(frozen=True)
 class NamedScene:
-    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as
-    the scene is without it; `beside_clean` is what the place is called beside the same
-    one without the adversarial scene of a run, empty where there is no such.
+    """One of the scenes of a sweep.
+
+    Attributes:
+        object: its name.
+        environment: its name.
+        scene: as it was loaded.
+        held: controls that do not vary.
+        u: (d,) where they are; None: as the scene is.
+        beside_clean: name of the scene beside the same one without or with the
+            adversarial configuration of a run; empty if nothing is compared.
     """
 
     object: str
@@ -62,15 +69,32 @@ class NamedScene:
 
     @property
     def names(self) -> dict[str, str]:
-        named = {"object": self.object, "environment": self.environment}
-        return {**named, "answer": self.beside_clean} if self.beside_clean else named
+        """The values of the axes outside the scene, by their names."""
+        names = {"object": self.object, "environment": self.environment}
+        if self.beside_clean:
+            names["answer"] = self.beside_clean
+        return names
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that was asked for, found and loaded: `controls` are drawn by chance;
-    `aovs` are layers of ground truth that are kept of every picture of the first model
-    (`scene.formation.AOVS`).
+    """Everything that a sweep needs, loaded.
+
+    Images are numbered by scene, then as `Points` numbers them; rows by image, then by
+    model.
+
+    Attributes:
+        config: the settings.
+        places: the scenes.
+        models: all of which get the same images.
+        tasks: one for each model.
+        controls: the sampled ones.
+        axes: of the grid.
+        aovs: layers of ground truth that are stored of every image of the first model
+            (`scene.formation.AOVS`).
+        warnings: of loading.
+        metrics: columns of the rows, by name.
+        tracker: of drives.
     """
 
     config: SweepConfig
@@ -83,120 +107,178 @@ class Job:
     warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     tracker: Tracker = ConstantVelocity
-    _bound: dict[int, dict[tuple[int, int], Points]] = field(
+    _points_by_scene: dict[int, dict[ImageSize, Points]] = field(
         default_factory=dict, init=False, repr=False
     )
 
     @property
     def samples(self) -> int:
-        return self.config.samples or (
-            SAMPLES if self.controls and not self.axes else 1
-        )
+        """Samples at each point of the grid."""
+        is_sampled_only = bool(self.controls) and not self.axes
+        default = DEFAULT_SAMPLES if is_sampled_only else 1
+        return self.config.samples or default
 
     @cached_property
     def spp(self) -> int:
-        """Samples a pixel, as the sampler has them."""
+        """Samples per pixel, as the sampler has them."""
         return next_count(self.config.pixel_sampler, self.config.search_spp)
 
     @cached_property
-    def sizes(self) -> tuple[tuple[int, int], ...]:
-        """(height, width) of the pictures for each model."""
+    def sizes(self) -> tuple[ImageSize, ...]:
+        """(height, width) of the images of each model."""
         return tuple(
             self.config.resolution or model.input_size for model in self.models
         )
 
     @cached_property
     def first_of_size(self) -> tuple[bool, ...]:
-        """Of each model, whether no model before it is shown the same pictures."""
+        """Of each model, whether no model before it gets the same images."""
         return tuple(
             size not in self.sizes[:model] for model, size in enumerate(self.sizes)
         )
 
     @cached_property
     def per_scene(self) -> int:
-        """Pictures of a scene."""
+        """Images of a scene."""
         return next(iter(self.bound(0).values())).count
 
     @cached_property
     def seeds(self) -> Seeds:
         return Seeds(self.config.seed, KIND)
 
-    def bound(self, scene: int) -> dict[tuple[int, int], Points]:
-        """The configurations of a scene for each size of picture; those of the last
-        scene are held.
+    def bound(self, scene: int) -> dict[ImageSize, Points]:
+        """Return the configurations of a scene for each size of image.
+
+        Those of the last scene are cached.
         """
-        if scene not in self._bound:
-            self._bound.clear()
-            place = self.places[scene]
+        if scene not in self._points_by_scene:
+            self._points_by_scene.clear()
+            named_scene = self.places[scene]
             sizes = dict.fromkeys(self.sizes)
-            self._bound[scene] = {
-                size: self.points(self.space(place, size)) for size in sizes
+            self._points_by_scene[scene] = {
+                size: self.points(self.space(named_scene, size)) for size in sizes
             }
-        return self._bound[scene]
+        return self._points_by_scene[scene]
 
     def queries(self, numbers: range) -> list[Sent]:
-        """Ask all models about the pictures with these numbers, all of one scene, whose
-        number is the name.
+        """Return the queries of all models about images of one scene.
+
+        Args:
+            numbers: of the images in the sweep.
+
+        Returns:
+            The queries by ascending number, with the scene's number as the name of the
+            problem.
         """
         scene = numbers.start // self.per_scene
-        place = self.places[scene]
-        before = scene * self.per_scene
-        keep = self.config.keep_pictures != "none"
-        held = {control.name for control in place.held}
-        queries: dict[int, Query] = {}
+        images_before = scene * self.per_scene
+        first_in_scene = numbers.start - images_before
+        queries = list[Query]()
         for size, points in self.bound(scene).items():
-            u = points.configurations(numbers.start - before, len(numbers), before)
-            described = points.values(u, numbers.start - before)
+            u = points.configurations(first_in_scene, len(numbers), images_before)
+            descriptions = points.values(u, first_in_scene)
             for number, configuration, values in zip(
-                numbers, u, described, strict=True
+                numbers, u, descriptions, strict=True
             ):
-                names = place.names
-                lit_by = points.space.lit_by(values)
-                if lit_by is not None:
-                    names["environment"] = lit_by
-                seed = self.seeds(points.noise(number))
-                for model in (
-                    model for model, own in enumerate(self.sizes) if own == size
-                ):
-                    names["model"] = self.models[model].name
-                    told: dict[str, Value] = {
-                        name: {"value": text, "unit": ""}
-                        for name, text in names.items()
-                    }
-                    told |= {
-                        name: value
-                        for name, value in values.items()
-                        if name.partition(".")[0] not in held
-                    }
-                    step = number * len(self.models) + model
-                    queries[step] = Query(
-                        configuration.clone(), seed, KIND, step, spp=self.spp, drawn=False, values=told, sought=False,
-                        keep=keep,
-                    )  # fmt: skip
-        return [(str(scene), None, queries[step]) for step in sorted(queries)]
+                queries += [
+                    self._make_query(number, model, points, configuration, values)
+                    for model, model_size in enumerate(self.sizes)
+                    if model_size == size
+                ]
+        queries.sort(key=lambda query: query.number)
+        return [(str(scene), None, query) for query in queries]
 
-    def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
-        """The controls, those of the grid as choices, bound to a scene."""
-        description = framed(place.scene.description, size)
-        controls = (*place.held, *on_grid(self.controls, self.axes, description))
+    def _make_query(
+        self,
+        number: int,
+        model: int,
+        points: Points,
+        u: Tensor,
+        values: Mapping[str, Value],
+    ) -> Query:
+        """Return the query of a model about an image.
+
+        Args:
+            number: of the image in the sweep.
+            model: its index.
+            points: of the scene.
+            u: (d,) the configuration.
+            values: of the controls.
+        """
+        scene = number // self.per_scene
+        environment = points.space.lit_by(values)
+        return Query(
+            u.clone(),
+            self.seeds(points.noise(number)),
+            KIND,
+            number * len(self.models) + model,
+            spp=self.spp,
+            drawn=False,
+            values=self._row_values(scene, model, environment, values),
+            sought=False,
+            keep=self.config.keep_pictures != "none",
+        )
+
+    def _row_values(
+        self,
+        scene: int,
+        model: int,
+        environment: str | None,
+        values: Mapping[str, Value],
+    ) -> dict[str, Value]:
+        """Return the stored values of a row.
+
+        Args:
+            scene: its index.
+            model: its index.
+            environment: what lights the scene instead of its own environment.
+            values: of the controls.
+        """
+        named_scene = self.places[scene]
+        held_names = {control.name for control in named_scene.held}
+        names = named_scene.names
+        if environment is not None:
+            names["environment"] = environment
+        names["model"] = self.models[model].name
+        row_values: dict[str, Value] = {
+            name: {"value": text, "unit": ""} for name, text in names.items()
+        }
+        for name, value in values.items():
+            control_name = name.partition(".")[0]
+            if control_name not in held_names:
+                row_values[name] = value
+        return row_values
+
+    def space(self, named_scene: NamedScene, size: ImageSize) -> Space:
+        """Bind the controls, those of the grid as choices, to a scene.
+
+        Args:
+            named_scene: the scene.
+            size: (height, width) of the images.
+
+        Raises:
+            InputError: the adversarial configuration does not fit the scene, or a
+                sampled parameter was set.
+        """
+        description = framed(named_scene.scene.description, size)
+        controls = (*named_scene.held, *on_grid(self.controls, self.axes, description))
         if not controls:
             return Space((), None)
         space = make_space(controls, description)
-        if place.held:
-            start = torch.cat(
-                [bound.start for bound in space.controls[: len(place.held)]]
-            )
-            if place.u is not None and len(place.u) != len(start):
+        if named_scene.held:
+            held_controls = space.controls[: len(named_scene.held)]
+            start = torch.cat([control.start for control in held_controls])
+            if named_scene.u is not None and len(named_scene.u) != len(start):
                 raise InputError(
                     "adversarial_of: the adversarial configuration of "
-                    f"{place.beside_clean} has {len(place.u)} "
-                    f"numbers, and {place.object} takes {len(start)}: it is another "
+                    f"{named_scene.beside_clean} has {len(named_scene.u)} "
+                    f"numbers, and {named_scene.object} takes {len(start)}: it is another "
                     "object, or it has changed since; "
                     "do the run again"
                 )
-            space = space.holding(start if place.u is None else place.u)
+            space = space.holding(start if named_scene.u is None else named_scene.u)
         for group in space.groups:
-            if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            if group.setting in named_scene.scene.description.given - {ENVIRONMENT}:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
                     f"and `set` {group.setting} fixes "
@@ -205,124 +287,167 @@ class Job:
         return space
 
     def points(self, space: Space) -> Points:
-        """The configurations of a space; those with an adversarial scene have the draws
-        of those without it.
+        """Return the configurations of a space.
+
+        Scenes with an adversarial configuration have the draws of those without it.
         """
-        scenes = len(self.places) // 2 if self.places[0].beside_clean else 0
-        domain = domain_of(space.controls)
-        config = self.config
+        is_paired = bool(self.places[0].beside_clean)
         return Points(
             space,
-            domain,
+            domain_of(space.controls),
             self.axes,
             self.samples,
-            config.sampler,
-            config.seed,
-            scenes,
+            self.config.sampler,
+            self.config.seed,
+            len(self.places) // 2 if is_paired else 0,
             len(self.places),
         )
 
-    def facts(self, place: NamedScene, values: Mapping[str, Value]) -> Facts:
-        description = place.scene.description
-        config = self.config
+    def facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
+        """Return what a task needs to know of a scene whose controls have `values`."""
         return facts_about(
-            description, place.object, config.label, lambda: values, judge=config.judge
+            named_scene.scene.description,
+            named_scene.object,
+            self.config.label,
+            lambda: values,
+            judge=self.config.judge,
         )
 
 
 def check_scenes(
-    places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
 ) -> None:
-    given = {name for place in places for name in place.scene.description.given}
-    drawn = {control.name: control for control in controls}
-    choosing = list[str]()
+    """Check that nothing that the scenes fix is varied too.
+
+    Raises:
+        InputError: an axis varies what `set` fixes, or an axis or a control chooses the
+            environment beside several environments.
+    """
+    fixed_settings = {
+        name
+        for named_scene in named_scenes
+        for name in named_scene.scene.description.given
+    }
+    environment_choices = list[str]()
     for axis in axes:
-        settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
-        setting = (
-            drawn.get(axis.instance) or make_control(axis.instance, settings)
-        ).setting(axis.parameter)
+        setting = _find_setting(axis, controls)
         if setting == ENVIRONMENT:
-            choosing.append(f"`grid` {axis.name}")
-        elif setting in given:
+            environment_choices.append(f"`grid` {axis.name}")
+        elif setting in fixed_settings:
             raise InputError(
                 f"`grid` {axis.name}: `set` fixes it already; leave it "
                 "out of one of the two"
             )
-    environments = list(dict.fromkeys(place.environment for place in places))
-    choosing += [
-        f"`controls` {control.name}"
-        for control in controls
-        for parameter in control.parameters
-        if control.setting(parameter) == ENVIRONMENT
-        and parameter.name in control.settings()
-    ]
-    if len(environments) > 1 and choosing:
+    for control in controls:
+        for parameter in control.parameters:
+            is_varied = parameter.name in control.settings()
+            if control.setting(parameter) == ENVIRONMENT and is_varied:
+                environment_choices.append(f"`controls` {control.name}")
+    environments = list(
+        dict.fromkeys(named_scene.environment for named_scene in named_scenes)
+    )
+    if len(environments) > 1 and environment_choices:
         raise InputError(
-            f"`environment={','.join(environments)}` and {choosing[0]} both choose "
-            "what lights the scene; name all of "
+            f"`environment={','.join(environments)}` and {environment_choices[0]} both "
+            "choose what lights the scene; name all of "
             "them in one of the two, and leave the other out"
         )
 
 
+def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
+    """Return the name of the scene's setting that an axis varies."""
+    control = next(
+        (control for control in controls if control.name == axis.instance), None
+    )
+    if control is None:
+        settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
+        control = make_control(axis.instance, settings)
+    return control.setting(axis.parameter)
+
+
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
-    """Bind every scene once, so that what is wrong is said before anything is rendered.
-    Returns the points of the first scene, and what the table shows of the draws: shares
-    of the range where scenes, or pictures of different shapes, have different ones.
+    """Bind every scene once, so that errors come before anything is rendered.
+
+    Returns:
+        The points of the first scene, and the sampled numbers that tables show: as
+        fractions of the range where it differs between scenes or sizes of image.
+
+    Raises:
+        InputError: controls sample other numbers in one scene than in another.
     """
-    bound = []
-    for scene, place in enumerate(job.places):
-        bound += [(place, points) for points in job.bound(scene).values()]
+    points_of_scene = list[tuple[NamedScene, Points]]()
+    for scene, named_scene in enumerate(job.places):
+        points_of_scene += [
+            (named_scene, points) for points in job.bound(scene).values()
+        ]
+        facts = job.facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
             check_truth(
-                task,
-                model,
-                place.scene,
-                job.facts(place, {}),
-                job.config.image_settings,
+                task, model, named_scene.scene, facts, job.config.image_settings
             )
-    first = bound[0][1]
-    for place, points in bound:
-        if points.drawn_numbers != first.drawn_numbers:
+    first_points = points_of_scene[0][1]
+    for named_scene, points in points_of_scene:
+        if points.drawn_numbers != first_points.drawn_numbers:
             raise InputError(
-                f"`object` {place.object}: its controls draw other numbers than those "
-                f"of {job.places[0].object}; sweep "
+                f"`object` {named_scene.object}: its controls draw other numbers than "
+                f"those of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
-    drawn = []
-    for versions in zip(*(points.drawn for _, points in bound), strict=True):
-        same = all(one.parts == versions[0].parts for one in versions)
-        shares = tuple(
-            [k / first.parts, (k + 1) / first.parts] for k in range(first.parts)
+    sampled = [
+        _merge_versions(versions, first_points.parts)
+        for versions in zip(
+            *(points.drawn for _, points in points_of_scene), strict=True
         )
-        drawn.append(
-            versions[0]
-            if same
-            else replace(versions[0], unit="of its range", parts=shares, settled=False)
-        )
-    return first, tuple(drawn)
+    ]
+    return first_points, tuple(sampled)
+
+
+def _merge_versions(versions: Sequence[Drawn], n_parts: int) -> Drawn:
+    """Return a sampled number as the table of all scenes shows it.
+
+    Args:
+        versions: the number in each scene.
+        n_parts: into which its range is cut.
+    """
+    number = versions[0]
+    if all(version.parts == number.parts for version in versions):
+        return number
+    fractions = tuple([k / n_parts, (k + 1) / n_parts] for k in range(n_parts))
+    return replace(number, unit="of its range", parts=fractions, settled=False)
 
 
 class SweptScene:
-    """One scene, ready to be rendered and shown to the models: a `Problem` for each of
-    them. Points, renderers and what predicts pictures are there for each size of
-    picture, on which what a control frames may depend.
+    """One scene, ready to be rendered and evaluated.
+
+    Points, renderers and predictors are there for each size of image, on which what a
+    control frames may depend.
+
+    Attributes:
+        number: its index in the sweep.
+        points: its configurations.
+        renderers: its renderers.
+        problems: one for each model.
+        predicted: what predicts its images.
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        place = job.places[number]
+        named_scene = job.places[number]
         config = job.config
-        self.number, self.job, self.points = number, job, job.bound(number)
-        self._without: dict[tuple[int, int], Renderer] = {}
-        self.renderers = {size: self._renderer(size) for size in self.points}
+        self.number = number
+        self.job = job
+        self.points = job.bound(number)
+        # render the scene without its object
+        self._empty_renderers: dict[ImageSize, Renderer] = {}
+        self.renderers = {size: self._make_renderer(size) for size in self.points}
         facts = partial(
             facts_about,
-            place.scene.description,
-            place.object,
+            named_scene.scene.description,
+            named_scene.object,
             config.label,
             judge=config.judge,
         )
-        spp = job.spp
-        seed = config.seed
         self.problems = tuple(
             Problem(
                 self.renderers[size],
@@ -331,214 +456,271 @@ class SweptScene:
                 task,
                 facts,
                 None,
-                spp,
-                seed,
+                job.spp,
+                config.seed,
                 metrics=job.metrics,
             )
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
-        seed = seeds.stream(seed, "sweep light", number)
-        self.predicted = dict[tuple[int, int], PredictedSweep]()
+        light_seed = seeds.stream(config.seed, "sweep light", number)
+        self.predicted = dict[ImageSize, PredictedSweep]()
         for size, points in self.points.items():
-            problem = self.problems[job.sizes.index(size)]
-            before = number * points.count
             self.predicted[size] = PredictedSweep(
-                problem, points, job.axes, seed, config.specialise, before
+                self.problems[job.sizes.index(size)],
+                points,
+                job.axes,
+                light_seed,
+                config.specialise,
+                number * points.count,
             )
 
     @property
     def not_finite(self) -> int:
+        """Values of images that were not finite, and were set to 0."""
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
-        return rendered + sum(one.not_finite for one in self.predicted.values())
+        predicted = sum(images.not_finite for images in self.predicted.values())
+        return rendered + predicted
 
     def evaluate_all(
         self, queries: Sequence[Query], prepared: Prepared | None = None
     ) -> list[Evaluation]:
-        """Answer queries of neighbouring rows: a picture is made once for each size,
-        and a model sees all of its own at once. Nothing is prepared for these.
+        """Evaluate queries of neighbouring rows.
+
+        An image is made once for each size, and a model gets all of its images at once.
+
+        Args:
+            queries: of this scene.
+            prepared: nothing; sweeps prepare nothing.
         """
-        begun = time.perf_counter()
-        before = self.not_finite
-        job = self.job
-        models = len(job.models)
-        made = {size: self._made(size, queries) for size in self.points}
-        said: dict[int, Judgement] = {}
-        for model, (size, problem) in enumerate(
-            zip(job.sizes, self.problems, strict=True)
-        ):
-            mine = [query for query in queries if query.number % models == model]
-            if mine:
-                shown = torch.stack(
-                    [made[size][query.number // models].picture for query in mine]
-                )
-                judged = problem.judge_several(
-                    shown, [query.u for query in mine], [query.values for query in mine]
-                )
-                judged = self._with_claims(problem, size, mine, shown, judged)
-                said |= {
-                    query.number: judgement
-                    for query, judgement in zip(mine, judged, strict=True)
-                }
-        wrong = {
-            number // models
-            for number, judgement in said.items()
+        begin = time.perf_counter()
+        not_finite_before = self.not_finite
+        n_models = len(self.job.models)
+        images = {size: self._make_images(size, queries) for size in self.points}
+        judgements = self._judge(queries, images)
+        wrong_images = {
+            step // n_models
+            for step, judgement in judgements.items()
             if not judgement.right
         }
-        seconds = (time.perf_counter() - begun) / len(queries)
+        seconds = (time.perf_counter() - begin) / len(queries)
         evaluations = list[Evaluation]()
         for query in queries:
-            number, model = divmod(query.number, models)
-            picture = made[job.sizes[model]][number]
-            cost = picture.traced * job.first_of_size[model]
+            number, model = divmod(query.number, n_models)
+            image = images[self.job.sizes[model]][number]
             evaluation = Evaluation.of(
-                said[query.number],
-                cost=cost,
-                predicted=picture.predicted,
+                judgements[query.number],
+                cost=image.traced * self.job.first_of_size[model],
+                predicted=image.predicted,
                 seconds=seconds,
             )
-            if (
-                model == 0
-                and query.keep
-                and (job.config.keep_pictures == "all" or number in wrong)
-            ):
-                evaluation = replace(
-                    evaluation, small=thumbnails.thumbnail(picture.picture)
-                )
-            if model == 0 and job.aovs:
-                surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
-                layers = {
-                    name: layer.numpy()
-                    for name, layer in surfaces.layers(job.aovs, OBJECT).items()
-                }
-                evaluation = replace(
-                    evaluation, layers=(layers, surfaces.notes(job.aovs))
-                )
+            if model == 0:
+                is_wrong = number in wrong_images
+                evaluation = self._attach_images(evaluation, query, image, is_wrong)
             evaluations.append(evaluation)
-        so_far = [one.summary() for one in self.predicted.values()]
-        return [
-            *evaluations[:-1],
-            replace(
-                evaluations[-1],
-                light=so_far,
-                non_finite=max(0, self.not_finite - before),
-            ),
-        ]
+        # What concerns the batch stands in its last evaluation.
+        evaluations[-1] = replace(
+            evaluations[-1],
+            light=[predictor.summary() for predictor in self.predicted.values()],
+            non_finite=max(0, self.not_finite - not_finite_before),
+        )
+        return evaluations
 
-    def _with_claims(
+    def _judge(
+        self,
+        queries: Sequence[Query],
+        images: Mapping[ImageSize, Mapping[int, SweptPicture]],
+    ) -> dict[int, Judgement]:
+        """Return the judgements of all queries by their numbers.
+
+        Args:
+            queries: of all models.
+            images: by size, then by the number of the image.
+        """
+        job = self.job
+        n_models = len(job.models)
+        judgements: dict[int, Judgement] = {}
+        for model, problem in enumerate(self.problems):
+            size = job.sizes[model]
+            model_queries = [
+                query for query in queries if query.number % n_models == model
+            ]
+            if not model_queries:
+                continue
+            batch = torch.stack(
+                [
+                    images[size][query.number // n_models].picture
+                    for query in model_queries
+                ]
+            )
+            judged = problem.judge_several(
+                batch,
+                [query.u for query in model_queries],
+                [query.values for query in model_queries],
+            )
+            judged = self._add_claims(problem, size, model_queries, batch, judged)
+            for query, judgement in zip(model_queries, judged, strict=True):
+                judgements[query.number] = judgement
+        return judgements
+
+    def _attach_images(
+        self, evaluation: Evaluation, query: Query, image: SweptPicture, is_wrong: bool
+    ) -> Evaluation:
+        """Return an evaluation of the first model with the images that are stored.
+
+        Args:
+            evaluation: without them.
+            query: what is evaluated.
+            image: of the query.
+            is_wrong: whether the prediction of any model is wrong.
+        """
+        job = self.job
+        if query.keep and (job.config.keep_pictures == "all" or is_wrong):
+            thumbnail = thumbnails.thumbnail(image.picture)
+            evaluation = replace(evaluation, small=thumbnail)
+        if job.aovs:
+            surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
+            layers = {
+                name: layer.numpy()
+                for name, layer in surfaces.layers(job.aovs, OBJECT).items()
+            }
+            notes = surfaces.notes(job.aovs)
+            evaluation = replace(evaluation, layers=(layers, notes))
+        return evaluation
+
+    def _add_claims(
         self,
         problem: Problem,
-        size: tuple[int, int],
-        mine: Sequence[Query],
-        shown: Tensor,
+        size: ImageSize,
+        queries: Sequence[Query],
+        images: Tensor,
         judged: list[Judgement],
     ) -> list[Judgement]:
-        """Return judgements of pictures (n, H, W, 3) with a number for each claim about
-        changed ones: 1 where it is as claimed. What is true stays what it was before
-        the change.
+        """Return judgements with a metric for each claim about changed images.
+
+        It is 1 where the prediction is as claimed. The ground truth stays what it was
+        before the change.
+
+        Args:
+            problem: of the model.
+            size: (height, width) of its images.
+            queries: n of them.
+            images: (n, H, W, 3).
+            judged: of the unchanged images.
         """
-        wholes = [query.u for query in mine]
-        listed = [query.values for query in mine]
-        for claim, when in self.job.config.claims:
-            if when == AWAY:  # rendered with the same noise
-                # by a renderer of its own: a scene in which something was far away has
-                # other last bits
-                renderer = (
-                    self._without[size]
-                    if size in self._without
-                    else self._renderer(size)
-                )
-                self._without[size], renderer.scene.assembly.away = renderer, True
-                with torch.no_grad():
-                    rendered = [
-                        renderer(query.u, query.seed, query.spp) for query in mine
-                    ]
-                pictures = torch.stack(list(map(to_8_bit, rendered)))
+        judged = list(judged)
+        configurations = [query.u for query in queries]
+        values = [query.values for query in queries]
+        for claim, change in self.job.config.claims:
+            if change == AWAY:
+                changed_images = self._render_empty(size, queries)
             else:
-                pictures = torch.stack(
-                    [changed(picture, when, problem.model.cameras) for picture in shown]
+                changed_images = torch.stack(
+                    [changed(image, change, problem.model.cameras) for image in images]
                 )
-            after = problem.judge_several(pictures, wholes, listed)
-            for k, (before, now) in enumerate(zip(judged, after, strict=True)):
-                held = float(as_claimed(claim, before.prediction, now.prediction))
-                judged[k] = replace(
-                    before, metrics={**(before.metrics or {}), f"{claim} {when}": held}
-                )
+            changed_judged = problem.judge_several(
+                changed_images, configurations, values
+            )
+            for index, (before, after) in enumerate(
+                zip(judged, changed_judged, strict=True)
+            ):
+                is_claimed = as_claimed(claim, before.prediction, after.prediction)
+                metrics = {
+                    **(before.metrics or {}),
+                    f"{claim} {change}": float(is_claimed),
+                }
+                judged[index] = replace(before, metrics=metrics)
         return judged
 
-    def _renderer(self, size: tuple[int, int]) -> Renderer:
+    def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
+        """Render the scene without its object, with the noise of each query.
+
+        A renderer of its own does it: a scene in which something was far away has other
+        last bits.
+        """
+        if size not in self._empty_renderers:
+            self._empty_renderers[size] = self._make_renderer(size)
+        renderer = self._empty_renderers[size]
+        renderer.scene.assembly.away = True
+        with torch.no_grad():
+            rendered = [renderer(query.u, query.seed, query.spp) for query in queries]
+        return torch.stack(list(map(to_8_bit, rendered)))
+
+    def _make_renderer(self, size: ImageSize) -> Renderer:
         config = self.job.config
-        space = self.points[size].space
         description = framed(self.job.places[self.number].scene.description, size)
         return make_renderer(
             description,
-            space,
+            self.points[size].space,
             size,
             config.denoise,
             config.seed,
             sampler=config.pixel_sampler,
         )
 
-    def _made(
-        self, size: tuple[int, int], queries: Sequence[Query]
+    def _make_images(
+        self, size: ImageSize, queries: Sequence[Query]
     ) -> dict[int, SweptPicture]:
-        """The pictures of one size, rounded to 8 bits, by their numbers."""
-        models = len(self.job.models)
-        before = self.number * self.points[size].count
-        shown = [
-            query for query in queries if self.job.sizes[query.number % models] == size
-        ]
+        """Return the images of one size, rounded to 8 bits, by their numbers."""
+        n_models = len(self.job.models)
+        images_before = self.number * self.points[size].count
+        query_of_image = {
+            query.number // n_models - images_before: query
+            for query in queries
+            if self.job.sizes[query.number % n_models] == size
+        }
         with torch.no_grad():
-            made = self.predicted[size].pictures(
-                {query.number // models - before: query for query in shown}
-            )
+            images = self.predicted[size].pictures(query_of_image)
         return {
-            before + number: replace(swept, picture=to_8_bit(swept.picture))
-            for number, swept in made.items()
+            images_before + number: replace(image, picture=to_8_bit(image.picture))
+            for number, image in images.items()
         }
 
     def picture(self, query: Query) -> Tensor:
-        """Return the picture (H, W, 3) that the first model is asked about."""
-        (made,) = self._made(self.job.sizes[0], [query]).values()
-        return made.picture
+        """Return the image (H, W, 3) of a query to the first model."""
+        (image,) = self._make_images(self.job.sizes[0], [query]).values()
+        return image.picture
 
 
 class OpenScenes:
-    """The scenes of a sweep in this process, of which the last one is held."""
+    """Loads the scenes of a sweep in this process; the last one is cached."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
         self.scene: SweptScene | None = None
 
     def open(self, number: int) -> SweptScene:
-        """The scene with this number; loading it lets the one before go."""
+        """Load the scene with this number, and release the one before."""
         if self.scene is None or self.scene.number != number:
             self.scene = None
             self.scene = SweptScene(self.job, number)
         return self.scene
 
     def named(self, name: str) -> SweptScene:
-        """The same by its number as text: see
-        `advsearch.engine.journal.worker_call`.
+        """Load a scene by its number as text.
+
+        That is the name of its problem: see `advsearch.engine.journal.worker_call`.
         """
         return self.open(int(name))
 
     def asked(self, number: int) -> tuple[SweptScene, list[Query]]:
-        """The scene of a picture, open, and what its models are asked about it."""
+        """Load the scene of an image; return it and the queries of all models."""
         sent = self.job.queries(range(number, number + 1))
         return self.named(str(sent[0][0])), [query for _, _, query in sent]
 
     def picture(self, number: int) -> Tensor:
-        """The picture (H, W, 3) as the first model sees it."""
+        """Render an image (H, W, 3) as the first model gets it."""
         scene, (query, *_) = self.asked(number)
         return scene.picture(query)
 
     def thumbnail(self, number: int) -> bytes:
-        """The same as a small JPEG."""
+        """Render an image as the first model gets it, as a small JPEG."""
         return thumbnails.thumbnail(self.picture(number))
 
     def find_features(self) -> Features:
-        """Find what reads the features that the first model decides by. Raises
-        InputError: the task has none.
+        """Find the layer whose features the first model decides by.
+
+        Raises:
+            InputError: the task has none.
         """
         if self.job.tasks[0].varies:
             raise InputError(
@@ -554,8 +736,19 @@ def check_worst(
     run: RunDirectory | None,
     stages: Stages,
 ) -> WorstVerified | None:
-    """Render a configuration again, and say how often the model is wrong; None without
-    trials. Those that the run has stored already are not made again.
+    """Render the worst configuration again, and count wrong predictions.
+
+    Renders that the run has stored already are not made again.
+
+    Args:
+        problem: of its scene and model.
+        config: of the sweep.
+        u: (d,) the configuration.
+        run: None stores nothing.
+        stages: of the sweep.
+
+    Returns:
+        The rate of wrong predictions; None without trials.
     """
     if config.trials == 0:
         return None
@@ -564,13 +757,16 @@ def check_worst(
     verifier.choose_spp({"worst": u})
     verifier.begin("checking the worst configuration with fresh renders", config.trials)
     spp = verifier.findings.spp
-    count = verifier.findings.sample_count
-    tried = run_trials(
+    sample_count = verifier.findings.sample_count
+    trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
-    wrong = [trial for trial in tried if trial.success]
-    rate = rate_of(Trials(len(wrong), len(tried), spp), tried, wrong)
-    settled = len(verifier.ladder) == 1 or (count is not None and count.converged)
+    wrong_trials = [trial for trial in trials if trial.success]
+    counts = Trials(len(wrong_trials), len(trials), spp)
+    verified_rate = rate_of(counts, trials, wrong_trials)
+    has_converged = sample_count is not None and sample_count.converged
     return WorstVerified(
-        **vars(rate), converged=settled, renders=verifier.findings.verification_renders
+        **vars(verified_rate),
+        converged=len(verifier.ladder) == 1 or has_converged,
+        renders=verifier.findings.verification_renders,
     )

@@ -1,6 +1,7 @@
-"""The loop of a sweep: ask about every configuration, store and count what is
-predicted, sum it up. They are numbered: scenes (beside an adversarial scene first all
-without it), then the grid with its last axis fastest, then draws, then models; a batch
+"""The loop of a sweep: evaluate every row, store and count predictions, sum up.
+
+Rows are numbered by scene (with an adversarial scene, first all without it), then by
+point of the grid with its last axis fastest, then by draw, then by model. A batch
 begins at a multiple of its size, so that a sweep that was stopped, or whose batches
 come in another order, ends bit for bit as any other.
 """
@@ -14,17 +15,19 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
+from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.domain import batches
 from advsearch.cluster import InProcess, Workers
 from advsearch.engine.journal import Journal, Sent, Shared, lost, worker_call
 from advsearch.engine.loading import framed
+from advsearch.engine.problem import Problem
 from advsearch.engine.record import LOST, judgement_of, lost_remarks
 from advsearch.interrupts import interruptible
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress, Stages
 from advsearch.questions.attack.result import save_marked
-from advsearch.questions.sweep import summary as results
 from advsearch.questions.sweep.display import sweep_figure
 from advsearch.questions.sweep.drives import Drives, time_axis
 from advsearch.questions.sweep.job import KIND, Job, OpenScenes, check_all, check_worst
@@ -39,7 +42,16 @@ from advsearch.questions.sweep.result import (
     map_over,
 )
 from advsearch.questions.sweep.settings import BLIND
-from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
+from advsearch.questions.sweep.summary import (
+    BesideClean,
+    ChangeRates,
+    DriveRates,
+    SurfaceMap,
+    SweepSummary,
+    WorstClaim,
+    WorstConfiguration,
+    WorstVerified,
+)
 from advsearch.questions.sweep.surface import map_surface
 from advsearch.report.wording import count, repeats_remark
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
@@ -58,20 +70,32 @@ from advsearch.tasks import Judgement
 from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
 
-# the note under which the store keeps that there were some
+# the note in the store that some values of images were not finite
 NOT_FINITE = "pictures not finite"
-# samples a pixel of the picture that is kept, unless verification needed more
-PICTURE_SPP = 64
-ENOUGH_DRIVES = 20  # of fewer, a sweep says what they could show at best
-TELL_SECONDS = 0.1
-MOST_METERED = 256  # scenes whose gains a summary lists; of more it has none
-DRAWN_AT_ONCE = 4096  # pictures whose draws are worked out at once for the tables
+# samples per pixel of the image that is saved, unless verification needed more
+SAVED_IMAGE_SPP = 64
+ENOUGH_DRIVES = 20  # of fewer, a sweep states what they can show at best
+REPORT_SECONDS = 0.1
+MAX_LISTED_GAINS = 256  # scenes whose gains a summary lists; of more it has none
+SAMPLING_BATCH = 4096  # images whose draws are computed at once for the tables
 
 
 class Sweep:
-    """One sweep, from its first configuration or from where it was stopped: `run` has
-    the rows that are there already, and None keeps it in memory. Without an executor
-    all is done here.
+    """One sweep, from its first row or from where it was stopped.
+
+    Args:
+        job: what is swept.
+        run: the run directory, with the rows that are stored already; None keeps all
+            in memory.
+        progress: reports it.
+        executor: evaluates the batches; None does so in this process.
+
+    Attributes:
+        points: the configurations of the first scene.
+        per_scene: images of a scene.
+        models: how many there are.
+        units: how rows follow from draws.
+        total: rows of the full sweep.
     """
 
     def __init__(
@@ -81,353 +105,409 @@ class Sweep:
         progress: Progress,
         executor: Workers | None = None,
     ) -> None:
-        self.job, self.run, self.stages = job, run, Stages(progress)
+        self.job = job
+        self.run = run
+        self.stages = Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
-        self.points, self._shown = check_all(job)
+        self.points, self._sampled_numbers = check_all(job)
         self.per_scene = self.points.count
         self.models = len(job.models)
         self.units = replace(self.points.units, models=self.models)
-        if run is not None:
-            run.store.set_note(
-                EDGES,
-                json.dumps(
-                    {drawn.name: drawn.edges for drawn in self._shown if drawn.edges}
-                ),
-            )
-            run.store.set_note(NOTE, json.dumps(asdict(self.units)))
         self.total = len(job.places) * self.per_scene * self.models
+        if run is not None:
+            edges = {
+                number.name: number.edges
+                for number in self._sampled_numbers
+                if number.edges
+            }
+            run.store.set_note(EDGES, json.dumps(edges))
+            run.store.set_note(NOTE, json.dumps(asdict(self.units)))
         self._scenes = OpenScenes(job)
-        self._executor = (
-            InProcess(worker_call(self._scenes.named)) if executor is None else executor
-        )
+        if executor is None:
+            self._executor: Workers = InProcess(worker_call(self._scenes.named))
+        else:
+            self._executor = executor
         self.journal = Journal(run, Shared(None, executor))
-        self._rendered = self._traced = self._predicted = self._lost = 0
+        self._n_rendered = 0  # images, by this process or its workers
+        self._n_traced = 0  # images of the full sweep, as its rows state them
+        self._n_predicted = 0
+        self._n_lost = 0
+        # what predicted images, by worker and scene
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
-        self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
-        self._told = 0.0
-        self._untold = 0
-        self._begun = 0.0
-        self._surface: results.SurfaceMap | None = None
-        self._drives: list[results.DriveRates] | None = None
+        self._has_non_finite = (
+            run is not None and run.store.note(NOT_FINITE) is not None
+        )
+        self._sweep_begin = 0.0
+        self._last_report = 0.0
+        self._n_unreported = 0
+        self._surface: SurfaceMap | None = None
+        self._drives: list[DriveRates] | None = None
 
     def carry_out(self, first: int | None = None) -> SweepResult:
-        """Do what is left, or all from the configuration with a number on, and return
-        the result.
+        """Evaluate the rows that are missing, and return the result.
+
+        Args:
+            first: evaluates all rows from this number on instead.
         """
-        predictions = self._counted()
+        predictions = self._read_predictions()
         ending = FINISHED
-        for text in self.job.warnings:
-            self.stages.progress.message(text)
+        for warning in self.job.warnings:
+            self.stages.progress.message(warning)
         try:
             with interruptible():
-                left = [range(first, self.total)] if first is not None else self._left()
-                self._scenes.open(
-                    self._scene_of(left[0].start if left else self.total - 1)
-                )
-                self._go_through(left, predictions)
-                worst = self._worst(predictions, verify=True)
-                if self.job.config.surface and self.run is not None:
-                    self.stages.begin(
-                        "surface", "tracing the surface that was seen", self.total
-                    )
-                    self._surface = map_surface(
-                        self._scenes, self.rows(), self.run, self.stages.progress
-                    )
-                if time_axis(self.job.axes) is not None:
-                    self.stages.begin(
-                        "drives", "rendering the frames of the worst drive"
-                    )
-                    drives = Drives(self.job, self.rows())
-                    if self.run is not None:
-                        drives.keep_worst(self._scenes, self.run)
-                    self._drives = drives.rates()
+                if first is not None:
+                    missing = [range(first, self.total)]
+                else:
+                    missing = self._find_missing()
+                first_row = missing[0].start if missing else self.total - 1
+                self._scenes.open(self._scene_of(first_row))
+                self._evaluate_rows(missing, predictions)
+                worst = self._find_worst(predictions, verify=True)
+                self._map_surface()
+                self._analyze_drives()
         except KeyboardInterrupt:
             ending = INTERRUPTED
-            predictions = self._counted()
-            worst = self._worst(predictions)
+            predictions = self._read_predictions()
+            worst = self._find_worst(predictions)
         self.stages.end()
         return self._finish(predictions, ending, worst)
 
-    def _scene_of(self, configuration: int) -> int:
-        return configuration // self.models // self.per_scene
-
-    def _left(self) -> list[range]:
-        return (
-            [range(self.total)]
-            if self.run is None
-            else list(self.run.store.missing(KIND, self.total))
+    def _map_surface(self) -> None:
+        """Map wrong predictions over the surface, if that was requested."""
+        if not self.job.config.surface or self.run is None:
+            return
+        self.stages.begin("surface", "tracing the surface that was seen", self.total)
+        self._surface = map_surface(
+            self._scenes, self.rows(), self.run, self.stages.progress
         )
 
-    def _go_through(self, left: Sequence[range], predictions: Predictions) -> None:
-        hint = (
-            f"{self.total} predictions, pictures of "
-            f"{count(self.job.spp, 'sample')} "
-            "a pixel; `resolution`, `spp` or "
-        )
-        hint += "fewer points shorten it"
-        keep = self.job.config.keep_pictures
-        if self.run is not None and keep != "none":
-            height, width = self.job.sizes[0]
-            share = (
-                min(1.0, thumbnails.SIDE / max(height, width)) ** 2
-                * height
-                * width
-                / thumbnails.SIDE**2
-            )
-            megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
-            size = (
-                f"{megabytes / 1e3:.1f} GB"
-                if megabytes >= 1e3
-                else f"{max(megabytes, 0.1):.1f} MB"
-            )
-            hint += (
-                "; pictures that are kept take "
-                f"{'about' if keep == 'all' else 'at most about'} {size}"
-            )
-        self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
-        self.stages.progress.advance(self.total - sum(map(len, left)))
-        self._begun = time.monotonic()
-        for done in self._executor.results(self._asked(left)):
+    def _analyze_drives(self) -> None:
+        """Compute the rates over drives, if the frames of a path are swept."""
+        if time_axis(self.job.axes) is None:
+            return
+        self.stages.begin("drives", "rendering the frames of the worst drive")
+        drives = Drives(self.job, self.rows())
+        if self.run is not None:
+            drives.keep_worst(self._scenes, self.run)
+        self._drives = drives.rates()
+
+    def _scene_of(self, row: int) -> int:
+        return row // self.models // self.per_scene
+
+    def _find_missing(self) -> list[range]:
+        """Return the numbers of the rows that are not stored."""
+        if self.run is None:
+            return [range(self.total)]
+        return list(self.run.store.missing(KIND, self.total))
+
+    def _evaluate_rows(
+        self, missing: Sequence[range], predictions: Predictions
+    ) -> None:
+        """Evaluate rows in batches; store and count what is predicted."""
+        title = "rendering and classifying"
+        self.stages.begin("sweep", title, self.total, hint=self._sweep_hint())
+        self.stages.progress.advance(self.total - sum(map(len, missing)))
+        self._sweep_begin = time.monotonic()
+        for done in self._executor.results(self._make_batches(missing)):
             queries = [query for *_, query in done.items]
-            evaluations = (
-                [lost(query, done.lost) for query in queries]
-                if done.lost
-                else done.value
-            )
+            if done.lost:
+                evaluations = [lost(query, done.lost) for query in queries]
+            else:
+                evaluations = done.value
             evaluations = [
                 replace(evaluation, machine=done.machine) for evaluation in evaluations
             ]
             evaluated = list(zip(queries, evaluations, strict=True))
-            if self.run is not None:
-                for query, evaluation in evaluated:
-                    number = query.number // self.models
-                    if evaluation.small is not None:
-                        thumbnails.keep(self.run.path, number, evaluation.small)
-                    if evaluation.layers is not None:
-                        write_layers(
-                            self.run.path / AOV_FOLDER / f"{number:06d}.exr",
-                            *evaluation.layers,
-                        )
-            self._spend(self.journal.keep(evaluated, numbered=True))
-            self._rendered += sum(
+            self._save_images(evaluated)
+            self._add_costs(self.journal.keep(evaluated, numbered=True))
+            self._n_rendered += sum(
                 self.job.first_of_size[query.number % self.models] for query in queries
             )
-            self._transport[done.worker, self._scene_of(queries[0].number)] = (
-                evaluations[-1].light or []
-            )
-            if (
-                any(evaluation.non_finite for evaluation in evaluations)
-                and not self._not_finite
-            ):
-                self._not_finite = True
-                if self.run is not None:
-                    self.run.store.set_note(NOT_FINITE, "yes")
+            scene = self._scene_of(queries[0].number)
+            self._transport[done.worker, scene] = evaluations[-1].light or []
+            if any(evaluation.non_finite for evaluation in evaluations):
+                self._note_non_finite()
             for query, evaluation in evaluated:
                 predictions.add(query.number, evaluation.said)
-            self._tell(len(queries), predictions)
+            self._report(len(queries), predictions)
         self.journal.rows.sort(key=lambda row: row.step)
 
-    def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
-        for part in left:
-            first = part.start // self.models
-            last = -(-part.stop // self.models)
-            while first < last:
-                before = first // self.per_scene * self.per_scene
-                for piece in batches(
-                    first - before,
-                    min(last - before, self.per_scene),
-                    self.job.config.batch,
-                ):
-                    asked = self.job.queries(
-                        range(before + piece.start, before + piece.stop)
+    def _sweep_hint(self) -> str:
+        """Return what the progress says of the work ahead."""
+        hint = (
+            f"{self.total} predictions, pictures of "
+            f"{count(self.job.spp, 'sample')} "
+            "a pixel; `resolution`, `spp` or fewer points shorten it"
+        )
+        keep = self.job.config.keep_pictures
+        if self.run is None or keep == "none":
+            return hint
+        height, width = self.job.sizes[0]
+        scale = min(1.0, thumbnails.SIDE / max(height, width))
+        size_fraction = scale**2 * height * width / thumbnails.SIDE**2
+        n_images = self.total // self.models
+        megabytes = n_images * thumbnails.BYTES * size_fraction / 1e6
+        if megabytes >= 1e3:
+            size = f"{megabytes / 1e3:.1f} GB"
+        else:
+            size = f"{max(megabytes, 0.1):.1f} MB"
+        about = "about" if keep == "all" else "at most about"
+        return f"{hint}; pictures that are kept take {about} {size}"
+
+    def _save_images(self, evaluated: Sequence[tuple[Query, Evaluation]]) -> None:
+        """Save thumbnails and layers that evaluations have, in the run directory."""
+        if self.run is None:
+            return
+        for query, evaluation in evaluated:
+            number = query.number // self.models
+            if evaluation.small is not None:
+                thumbnails.keep(self.run.path, number, evaluation.small)
+            if evaluation.layers is not None:
+                file = self.run.path / AOV_FOLDER / f"{number:06d}.exr"
+                write_layers(file, *evaluation.layers)
+
+    def _note_non_finite(self) -> None:
+        """Note that some values of images were not finite."""
+        if self._has_non_finite:
+            return
+        self._has_non_finite = True
+        if self.run is not None:
+            self.run.store.set_note(NOT_FINITE, "yes")
+
+    def _make_batches(self, missing: Sequence[range]) -> Iterator[list[Sent]]:
+        """Yield the queries of missing rows in batches, none over two scenes.
+
+        A batch begins at a multiple of its size in the scene, whatever is missing, so
+        that its evaluations don't depend on where a sweep was stopped.
+        """
+        batch_size = self.job.config.batch
+        for rows in missing:
+            image = rows.start // self.models
+            last_image = -(-rows.stop // self.models)  # rounded up
+            while image < last_image:
+                scene_begin = image // self.per_scene * self.per_scene
+                images = batches(
+                    image - scene_begin,
+                    min(last_image - scene_begin, self.per_scene),
+                    batch_size,
+                )
+                for batch in images:
+                    queries = self.job.queries(
+                        range(scene_begin + batch.start, scene_begin + batch.stop)
                     )
                     yield [
-                        one for one in asked if part.start <= one[2].number < part.stop
+                        sent
+                        for sent in queries
+                        if rows.start <= sent[2].number < rows.stop
                     ]
-                first = before + self.per_scene
+                image = scene_begin + self.per_scene
 
-    def _tell(self, count: int, predictions: Predictions) -> None:
-        self._untold += count
+    def _report(self, n_rows: int, predictions: Predictions) -> None:
+        """Report progress by some rows, at most every `REPORT_SECONDS`."""
+        self._n_unreported += n_rows
         now = time.monotonic()
-        if now - self._told >= TELL_SECONDS:
-            beside = dict[str, float | str]()
-            if seen := int(predictions.counted.sum()):
-                beside["accuracy"] = (
-                    int((predictions.right & predictions.counted).sum()) / seen
-                )
-            if (facts := self._executor.facts) is not None:
-                beside |= {
-                    **facts.told,
-                    "a second": self._rendered / max(1e-9, now - self._begun),
-                }
-            self.stages.progress.advance(self._untold, **beside)
-            self._told = now
-            self._untold = 0
+        if now - self._last_report < REPORT_SECONDS:
+            return
+        values = dict[str, float | str]()
+        n_counted = int(predictions.counted.sum())
+        if n_counted:
+            n_right = int((predictions.right & predictions.counted).sum())
+            values["accuracy"] = n_right / n_counted
+        facts = self._executor.facts
+        if facts is not None:
+            seconds = max(1e-9, now - self._sweep_begin)
+            values |= {**facts.told, "a second": self._n_rendered / seconds}
+        self.stages.progress.advance(self._n_unreported, **values)
+        self._last_report = now
+        self._n_unreported = 0
 
-    def _counted(self) -> Predictions:
+    def _read_predictions(self) -> Predictions:
+        """Read the predictions of all rows so far, and count their costs anew."""
         predictions = Predictions(self.total)
-        self._traced = self._predicted = self._lost = 0
+        self._n_traced = 0
+        self._n_predicted = 0
+        self._n_lost = 0
         for row in self.rows():
             predictions.add(row.step, judgement_of(row))
-            self._spend([row])
+            self._add_costs([row])
         return predictions
 
     def rows(self) -> Iterable[Row]:
+        """Return all rows so far."""
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
-    def _spend(self, rows: Sequence[Row]) -> None:
-        """Count the pictures that rows took; old ones don't say it."""
+    def _add_costs(self, rows: Sequence[Row]) -> None:
+        """Count the images that rows took."""
         for row in rows:
-            first = self.job.first_of_size[row.step % self.models]
-            self._traced += int(first) if row.renders is None else row.renders
-            self._predicted += row.seed is None and first
-            self._lost += row.label == LOST
+            is_first = self.job.first_of_size[row.step % self.models]
+            # Rows of old versions don't state their renders.
+            self._n_traced += int(is_first) if row.renders is None else row.renders
+            self._n_predicted += row.seed is None and is_first
+            self._n_lost += row.label == LOST
 
-    def _axes(self, numbers: npt.NDArray[np.int64]) -> list[SweptAxis]:
-        """What the tables are by, with the places of configurations by their numbers
-        (n,).
+    def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[SweptAxis]:
+        """Return what tables are by: all axes with several values.
+
+        Args:
+            rows: (n,) numbers of the rows, ascending, whose values are looked up.
         """
-        job = self.job
-        (pictures, model) = np.divmod(numbers, self.models)
-        scene, local = np.divmod(pictures, self.per_scene)
-        axes = []
-        for what in ("object", "environment", "answer"):
-            names = [place.names.get(what, "") for place in job.places]
-            several = list(dict.fromkeys(names))
-            axes.append(
-                SweptAxis(
-                    what,
-                    "",
-                    several,
-                    np.array([several.index(name) for name in names])[scene],
-                )
-            )
-        axes.append(SweptAxis("model", "", [one.name for one in job.models], model))
-        digits = (
-            np.unravel_index(local // job.samples, self.points.grid.sizes)
-            if job.axes
-            else ()
-        )
-        of_the_grid = zip(job.axes, digits, strict=True)
-        axes += [
-            SweptAxis(one.name, one.unit, one.values, at, "grid")
-            for one, at in of_the_grid
+        image, model = np.divmod(rows, self.models)
+        scene, image_in_scene = np.divmod(image, self.per_scene)
+        model_names = [network.name for network in self.job.models]
+        axes = [
+            *self._scene_axes(scene),
+            SweptAxis("model", "", model_names, model),
+            *self._grid_axes(image_in_scene),
         ]
-        if self._shown and len(numbers):
-            scenes = range(0, int(pictures[-1]) + 1, self.per_scene)
-            blocks = [
-                block
-                for first in scenes
-                for block in batches(first, first + self.per_scene, DRAWN_AT_ONCE)
-            ]
-            drawn = [
-                self.points.parts_of(one.start, len(one))
-                for one in blocks
-                if one.start <= pictures[-1]
-            ]
-            parts = zip(self._shown, np.concatenate(drawn)[pictures].T, strict=True)
+        if self._sampled_numbers and len(rows):
+            parts = self._find_parts(image)
             axes += [
-                SweptAxis(one.name, one.unit, one.parts, at, "drawn")
-                for one, at in parts
+                SweptAxis(number.name, number.unit, number.parts, index, "drawn")
+                for number, index in zip(self._sampled_numbers, parts.T, strict=True)
             ]
-        return [one for one in axes if len(one.values) > 1]
+        return [axis for axis in axes if len(axis.values) > 1]
 
-    def _worst(
+    def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[SweptAxis]:
+        """Yield the axes over scenes; `scene` (n,) has the scene of each row."""
+        for name in ("object", "environment", "answer"):
+            scene_values = [
+                named_scene.names.get(name, "") for named_scene in self.job.places
+            ]
+            values = list(dict.fromkeys(scene_values))
+            index_of_scene = np.array([values.index(value) for value in scene_values])
+            yield SweptAxis(name, "", values, index_of_scene[scene])
+
+    def _grid_axes(self, image: npt.NDArray[np.int64]) -> list[SweptAxis]:
+        """Return the axes of the grid; `image` (n,) is numbered in the scene."""
+        if not self.job.axes:
+            return []
+        grid_point = image // self.job.samples
+        indices = np.unravel_index(grid_point, self.points.grid.sizes)
+        return [
+            SweptAxis(axis.name, axis.unit, axis.values, index, "grid")
+            for axis, index in zip(self.job.axes, indices, strict=True)
+        ]
+
+    def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return the part of each of k sampled numbers that images lie in, (n, k).
+
+        Args:
+            images: (n,) their numbers, ascending.
+        """
+        last_image = int(images[-1])
+        parts = list[npt.NDArray[np.int64]]()
+        for scene_begin in range(0, last_image + 1, self.per_scene):
+            scene_end = scene_begin + self.per_scene
+            for batch in batches(scene_begin, scene_end, SAMPLING_BATCH):
+                if batch.start <= last_image:
+                    parts.append(self.points.parts_of(batch.start, len(batch)))
+        return np.asarray(np.concatenate(parts)[images])
+
+    def _find_worst(
         self, predictions: Predictions, verify: bool = False
     ) -> WorstConfiguration | None:
-        """What the sweep saw at its worst; if asked, with what fresh renders say of it,
-        and what the model says of the picture that is kept.
+        """Return the configuration with the smallest margin; None if there is none.
+
+        Args:
+            predictions: of all rows.
+            verify: also renders it again, and saves its image.
         """
-        index = predictions.worst
-        if index is None:
+        row_number = predictions.worst
+        if row_number is None:
             return None
-        rows = (
-            self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
-        )
-        row = next(row for row in rows if row is not None and row.step == index)
-        number, model = divmod(index, self.models)
-        query = self.job.queries(range(number, number + 1))[model][2]
-        task = self.job.tasks[model]
-        scene = self._scene_of(index)
-        if task.varies:
-            truth = (
-                self._scenes.open(scene).problems[model].truth(query.u, query.values)
-            )
-        else:
-            truth = task.truth(self.job.facts(self.job.places[scene], query.values))
+        rows: Iterable[Row | None] = self.journal.rows
+        if self.run is not None:
+            rows = [self.run.store.row(KIND, row_number)]
+        row = next(row for row in rows if row is not None and row.step == row_number)
+        image, model = divmod(row_number, self.models)
+        query = self.job.queries(range(image, image + 1))[model][2]
+        scene = self._scene_of(row_number)
         worst = WorstConfiguration(
-            configuration=index,
+            configuration=row_number,
             values={
                 name: DescribedValue.of(value) for name, value in query.values.items()
             },
             seed=query.seed,
-            label_set=list(task.truth_names(truth)),
-            claimed=_claim_of(judgement_of(row)),
+            label_set=self._find_right_labels(scene, model, query),
+            claimed=_to_claim(judgement_of(row)),
             verified=None,
         )
         if not verify:
             return worst
         problem = self._scenes.open(scene).problems[model]
-        checked = check_worst(problem, self.job.config, query.u, self.run, self.stages)
+        return self._verify_worst(worst, problem, query.u)
+
+    def _find_right_labels(self, scene: int, model: int, query: Query) -> list[str]:
+        """Return the names that count as right in the image of a query."""
+        task = self.job.tasks[model]
+        if task.varies:
+            problem = self._scenes.open(scene).problems[model]
+            truth = problem.truth(query.u, query.values)
+        else:
+            truth = task.truth(self.job.facts(self.job.places[scene], query.values))
+        return list(task.truth_names(truth))
+
+    def _verify_worst(
+        self, worst: WorstConfiguration, problem: Problem, u: Tensor
+    ) -> WorstConfiguration:
+        """Render the worst configuration again, and save its image.
+
+        Args:
+            worst: as the sweep had it.
+            problem: of its scene and model.
+            u: (d,) the configuration.
+        """
+        verified = check_worst(problem, self.job.config, u, self.run, self.stages)
         if self.run is None:
-            return worst.model_copy(update={"verified": checked})
-        picture = problem.picture(
-            query.u, worst.seed, max(PICTURE_SPP, checked.spp if checked else 0)
-        )
-        self.run.save_image("worst", picture)
-        save_marked(self.run, "worst", picture, problem.marks(picture, query.u))
-        pictured = _claim_of(problem.judge(picture, query.u))
-        return worst.model_copy(update={"verified": checked, "pictured": pictured})
+            return worst.model_copy(update={"verified": verified})
+        verified_spp = verified.spp if verified else 0
+        image = problem.picture(u, worst.seed, max(SAVED_IMAGE_SPP, verified_spp))
+        self.run.save_image("worst", image)
+        save_marked(self.run, "worst", image, problem.marks(image, u))
+        pictured = _to_claim(problem.judge(image, u))
+        return worst.model_copy(update={"verified": verified, "pictured": pictured})
 
     def _finish(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepResult:
+        """Summarize the sweep, write its files, and return the result."""
+        summary = self._summarize(predictions, ending, worst)
+        if self.run is not None:
+            for suffix, data in sweep_figure(summary).items():
+                write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
+            write_sweep_page(self.run.path, summary)
+            # The summary comes last: without a page the run has not finished.
+            self.run.write_summary(summary)
+        path = None if self.run is None else self.run.path
+        return SweepResult(summary, path, tuple(self.journal.rows))
+
+    def _summarize(
+        self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
+    ) -> SweepSummary:
+        """Return what `summary.json` holds."""
         job = self.job
-        run = self.run
+        config = job.config
+        path = None if self.run is None else self.run.path
         seconds = self.stages.seconds
-        view = self._scenes.scene
-        checked = worst.verified if worst else None
-        predicting = self._transport.values() or [
-            [one.summary() for one in (view.predicted.values() if view else ())]
-        ]
-        swept = seconds.get("sweep", 0.0)
-        formation = (
-            Formation.of(next(iter(view.renderers.values())).formation)
-            if view
-            else None
-        )
-        gains: dict[str, float] = {}
-        if formation and len(job.places) <= MOST_METERED:
-            for place in job.places:
-                gains[f"{place.object}, {place.environment}"] = framed(
-                    place.scene.description, job.sizes[0]
-                ).gain
-        if formation and len(set(gains.values())) != 1:
-            formation = formation.model_copy(update={"gain": None})
-        models = [model.name for model in job.models]
-        adversarial = job.places[-1].beside_clean
-        numbers = np.flatnonzero(predictions.counted)
-        right = predictions.right[numbers]
-        units = self.units.of(numbers)
-        axes = self._axes(numbers)
-        outcome = predictions.outcome[numbers]
-        changes = self._changes()
-        renders = {
-            "sweep": self._traced,
-            "verification": checked.renders if checked else 0,
-        }
-        pairs = predictions.beside(models, self.units) if adversarial else []
-        summary = results.SweepSummary(
-            run=None if run is None else str(run.path),
-            object=job.config.object,
-            model=",".join(models),
-            task=job.config.task_name,
-            environment=self.points.environment or job.config.lit_by,
+        verified = worst.verified if worst else None
+        formation, gains = self._describe_formation()
+        rows = np.flatnonzero(predictions.counted)
+        right = predictions.right[rows]
+        units = self.units.of(rows)
+        axes = self._make_axes(rows)
+        outcome = predictions.outcome[rows]
+        changes = self._compute_change_rates()
+        return SweepSummary(
+            run=None if path is None else str(path),
+            object=config.object,
+            model=",".join(model.name for model in job.models),
+            task=config.task_name,
+            environment=self.points.environment or config.lit_by,
             controls=[control.name for control in job.controls],
             ending=ending,
             image_formation=formation,
             gains=gains if len(gains) > 1 else None,
-            drawn={one.name: one.varied for one in self._shown},
+            drawn={number.name: number.varied for number in self._sampled_numbers},
             planned=self.total,
             **vars(counted_by_unit(right, units, outcome)),
             out_of_view=int(predictions.hidden.sum()),
@@ -436,63 +516,107 @@ class Sweep:
             not_finite=predictions.not_finite,
             answers=predictions.frequent,
             axes=[row for axis in axes for row in axis.rows(right, units, outcome)],
-            cells=map_over(axes, right, predictions.margin[numbers]),
-            beside=results.BesideClean(answer=adversarial, pairs=pairs)
-            if adversarial
-            else None,
+            cells=map_over(axes, right, predictions.margin[rows]),
+            beside=self._compare_arms(predictions),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
-            sampler=job.config.sampler if self.points.draws else None,
+            sampler=config.sampler if self.points.draws else None,
             spp=job.spp,
-            renders={**renders, "products": self._predicted}
-            if self._predicted
-            else renders,
-            transport=combined([one for light in predicting for one in light]),
+            renders=self._count_renders(verified),
+            transport=self._combine_transport(),
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines),
-            renders_per_second=self._rendered / swept
-            if self._rendered and swept
-            else None,
+            renders_per_second=self._compute_speed(seconds.get("sweep", 0.0)),
             seconds={**seconds, "total": self.stages.total},
-            seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(predictions, checked, changes)],
-            command_line=job.config.command_line(None if run is None else run.path),
-            python_only=job.config.python_only,
-        )
-        if run is not None:
-            for suffix, data in sweep_figure(summary).items():
-                write_bytes(run.path / "images" / f"sweep.{suffix}", data)
-            write_sweep_page(run.path, summary)
-            run.write_summary(summary)  # last: without a page the run is not done
-        return SweepResult(
-            summary, None if run is None else run.path, tuple(self.journal.rows)
+            seed=config.seed,
+            warnings=[*job.warnings, *self._remarks(predictions, verified, changes)],
+            command_line=config.command_line(path),
+            python_only=config.python_only,
         )
 
-    def _changes(self) -> list[results.ChangeRates]:
-        rates: list[results.ChangeRates] = []
-        for claim, when in self.job.config.claims:
-            name = f"{claim} {when}"
-            shown = (row for row in self.rows() if row.label != OUT_OF_VIEW)
-            held = {row.step: row.metrics[name] for row in shown if name in row.metrics}
+    def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:
+        """Return how images are formed, and the gain of each scene.
+
+        The formation states a gain if all scenes have the same; there are no gains of
+        very many scenes.
+        """
+        gains: dict[str, float] = {}
+        if self._scenes.scene is None:
+            return None, gains
+        renderer = next(iter(self._scenes.scene.renderers.values()))
+        formation = Formation.of(renderer.formation)
+        if len(self.job.places) <= MAX_LISTED_GAINS:
+            for named_scene in self.job.places:
+                description = framed(named_scene.scene.description, self.job.sizes[0])
+                gains[f"{named_scene.object}, {named_scene.environment}"] = (
+                    description.gain
+                )
+        if len(set(gains.values())) != 1:
+            formation = formation.model_copy(update={"gain": None})
+        return formation, gains
+
+    def _compare_arms(self, predictions: Predictions) -> BesideClean | None:
+        """Compare the scenes without and with an adversarial configuration."""
+        adversarial = self.job.places[-1].beside_clean
+        if not adversarial:
+            return None
+        models = [model.name for model in self.job.models]
+        pairs = predictions.beside(models, self.units)
+        return BesideClean(answer=adversarial, pairs=pairs)
+
+    def _count_renders(self, verified: WorstVerified | None) -> dict[str, int]:
+        """Return how many images were traced, and how many predicted instead."""
+        n_verification = verified.renders if verified else 0
+        renders = {"sweep": self._n_traced, "verification": n_verification}
+        if self._n_predicted:
+            renders["products"] = self._n_predicted
+        return renders
+
+    def _combine_transport(self) -> LinearTransport | None:
+        """Return what predicted the images, over all workers and scenes."""
+        transport = [
+            summary for summaries in self._transport.values() for summary in summaries
+        ]
+        if not self._transport and self._scenes.scene is not None:
+            predictors = self._scenes.scene.predicted.values()
+            transport = [predictor.summary() for predictor in predictors]
+        return combined(transport)
+
+    def _compute_speed(self, sweep_seconds: float) -> float | None:
+        """Return rendered images a second; None if none was rendered now."""
+        if not self._n_rendered or not sweep_seconds:
+            return None
+        return self._n_rendered / sweep_seconds
+
+    def _compute_change_rates(self) -> list[ChangeRates]:
+        """Return how often predictions of changed images are as claimed."""
+        rates = list[ChangeRates]()
+        for claim, change in self.job.config.claims:
+            metric = f"{claim} {change}"
+            value_of_row = {
+                row.step: row.metrics[metric]
+                for row in self.rows()
+                if row.label != OUT_OF_VIEW and metric in row.metrics
+            }
             for model, network in enumerate(self.job.models):
-                numbers = np.array(
-                    [one for one in held if one % self.models == model], dtype=np.int64
+                rows = np.array(
+                    [row for row in value_of_row if row % self.models == model],
+                    dtype=np.int64,
                 )
-                right = np.array(
-                    [held[one] == 1.0 for one in numbers.tolist()], dtype=bool
+                is_claimed = np.array(
+                    [value_of_row[row] == 1.0 for row in rows.tolist()], dtype=bool
                 )
-                counts = vars(counted_by_unit(right, self.units.of(numbers)))
-                row = (
-                    int(numbers[~right][0])
-                    if len(numbers) and not right.all()
-                    else None
-                )
+                violations = rows[~is_claimed]
                 rates.append(
-                    results.ChangeRates(
-                        **counts, model=network.name, claim=claim, when=when, row=row
+                    ChangeRates(
+                        **vars(counted_by_unit(is_claimed, self.units.of(rows))),
+                        model=network.name,
+                        claim=claim,
+                        when=change,
+                        row=int(violations[0]) if len(violations) else None,
                     )
                 )
         return rates
@@ -500,47 +624,24 @@ class Sweep:
     def _remarks(
         self,
         predictions: Predictions,
-        checked: WorstVerified | None,
-        changes: Sequence[results.ChangeRates],
+        verified: WorstVerified | None,
+        changes: Sequence[ChangeRates],
     ) -> Iterator[str]:
-        yield from (*lost_remarks(self._lost), *self.journal.remarks)
+        """Yield what a reader of the result has to know."""
+        yield from lost_remarks(self._n_lost)
+        yield from self.journal.remarks
         if self.units.noise > 1:
             yield repeats_remark(
                 self.units.name, self.units.noise, self.total // self.units.size
             )
-        few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
-        if few == 1 and self.units.noise == 1:
-            yield "One drive says nothing of others: there is no interval over drives."
-        elif 1 < few < ENOUGH_DRIVES:
-            yield (
-                f"{count(few, 'drive')} can show little: were the model right in all "
-                "their frames, the interval of "
-                f"that share would begin at {100 * most_shown(few):.0f} %."
-            )
-        if hidden := int(predictions.hidden.sum()):
-            seen = count(int(predictions.seen.sum()), "picture")
-            phantoms = predictions.phantoms_out_of_view
-            more = (
-                f" In {phantoms} of them the model finds the object all the same."
-                if phantoms
-                else ""
-            )
-            yield (
-                f"In {hidden} of {seen} nothing of the object is to be seen: they "
-                f"are not counted.{more}"
-            )
-        if predictions.not_finite:
-            yield (
-                f"{predictions.not_finite} predictions of the model are not "
-                "numbers; "
-                "they count as not right."
-            )
-        if self._not_finite:
+        yield from self._drive_remarks()
+        yield from self._prediction_remarks(predictions)
+        if self._has_non_finite:
             yield "Some values of pictures were not finite and were set to 0."
-        if checked and not checked.converged:
+        if verified and not verified.converged:
             yield (
                 "It is not shown that the worst margin keeps its side beyond "
-                f"{checked.spp} samples a pixel, the most "
+                f"{verified.spp} samples a pixel, the most "
                 "that a check takes: noise may take part in it."
             )
         for rates in changes:
@@ -549,17 +650,55 @@ class Sweep:
                 and rates.interval is not None
                 and rates.interval[1] < 0.5
             ):
-                alike = (
-                    f"{rates.configurations - rates.correct} of "
-                    f"{rates.configurations} pictures"
+                n_same = rates.configurations - rates.correct
+                yield (
+                    f"{rates.model} says the same in {n_same} of "
+                    f"{rates.configurations} pictures when {BLIND[rates.when]}: it may "
+                    "not be looking at the object."
                 )
-                text = (
-                    f"{rates.model} says the same in {alike} when {BLIND[rates.when]}"
+
+    def _drive_remarks(self) -> Iterator[str]:
+        """Yield what few drives can show at best."""
+        n_drives = min(
+            (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
+        )
+        if n_drives == 1 and self.units.noise == 1:
+            yield "One drive says nothing of others: there is no interval over drives."
+        elif 1 < n_drives < ENOUGH_DRIVES:
+            lower_bound = most_shown(n_drives)
+            yield (
+                f"{count(n_drives, 'drive')} can show little: were the model right in "
+                "all their frames, the interval of "
+                f"that share would begin at {100 * lower_bound:.0f} %."
+            )
+
+    def _prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
+        """Yield which predictions do not count, or not as right."""
+        n_hidden = int(predictions.hidden.sum())
+        if n_hidden:
+            images = count(int(predictions.seen.sum()), "picture")
+            n_phantoms = predictions.phantoms_out_of_view
+            phantoms = ""
+            if n_phantoms:
+                phantoms = (
+                    f" In {n_phantoms} of them the model finds the object all the same."
                 )
-                yield f"{text}: it may not be looking at the object."
+            yield (
+                f"In {n_hidden} of {images} nothing of the object is to be seen: they "
+                f"are not counted.{phantoms}"
+            )
+        if predictions.not_finite:
+            yield (
+                f"{predictions.not_finite} predictions of the model are not "
+                "numbers; "
+                "they count as not right."
+            )
 
 
-def _claim_of(seen: Judgement) -> results.WorstClaim:
-    return results.WorstClaim(
-        **vars(seen.prediction), margin=seen.margin, payload=seen.payload
+def _to_claim(judgement: Judgement) -> WorstClaim:
+    """Return what a result holds of the prediction in one image."""
+    return WorstClaim(
+        **vars(judgement.prediction),
+        margin=judgement.margin,
+        payload=judgement.payload,
     )

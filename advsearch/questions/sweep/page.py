@@ -1,9 +1,8 @@
-"""The page of one or several sweeps: still pictures and tables that need no script, and
-the explorer over them.
+"""The page of sweeps: still images and tables that need no script, and the explorer.
 
 The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch
-dashboard`, and one of a folder that any web server serves: only where its rows and
-pictures come from differs (`SweepSource`).
+dashboard`, and one of a directory that any web server serves: only where its rows and
+images come from differs (`SweepSource`).
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep import display as sweeps
+from advsearch.questions.sweep.display import of_grid, outcomes_clause, rate_text
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.views import Html, element, join_html
-from advsearch.report.views import shown as shown_of
+from advsearch.report.views import shown as make_view
 from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory
 from advsearch.runs.summary import read_result
@@ -48,21 +47,27 @@ from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumb
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_EMBEDDED = 3_000_000
-"""Bytes of pictures that a page which needs no other file takes along; the worst
-predictions first.
+MAX_EMBEDDED_BYTES = 3_000_000
+"""Bytes of thumbnails in a page that needs no other file, at most; the worst predictions
+first.
 """
-# rows that such a page takes along; more are for `advsearch dashboard`
-MOST_ROWS = 200_000
+# in such a page; more are for `advsearch dashboard`
+MAX_EMBEDDED_ROWS = 200_000
 
 
 @dataclass(frozen=True)
 class SweepSource:
-    """Where the page of a run, by its name, gets what it shows: rows as columns for a
-    page that needs no other file, else the address they are fetched from, in `parts`
-    (``?after=ID``) as those of a sweep that goes on; None where they are too many for
-    such a page, which then has the tables only. And the thumbnails, and their address;
-    None puts them into the page.
+    """Where the page of a sweep gets its rows and images.
+
+    Attributes:
+        name: of the run.
+        rows: as columns, for a page that needs no other file, or the address they are
+            fetched from; None if they are too many for such a page, which then has the
+            tables only.
+        parts: whether the rows are fetched in parts (``?after=ID``), as those of a
+            sweep that goes on.
+        pictures: the thumbnails.
+        folder: address of the thumbnails; None puts them into the page.
     """
 
     name: str
@@ -73,249 +78,242 @@ class SweepSource:
 
     @property
     def embedded(self) -> bool:
+        """Whether the page has the rows in itself."""
         return self.rows is not None and not isinstance(self.rows, str)
 
 
 def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
-    """Write `report.html` of a sweep that has ended, and its rows as columns, into its
-    folder; return the page's path. Raises FileFormatError where results are damaged,
-    StorageError where it cannot be written.
+    """Write `report.html` of a finished sweep, and its rows as columns.
+
+    Args:
+        run: the run directory.
+        summary: of the sweep.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        FileFormatError: the results are corrupt.
+        StorageError: the page cannot be written.
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
-    return write_text(
-        run / directory.REPORT, page(run, summary, columns), durable=False
-    )
+    html = page(run, summary, columns)
+    return write_text(run / directory.REPORT, html, durable=False)
 
 
 def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) -> str:
-    """Return the page of a sweep that needs no other file, with its rows unless they
-    are too many.
+    """Return the page of a sweep that needs no other file.
+
+    Args:
+        run: the run directory.
+        summary: of the sweep.
+        columns: its rows; None reads them. The page has them unless they are too many.
     """
     columns = read_columns(run) if columns is None else columns
-    rows = columns if len(columns) <= MOST_ROWS else None
-    return sweep_page_html(
-        [(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))]
-    )
+    rows = columns if len(columns) <= MAX_EMBEDDED_ROWS else None
+    source = SweepSource(run.name, rows, pictures=kept_pictures(run))
+    return sweep_page_html([(run, summary)], [source])
 
 
 def sweep_page_html(
     runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]
 ) -> str:
-    """Return the page of sweeps as HTML, of each its folder, its result (None where it
-    has none yet) and what its explorer reads.
+    """Return the page of sweeps.
+
+    Args:
+        runs: directory and summary of each; None without a summary yet.
+        sources: what the explorer reads of each.
     """
-    connects = any(isinstance(source.rows, str) or source.folder for source in sources)
-    described = []
-    data = list[Html]()
-    left_out = list[Html]()
-    stills = list[Html]()
-    parts = list[Html | None]()
     explored = [
         (source, *run)
         for source, run in zip(sources, runs, strict=True)
         if source.rows is not None
     ]
-    for number, (source, path, summary) in enumerate(explored):
-        about: JsonObject = {"name": source.name, "parts": source.parts}
-        about |= (
-            {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
-        )
+    descriptions = list[JsonObject]()
+    embedded_rows = list[Html]()
+    image_notes = list[Html]()
+    for index, (source, path, summary) in enumerate(explored):
+        description: JsonObject = {"name": source.name, "parts": source.parts}
         if source.embedded:
-            zipped = base64.b64encode(
-                gzip.compress(packed(source.rows), 6, mtime=0)
-            ).decode()
-            data.append(
-                element(
-                    "script",
-                    Html(zipped),
-                    type="application/octet-stream",
-                    id=f"rows-{number}",
-                )
-            )
-        if (kept := source.pictures) is not None:
-            pictures: JsonObject = {"models": kept.models}
-            if source.folder is not None:
-                pictures |= {
-                    "folder": source.folder,
-                    "suffix": "jpg",
-                    "kept": [*kept.numbers] if kept.some else None,
-                }
-            elif source.embedded:
-                taken: JsonObject = dict(kept.embedded(source.rows, MOST_EMBEDDED))
-                pictures["embedded"] = taken
-                if len(taken) < len(kept.numbers):
-                    some = (
-                        f"{len(taken):,} of the {len(kept.numbers):,} pictures "
-                        "that "
-                        "were kept"
-                    )
-                    left_out.append(
-                        element(
-                            "p",
-                            f"This file has {some}, those of the worst margins.",
-                            class_="soft",
-                        )
-                    )
-            about["pictures"] = pictures
-        described.append(about | _judged(path, summary))
-    # what is shown of a sweep on a page alone, and how it came about
+            row_id = f"rows-{index}"
+            description["embedded"] = row_id
+            embedded_rows.append(_embed_rows(source.rows, row_id))
+        else:
+            description["rows"] = source.rows
+        if source.pictures is not None:
+            images, note = _describe_images(source, source.pictures)
+            description["pictures"] = images
+            image_notes += [] if note is None else [note]
+        descriptions.append(description | _describe_evaluation(path, summary))
+
+    stills = list[Html]()
+    parts = list[Html | None]()
     for path, summary in runs:
         if summary is not None:
-            stills.append(_still(path, summary))
-            shown = shown_of(summary)
-            of_a_page = [
-                part
-                for part in shown.sections
-                if part.only == "page" and not part.empty
-            ]
-            parts += [
-                *(part_html(path, part, shown.said) for part in of_a_page),
-                end_html(path, summary, shown),
-            ]
-    explorer = (
-        element("div", id="explorer", hidden="hidden") if explored else _too_many(runs)
+            stills.append(_still_html(path, summary))
+            parts += _page_parts_html(path, summary)
+    explorer = element("div", id="explorer", hidden="hidden")
+    if not explored:
+        explorer = _too_many_rows_html(runs)
+    needs_connection = any(
+        isinstance(source.rows, str) or source.folder for source in sources
     )
-    main = element("main", explorer, *left_out, *stills, *parts)
-    data = [data_script(described, "runs"), *data]
-    title = ", ".join(path.name for path, _ in runs)
     return document(
-        title, _header(runs), main, data=data, scripts=["sweep.js"], connects=connects
+        ", ".join(path.name for path, _ in runs),
+        _header_html(runs),
+        element("main", explorer, *image_notes, *stills, *parts),
+        data=[data_script(descriptions, "runs"), *embedded_rows],
+        scripts=["sweep.js"],
+        connects=needs_connection,
     )
 
 
-def _judged(run: Path, summary: SweepSummary | None) -> JsonObject:
-    """The task, as far as settings can be read where there is no result yet, the axes
-    of the grid, and height and width in pixels of what was judged, where that is one
-    size: boxes are told in them.
+def _embed_rows(rows: Any, element_id: str) -> Html:
+    """Return a script element that holds rows, compressed."""
+    zipped = gzip.compress(packed(rows), 6, mtime=0)
+    encoded = Html(base64.b64encode(zipped).decode())
+    return element("script", encoded, type="application/octet-stream", id=element_id)
+
+
+def _describe_images(
+    source: SweepSource, thumbnails: Kept
+) -> tuple[JsonObject, Html | None]:
+    """Return where the explorer finds thumbnails, and which are left out, if any."""
+    images: JsonObject = {"models": thumbnails.models}
+    if source.folder is not None:
+        images["folder"] = source.folder
+        images["suffix"] = "jpg"
+        images["kept"] = [*thumbnails.numbers] if thumbnails.some else None
+        return images, None
+    if not source.embedded:
+        return images, None
+    embedded: JsonObject = dict(thumbnails.embedded(source.rows, MAX_EMBEDDED_BYTES))
+    images["embedded"] = embedded
+    n_thumbnails = len(thumbnails.numbers)
+    if len(embedded) == n_thumbnails:
+        return images, None
+    note = (
+        f"This file has {len(embedded):,} of the {n_thumbnails:,} pictures that were "
+        "kept, those of the worst margins."
+    )
+    return images, element("p", note, class_="soft")
+
+
+def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
+    """Return what only a page shows of a sweep, and how its result came about."""
+    view = make_view(summary)
+    page_parts = [
+        part for part in view.sections if part.only == "page" and not part.empty
+    ]
+    return [
+        *(part_html(path, part, view.said) for part in page_parts),
+        end_html(path, summary, view),
+    ]
+
+
+def _describe_evaluation(run: Path, summary: SweepSummary | None) -> JsonObject:
+    """Return what the explorer has to know of a sweep.
+
+    That is the task, the axes of the grid, and height and width in pixels of the
+    evaluated images if all have one size: boxes are in these. Without a summary it is
+    the task, as far as the settings can be read.
     """
     if summary is None:
         with suppress(AdvsearchError):
-            given = read_yaml(run / directory.CONFIG).get("task")
-            return {
-                "task": str(
-                    given.get("name") if isinstance(given, Mapping) else given
-                ).partition("=")[0]
-            }
+            task = read_yaml(run / directory.CONFIG).get("task")
+            name = task.get("name") if isinstance(task, Mapping) else task
+            return {"task": str(name).partition("=")[0]}
         return {}
-    formed = summary.image_formation
-    size = (
-        None
-        if formed is None or "," in summary.model
-        else list[JsonValue](formed.resolution)
-    )
-    grid = list[JsonValue](dict.fromkeys(row.axis for row in summary.axes))
+    formation = summary.image_formation
+    size = None
+    if formation is not None and "," not in summary.model:
+        size = list[JsonValue](formation.resolution)
     return {
         "task": summary.task,
         "size": size,
-        "grid": grid,
+        "grid": list[JsonValue](dict.fromkeys(row.axis for row in summary.axes)),
         "drives": bool(summary.drives),
     }
 
 
-def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    """Return the header: of each sweep its subject, its result and its warnings."""
     lines: list[Html] = []
+    heading = "h1" if len(runs) == 1 else "h2"
     for path, summary in runs:
-        title = "h1" if len(runs) == 1 else "h2"
         if summary is None:
-            lines += [element(title, f"{path.name}: this sweep has not ended yet")]
+            lines += [element(heading, f"{path.name}: this sweep has not ended yet")]
             continue
-        what = subject_html(
+        subject = subject_html(
             ("object", summary.object),
             ("environment", summary.environment),
             ("model", summary.model),
         )
         lines += [
-            element("p", f"sweep {path.name}; ", what, class_="eyebrow"),
-            element(title, sweep_verdict(summary)),
+            element("p", f"sweep {path.name}; ", subject, class_="eyebrow"),
+            element(heading, sweep_verdict(summary)),
+            remarks_html(summary.warnings),
         ]
-        lines += [remarks_html(summary.warnings)]
-    return element(
-        "header",
-        element("h1", "Sweeps side by side") if len(runs) > 1 else None,
-        *lines,
-    )
+    title = element("h1", "Sweeps side by side") if len(runs) > 1 else None
+    return element("header", title, *lines)
 
 
-def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
-    """What stands in the explorer's place in a file that would take more rows along
-    than it may.
-    """
-    served = shlex.join(
-        ["advsearch", "dashboard", *(directory.typed_name(path) for path, _ in runs)]
-    )
+def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    """Return what replaces the explorer in a file that would have too many rows."""
+    names = [directory.typed_name(path) for path, _ in runs]
+    command = shlex.join(["advsearch", "dashboard", *names])
     counts = ", ".join(
         f"{summary.configurations:,}" for _, summary in runs if summary is not None
     )
-    left = (
+    return element(
+        "p",
         f"This file leaves out the {counts} rows, and what pictures they have: it "
-        f"takes {MOST_ROWS:,} along at most. "
-    )
-    explores = [
-        element("code", served),
+        f"takes {MAX_EMBEDDED_ROWS:,} along at most. ",
+        element("code", command),
         " explores them all, and so does the folder that ",
-    ]
-    made = [
         element("code", "advsearch view"),
         " makes with its option ",
         element("code", "bundle"),
         ".",
-    ]
-    return element("p", left, *explores, *made, class_="soft")
+        class_="soft",
+    )
 
 
 def sweep_verdict(summary: SweepSummary) -> str:
+    """Return the result of a sweep in a sentence, also of one that goes on."""
     if not summary.configurations:
-        return (
-            "The object is in no picture."
-            if summary.out_of_view
-            else "No configuration was looked at."
-        )
+        if summary.out_of_view:
+            return "The object is in no picture."
+        return "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
         return " ".join(
-            beside_text(summary.beside.answer, one) for one in summary.beside.pairs
+            beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs
         )
-    ended = (
-        ""
-        if summary.looked_at == summary.planned
-        else f" so far, of {summary.planned} planned"
-    )
-    share = f"({sweeps.rate_text(summary)}){sweeps.of_grid(summary)}"
-    outcomes = sweeps.outcomes_clause(summary)
+    so_far = ""
+    if summary.looked_at != summary.planned:
+        so_far = f" so far, of {summary.planned} planned"
+    accuracy = f"({rate_text(summary)}){of_grid(summary)}"
     return (
         f"Right in {summary.correct} of {summary.configurations} "
-        f"configurations{ended} {share}{outcomes}."
+        f"configurations{so_far} {accuracy}{outcomes_clause(summary)}."
     )
 
 
-def _still(path: Path, summary: SweepSummary) -> Html:
-    """What a page without a script shows in the explorer's place."""
-    single = (
-        summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
-    )
-    axes = (
-        " and ".join(list(dict.fromkeys(row.axis for row in summary.axes))[:2])
-        or "all configurations"
-    )
-    figure = _figure(
-        path / "images" / "sweep.png",
-        f"{'Margin' if single else 'Accuracy'} over {axes}.",
-    )
-    text = ""
-    if summary.worst is not None:
-        values = ", ".join(
-            f"{name} {wording.number_text(one.value)}"
-            for name, one in summary.worst.values.items()
-        )
-        claim = summary.worst.pictured or summary.worst.claimed
-        rate = summary.worst.verified
-        text = f"{values}: the model predicts {prediction_text(summary.task, claim)}"
-        if rate is not None:
-            tally = wording.tally(
-                "wrong", rate.successes, rate.trials, rate.not_a_number
-            )
-            text += f"; {tally} fresh renders"
-    worst = _figure(path / "images" / "worst.png", f"{text}." if text else "")
+def _still_html(path: Path, summary: SweepSummary) -> Html:
+    """Return what a page without a script shows in the explorer's place.
+
+    Args:
+        path: the run directory.
+        summary: of the sweep.
+    """
+    measure = "Accuracy"
+    if summary.cells and max(map(max, summary.cells.configurations)) <= 1:
+        measure = "Margin"
+    axis_names = list(dict.fromkeys(row.axis for row in summary.axes))
+    axes = " and ".join(axis_names[:2]) or "all configurations"
+    figure = _figure_html(path / "images" / "sweep.png", f"{measure} over {axes}.")
+    worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
     return join_html(
         element("div", figure, class_="pictures", data_still="true")
         if figure
@@ -325,7 +323,26 @@ def _still(path: Path, summary: SweepSummary) -> Html:
     )
 
 
-def _figure(file: Path, caption: str) -> Html | None:
+def _worst_caption(summary: SweepSummary) -> str:
+    """Return the caption of the worst image; empty without one."""
+    worst = summary.worst
+    if worst is None:
+        return ""
+    values = ", ".join(
+        f"{name} {wording.number_text(described.value)}"
+        for name, described in worst.values.items()
+    )
+    claim = worst.pictured or worst.claimed
+    text = f"{values}: the model predicts {prediction_text(summary.task, claim)}"
+    rate = worst.verified
+    if rate is not None:
+        wrong = wording.tally("wrong", rate.successes, rate.trials, rate.not_a_number)
+        text += f"; {wrong} fresh renders"
+    return f"{text}."
+
+
+def _figure_html(file: Path, caption: str) -> Html | None:
+    """Return a PNG file as a figure; None if there is no such file."""
     if not file.is_file():
         return None
     image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=caption)
@@ -333,10 +350,19 @@ def _figure(file: Path, caption: str) -> Html | None:
 
 
 def result_of(run: Path) -> SweepSummary | None:
-    """Return the result of the sweep in a folder; None where it has none yet. Raises
-    FileFormatError where it is damaged, or that of another command.
+    """Read the result of a sweep.
+
+    None if it has none yet, or is a run of another command.
+
+    Args:
+        run: the run directory.
+
+    Raises:
+        FileFormatError: the result is corrupt.
     """
-    result = read_result(run) if (run / "summary.json").is_file() else None
+    if not (run / "summary.json").is_file():
+        return None
+    result = read_result(run)
     return result if isinstance(result, SweepSummary) else None
 
 
@@ -344,9 +370,20 @@ INDEX = "index.html"
 
 
 def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
-    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of
-    another run; return the page. Raises InputError where the folder is there and not
-    empty, or these runs have no common page, and otherwise as `write_sweep_page`.
+    """Write a directory with a page, the rows and the thumbnails of sweeps.
+
+    Of a run of another command, it has its page.
+
+    Args:
+        runs: run directories.
+        folder: which is written.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        InputError: the directory is there and not empty, or these runs have no common
+            page; and as `write_sweep_page`.
     """
     check_free_folder(folder, "bundle")
     results = [(run, read_result(run)) for run in runs]
@@ -356,40 +393,39 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
             run, result = results[0]
-            # made anew: what lies there may be anybody's
-            for page in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
-                write_text(
-                    folder / page.relative_to(run),
-                    page_of(page.parent, read_result(page.parent)),
-                )
+            # Pages are made anew: what lies in the run may be anybody's.
+            for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
+                html = page_of(file.parent, read_result(file.parent))
+                write_text(folder / file.relative_to(run), html)
             return write_text(folder / INDEX, page_of(run, result))
         if len(sweeps) < len(results):
             raise InputError(
                 "bundle: one run or several sweeps make a page; give one kind of them"
             )
-        sources = list[SweepSource]()
-        for number, (run, _) in enumerate(sweeps):
-            # a page that was opened by a double click may load pictures beside it, and
-            # no rows
-            columns = read_columns(run)
-            pictures = f"pictures-{number}"
-            rows = f"rows-{number}.bin"
-            embedded = len(columns) <= MOST_ROWS
-            if not embedded:
-                write_bytes(folder / rows, packed(columns))
-            kept = kept_pictures(run)
-            for picture in kept.numbers if kept else ():
-                place = path_of(folder / pictures, picture)
-                write_bytes(
-                    folder / pictures / place.parent.name / place.name,
-                    read_thumbnail(run, picture),
-                )
-            sources.append(
-                SweepSource(
-                    run.name,
-                    columns if embedded else rows,
-                    pictures=kept,
-                    folder=pictures,
-                )
-            )
+        sources = [
+            _write_source(run, index, folder) for index, (run, _) in enumerate(sweeps)
+        ]
         return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
+
+
+def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
+    """Write rows and thumbnails of a sweep into the directory of a bundle.
+
+    Args:
+        run: the run directory.
+        index: of the sweep in the bundle.
+        folder: of the bundle.
+    """
+    # A page that was opened by a double click may load images from files, but no rows.
+    columns = read_columns(run)
+    rows: pd.DataFrame | str = columns
+    if len(columns) > MAX_EMBEDDED_ROWS:
+        rows = f"rows-{index}.bin"
+        write_bytes(folder / rows, packed(columns))
+    image_folder = f"pictures-{index}"
+    stored = kept_pictures(run)
+    for number in stored.numbers if stored else ():
+        file = path_of(folder / image_folder, number)
+        target = folder / image_folder / file.parent.name / file.name
+        write_bytes(target, read_thumbnail(run, number))
+    return SweepSource(run.name, rows, pictures=stored, folder=image_folder)

@@ -1,9 +1,10 @@
-"""What predicts pictures of a sweep, for each *group* of pictures that have the rest in
-common, and by the group alone, so that a sweep that was stopped goes on with the same.
-Some are traced beside; where predicted ones are too far off, the group is rendered.
-Where light alone differs, pictures are put together from basis pictures
-(docs/transport.md); where the camera alone differs, from light on surfaces
-(docs/surface-light.md).
+"""Predictors of the images of a sweep.
+
+Each serves a *group* of images that have the rest in common, and follows from the group
+alone, so that a sweep that was stopped goes on with the same. Some images are traced
+for comparison; where predicted ones deviate too much, the group is rendered. Where
+light alone differs, images are combined from basis images (docs/transport.md); where
+the camera alone differs, from light on surfaces (docs/surface-light.md).
 """
 
 from __future__ import annotations
@@ -50,16 +51,26 @@ from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
 from advsearch.scene.transport.matrix import SPP
 from advsearch.trust.stored_files import scaled
 
-PAYS = 2.0
-"""Times the samples that a prediction takes, comparisons included, that a group has to
-take rendered, for it to pay.
+MIN_SAVING_FACTOR = 2.0
+"""A group is predicted if rendering it takes this many times the samples of a
+prediction, comparisons included.
 """
 
 
 class Groups:
-    """How the pictures of a scene fall into groups: whether they may differ along each
-    axis of the grid (`within`), and in what is `drawn`. The frames of a drive, on the
-    axis `frames`, have one draw.
+    """How the images of a scene fall into groups that one predictor serves.
+
+    Args:
+        grid: of the sweep.
+        samples: at each point of the grid.
+        within: whether images of a group may differ along each axis of the grid.
+        drawn: whether they may differ in what is sampled.
+        frames: the axis with the frames of a drive, which have one draw.
+
+    Attributes:
+        size: images of a group.
+        count: groups.
+        at_once: groups that have to be cached, so that no predictor is made twice.
     """
 
     def __init__(
@@ -72,82 +83,106 @@ class Groups:
     ) -> None:
         self.grid = grid
         self.samples = samples
-        # draws are like one more axis, the fastest
-        self._all = Product((*grid.sizes, samples))
-        self._free = (
-            *(
-                within[axis] and (drawn or axis == frames)
-                for axis in range(len(within))
-            ),
-            drawn,
-        )
-        axes = list(zip(self._all.sizes, self._free, strict=True))
-        self._within = Product(tuple(size for size, free in axes if free))
-        self._between = Product(tuple(size for size, free in axes if not free))
+        # Samples are like one more axis, the fastest.
+        self._all_axes = Product((*grid.sizes, samples))
+        axis_is_within = [
+            may_differ and (drawn or axis == frames)
+            for axis, may_differ in enumerate(within)
+        ]
+        self._is_within = (*axis_is_within, drawn)
+        within_sizes = self._select(self._all_axes.sizes, True)
+        between_sizes = self._select(self._all_axes.sizes, False)
+        self._within = Product(tuple(within_sizes))
+        self._between = Product(tuple(between_sizes))
         self.size = self._within.count
         self.count = self._between.count
-        first = self._free.index(True) if True in self._free else len(axes)
-        # how many have to be held at once, so that none is made twice
-        self.at_once = math.prod(size for size, free in axes[first:] if not free)
+        self.at_once = 1
+        if True in self._is_within:
+            # Groups differ along slower axes one after the other.
+            first_within = self._is_within.index(True)
+            for axis in range(first_within, len(self._is_within)):
+                if not self._is_within[axis]:
+                    self.at_once *= self._all_axes.sizes[axis]
+
+    def _select(self, values: Sequence[int], is_within: bool) -> list[int]:
+        """Return the values of the axes within groups, or of those between."""
+        return [
+            value
+            for value, within in zip(values, self._is_within, strict=True)
+            if within == is_within
+        ]
 
     def group(self, number: int) -> int:
-        """Return the number of the group of a picture of the scene."""
-        digits = zip(self._all.digits(number), self._free, strict=True)
-        return self._between.index([digit for digit, free in digits if not free])
+        """Return the index of the group of an image of the scene."""
+        digits = self._all_axes.digits(number)
+        return self._between.index(self._select(digits, False))
 
-    def member(self, number: int, place: int) -> int:
-        """Return the number of the picture at a place among those of the group of
-        another one.
+    def member(self, number: int, index: int) -> int:
+        """Return the number of another image of the group of an image.
+
+        Args:
+            number: of the image.
+            index: index of the other one in the group.
         """
-        own = iter(self._within.digits(place))
-        digits = zip(self._all.digits(number), self._free, strict=True)
-        return self._all.index([next(own) if free else digit for digit, free in digits])
+        within_digits = iter(self._within.digits(index))
+        digits = self._all_axes.digits(number)
+        return self._all_axes.index(
+            [
+                next(within_digits) if is_within else digit
+                for digit, is_within in zip(digits, self._is_within, strict=True)
+            ]
+        )
 
 
 Fall = Callable[[frozenset[str]], Groups]
-"""How pictures fall into groups that may differ in some groups of coordinates
+"""Makes the groups whose images may differ in some groups of coordinates
 (`control.parameter`).
 """
 
 
 class BasisPictures:
-    """Predicts pictures of one scene at one size by a basis picture of each light. It
-    `follows` groups of coordinates: the pictures of a group may differ in these, and
-    one `moves` if it changes more than the finished picture.
+    """Predicts the images of a scene at one size by a basis image of each light.
+
+    Attributes:
+        follows: groups of coordinates in which the images of a group may differ.
+        moves: whether one of these changes more than the finished image.
     """
 
     name = "basis pictures"
     samples = SPP
-    """Samples a pixel of what predicts."""
+    """Samples per pixel of what predicts."""
     bytes = 0
     """Memory of what groups share."""
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
         self._moving = lighting(renderer)
-        self.follows, self.moves = (
-            frozenset(self._moving.groups),
-            any(self._moving.groups.values()),
-        )
+        self.follows = frozenset(self._moving.groups)
+        self.moves = any(self._moving.groups.values())
 
     def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
-        """Return why pictures of so many samples a pixel are rendered; None if they are
-        predicted.
+        """Return why images are rendered; None if they are predicted.
+
+        Args:
+            fall: makes the groups.
+            spp: samples per pixel of the images.
         """
         renderer = self._renderer
         groups = fall(self.follows)
         if renderer.formation.denoiser != "oidn":
             return NOISE
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        lights = len(Lights(renderer, self._moving, inputs).alone)
-        least = math.ceil(PAYS * (lights * SPP + VIEWS * (2 * CHECK_SPP + spp)) / spp)
-        if groups.size < least:
+        n_lights = len(Lights(renderer, self._moving, inputs).alone)
+        prediction_samples = n_lights * SPP + VIEWS * (2 * CHECK_SPP + spp)
+        min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
+        if groups.size < min_images:
             return Refusal(
-                f"basis pictures pay where {least} pictures or more differ in light "
-                f"alone; here {groups.size} do"
+                f"basis pictures pay where {min_images} pictures or more differ in "
+                f"light alone; here {groups.size} do"
             )
         height, width = renderer.formation.resolution
-        if groups.at_once * lights * 8 * height * width > scaled(MOST_BYTES):
+        n_bytes = groups.at_once * n_lights * 8 * height * width
+        if n_bytes > scaled(MOST_BYTES):
             return Refusal(
                 f"basis pictures of {groups.count} groups take too much memory; make "
                 "light the last axes of the grid"
@@ -155,79 +190,102 @@ class BasisPictures:
         return None
 
     def make_predictor(self, u: Tensor, seed: int) -> Predictor:
-        """Return what predicts the pictures that have everything else in common with a
-        configuration.
+        """Return the predictor of the images of a group.
+
+        Args:
+            u: (d,) configuration of one of them.
+            seed: of its light paths.
         """
         return BasisRenderer(self._renderer, u, seed, moving=self._moving)
 
 
-ARRANGED = 2_200_000
-LIT = 80_000
+ARRANGEMENT_SAMPLES = 2_200_000
+LIGHT_SAMPLES = 80_000
 """Samples that take as long as finding what texels see, and the light of an
-environment: 0.8 and 0.03 s where a picture of 128 x 128 pixels with 8 samples a pixel
+environment: 0.8 and 0.03 s where an image of 128 x 128 pixels with 8 samples per pixel
 takes 46 ms.
 """
-SHOWN = 0.8  # samples a pixel that take as long as a predicted picture
-ARRANGED_BYTES = 50_000_000  # memory of an arrangement, about
-LIT_BYTES = 4_000_000  # memory of the light of an environment beside its map, about
+PREDICTION_SPP = 0.8  # samples per pixel that take as long as a predicted image
+ARRANGEMENT_BYTES = 50_000_000  # memory of an arrangement, about
+LIGHT_BYTES = 4_000_000  # memory of the light of an environment besides its map, about
 
 
-def pays_from(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
-    """Return how many pictures under one light have to be wanted for it to pay, where
-    what texels see is found `arrangements` times for each light.
+def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
+    """Return how many images under one light make light on surfaces pay.
+
+    Args:
+        renderer: of the images.
+        spp: samples per pixel of the images.
+        arrangements: arrangements that are found for each light.
     """
     height, width = renderer.formation.resolution
-    samples = (ARRANGED * arrangements + LIT) / (height * width) + VIEWS * (
-        2 * CHECK_SPP + spp
+    light_samples = (ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES) / (
+        height * width
     )
-    return math.ceil(PAYS * samples / (spp - SHOWN))
+    check_samples = VIEWS * (2 * CHECK_SPP + spp)
+    samples = light_samples + check_samples
+    return math.ceil(MIN_SAVING_FACTOR * samples / (spp - PREDICTION_SPP))
 
 
 class LightOnSurfaces:
-    """The same by light that is kept on surfaces. Groups in which object and
-    surroundings stand the same share what these see of each other; its rays are the
-    same wherever things stand, so that it does not matter which of the groups is first.
+    """Predicts the images of a scene at one size by light that is stored on surfaces.
+
+    Groups in which object and surroundings stand the same share an *arrangement*: what
+    these see of each other. Its rays are the same wherever things stand, so that it
+    does not matter which of the groups is first.
+
+    Attributes:
+        follows: groups of coordinates in which the images of a group may differ.
+        moves: whether one of these moves the camera.
     """
 
     name = "surface light"
     samples = RAYS
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
-        self._renderer, self._seed = renderer, seeds.stream(seed, "surface light")
-        self._arranged: list[SurfaceRenderer] = []
-        self._changes = {
+        self._renderer = renderer
+        self._seed = seeds.stream(seed, "surface light")
+        self._arrangements: list[SurfaceRenderer] = []
+        self._max_arrangements = 0
+        self._changed_inputs = {
             group.name: varied(renderer, [group.name])
             for group in renderer.space.groups
         }
-        self.follows = self._changing(CAMERAS)
-        self.moves = any(self._changes[name] & CAMERAS for name in self.follows)
+        self.follows = self._find_groups_changing_only(CAMERAS)
+        self.moves = any(self._changed_inputs[name] & CAMERAS for name in self.follows)
 
-    def _changing(self, inputs: frozenset[str]) -> frozenset[str]:
-        """The groups of coordinates that change nothing but these inputs, and the
-        finished picture.
+    def _find_groups_changing_only(self, inputs: frozenset[str]) -> frozenset[str]:
+        """Return the groups of coordinates that change nothing but these inputs.
+
+        They may change the finished image, too.
         """
+        allowed = inputs | ON_PICTURE
         return frozenset(
-            name
-            for name, found in self._changes.items()
-            if found <= inputs | ON_PICTURE
+            name for name, changed in self._changed_inputs.items() if changed <= allowed
         )
 
     def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
+        """Return why images are rendered; None if they are predicted.
+
+        Args:
+            fall: makes the groups.
+            spp: samples per pixel of the images.
+        """
         groups = fall(self.follows)
-        arranged = fall(self._changing(FREE - {COLOR}))
-        self._most_arranged = arranged.at_once
-        least = pays_from(self._renderer, spp, arranged.count / groups.count)
-        if groups.size < least:
+        arranged = fall(self._find_groups_changing_only(FREE - {COLOR}))
+        self._max_arrangements = arranged.at_once
+        min_images = find_break_even(self._renderer, spp, arranged.count / groups.count)
+        if groups.size < min_images:
             return Refusal(
-                f"light on surfaces pays where {least} pictures differ in the camera "
-                f"alone; here {groups.size} do"
+                f"light on surfaces pays where {min_images} pictures differ in the "
+                f"camera alone; here {groups.size} do"
             )
-        if (reason := why_not_kept(self._renderer)) is not None:
-            return reason
-        lit = LIT_BYTES + 4 * self._renderer.scene.base(MAP).numel()
-        if arranged.at_once * ARRANGED_BYTES + groups.at_once * lit > scaled(
-            MOST_BYTES
-        ):
+        refusal = why_not_kept(self._renderer)
+        if refusal is not None:
+            return refusal
+        light_bytes = LIGHT_BYTES + 4 * self._renderer.scene.base(MAP).numel()
+        n_bytes = arranged.at_once * ARRANGEMENT_BYTES + groups.at_once * light_bytes
+        if n_bytes > scaled(MOST_BYTES):
             return Refusal(
                 f"light of {groups.count} groups takes too much memory; make the "
                 "camera the last axes of the grid"
@@ -235,26 +293,38 @@ class LightOnSurfaces:
         return None
 
     def make_predictor(self, u: Tensor, seed: int) -> Predictor:
+        """Return the predictor of the images of a group.
+
+        Args:
+            u: (d,) configuration of one of them.
+            seed: not used; all arrangements have the same rays.
+        """
         with torch.no_grad():
             inputs = self._renderer.scene.assembly(self._renderer.space.inputs(u))
-            arranged = next((one for one in self._arranged if one.stands(inputs)), None)
-            if arranged is None:
-                if len(self._arranged) >= self._most_arranged:
-                    self._arranged.pop(0)
-                arranged = SurfaceRenderer(self._renderer, u, self._seed)
-                self._arranged.append(arranged)
-            return arranged.under(inputs)
+            for arrangement in self._arrangements:
+                if arrangement.stands(inputs):
+                    return arrangement.under(inputs)
+            if len(self._arrangements) >= self._max_arrangements:
+                self._arrangements.pop(0)
+            arrangement = SurfaceRenderer(self._renderer, u, self._seed)
+            self._arrangements.append(arrangement)
+            return arrangement.under(inputs)
 
     @property
     def bytes(self) -> int:
-        return sum(one.bytes for one in self._arranged)
+        """Memory of the arrangements."""
+        return sum(arrangement.bytes for arrangement in self._arrangements)
 
 
 @dataclass(frozen=True, eq=False)
 class SweptPicture:
-    """A picture (H, W, 3), sRGB in [0, 1]; the samples a pixel of what predicted it, 0
-    if it was rendered; and how many were traced for it, of the first of a group all
-    that were traced for the group.
+    """An image of a sweep.
+
+    Attributes:
+        picture: (H, W, 3), sRGB in [0, 1].
+        predicted: samples per pixel of what predicted it; 0 if it was rendered.
+        traced: images that were traced for it; those for a group count for the first
+            image of the group.
     """
 
     picture: Tensor
@@ -264,12 +334,20 @@ class SweptPicture:
 
 @dataclass
 class PredictedSweep:
-    """Makes pictures of one scene at one size, as a problem of one of the models has
-    them.
+    """Makes the images of one scene at one size, by prediction where that pays.
 
-    `before` it, the other scenes have so many pictures. Every picture is rendered where
-    there is a `refusal`, and in groups that are `left` since predictions were too far
-    off.
+    Attributes:
+        problem: of a model that gets these images.
+        points: the configurations of the scene.
+        axes: of the grid.
+        seed: of the predictors.
+        specialise: whether anything is predicted.
+        before: images of the scenes before this one.
+        deviations: of the predictors that were compared with traced images.
+        seconds: that making and comparing them took.
+        left: groups whose images are rendered because predictions deviated too much.
+        method: how images are predicted, or would be.
+        refusal: why all images are rendered; None if they are predicted.
     """
 
     problem: Problem
@@ -281,13 +359,15 @@ class PredictedSweep:
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     left: set[int] = field(default_factory=set)
-    _spent: dict[int, int] = field(default_factory=dict)
-    _held: dict[int, Predictor | None] = field(default_factory=dict)
+    # images that were traced for each group
+    _traced: dict[int, int] = field(default_factory=dict)
+    # None where the images of a group are rendered
+    _predictors: dict[int, Predictor | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.renderer = self.problem.renderer
         self.method, self.refusal = self._choose_method()
-        self._groups = self._fall(self.method.follows)
+        self._groups = self._make_groups(self.method.follows)
 
     def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
         """Return the cheapest method that pays here, without a refusal.
@@ -302,160 +382,201 @@ class PredictedSweep:
             if refusal is None:
                 return method, None
             refused.append((method, refusal))
-        return next(
-            (pair for pair in refused if pair[1] is not NOTHING_MOVES), refused[-1]
-        )
+        for method, refusal in refused:
+            if refusal is not NOTHING_MOVES:
+                return method, refusal
+        return refused[-1]
 
     def _find_refusal(self, method: BasisPictures | LightOnSurfaces) -> Refusal | None:
-        """Return why a method does not predict these pictures; None if it does."""
+        """Return why a method does not predict these images; None if it does."""
         if not method.moves:
             return NOTHING_MOVES
         if self.renderer.composed or not self.specialise:
             return Refusal(self.renderer.composed or "nothing is left out")
-        return method.find_refusal(self._fall, self.problem.spp)
+        return method.find_refusal(self._make_groups, self.problem.spp)
 
-    def _fall(self, follows: frozenset[str]) -> Groups:
-        of_grid = [axis.name for axis in self.axes]
-        drawn = all(
+    def _make_groups(self, follows: frozenset[str]) -> Groups:
+        """Return the groups whose images may differ in some groups of coordinates."""
+        axis_names = [axis.name for axis in self.axes]
+        follows_all_sampled = all(
             group.name in follows
             for group in self.renderer.space.groups
-            if group.name not in of_grid
+            if group.name not in axis_names
         )
-        within = tuple(name in follows for name in of_grid)
         return Groups(
             self.points.grid,
             self.points.samples,
-            within,
-            drawn,
+            tuple(name in follows for name in axis_names),
+            follows_all_sampled,
             self.points.units.frames,
         )
 
-    def pictures(self, asked: Mapping[int, Query]) -> dict[int, SweptPicture]:
-        """Return pictures by their numbers in the scene, each rendered or predicted."""
-        pictures: dict[int, SweptPicture] = {}
-        waiting: dict[Predictor, list[int]] = {}
-        for number, query in asked.items():
-            predictor = (
-                None
-                if self.refusal is not None
-                else self._of(self._groups.group(number), number)
-            )
-            if predictor is None:
-                picture = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
-                pictures[number] = SweptPicture(
-                    picture, predicted=0, traced=self._spent_on(number) + 1
-                )
-            else:
-                waiting.setdefault(predictor, []).append(number)
-        for predictor, numbers in waiting.items():
-            predicted = predictor.pictures([asked[number].u for number in numbers])
-            for number, picture in zip(numbers, predicted, strict=True):
-                pictures[number] = SweptPicture(
-                    picture, self.method.samples, self._spent_on(number)
-                )
-        return pictures
+    def pictures(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptPicture]:
+        """Render or predict images.
 
-    def _spent_on(self, number: int) -> int:
-        """Pictures that were traced for a group, said of its first picture alone."""
-        first = number == self._groups.member(number, 0)
-        return self._spent.get(self._groups.group(number), 0) * first
+        Args:
+            query_of_image: the queries by the number of the image in the scene.
 
-    def _of(self, group: int, number: int) -> Predictor | None:
-        """What predicts the pictures of a group, of which this is one; None where they
-        are rendered.
+        Returns:
+            The images by their numbers.
         """
-        if group in self._held:
-            return self._held[group]
-        if len(self._held) >= self._groups.at_once:
-            self._held.pop(next(iter(self._held)))
-        begun = time.perf_counter()
-        seed = seeds.stream(self.seed, "light", self.before + group)
-        made = self.method.make_predictor(self._configuration(number, 0), seed)
-
-        def margin(picture: Tensor, u: Tensor) -> float:
-            return self.problem.judge(to_8_bit(picture), u).margin
-
-        def view(check: int) -> ComparedView:
-            u = self._configuration(
-                number, seeds.stream(seed, "check", check) % self._groups.size
+        images: dict[int, SweptPicture] = {}
+        numbers_by_predictor: dict[Predictor, list[int]] = {}
+        for number, query in query_of_image.items():
+            predictor = None
+            if self.refusal is None:
+                group = self._groups.group(number)
+                predictor = self._load_predictor(group, number)
+            if predictor is None:
+                image = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
+                n_traced = self._count_traced(number) + 1
+                images[number] = SweptPicture(image, predicted=0, traced=n_traced)
+            else:
+                numbers_by_predictor.setdefault(predictor, []).append(number)
+        for predictor, numbers in numbers_by_predictor.items():
+            predicted = predictor.pictures(
+                [query_of_image[number].u for number in numbers]
             )
-            (predicted,) = made.pictures([u])
-            noise = seeds.stream(seed, "traced", check)
-            return view_of(self.renderer, predicted, u, noise, self.problem.spp, margin)
+            for number, image in zip(numbers, predicted, strict=True):
+                n_traced = self._count_traced(number)
+                images[number] = SweptPicture(image, self.method.samples, n_traced)
+        return images
 
-        with torch.no_grad():
-            deviation = compared(view)
+    def _count_traced(self, number: int) -> int:
+        """Return the images that were traced for the group of its first image.
+
+        Of the other images of the group it is 0.
+        """
+        if number != self._groups.member(number, 0):
+            return 0
+        return self._traced.get(self._groups.group(number), 0)
+
+    def _load_predictor(self, group: int, number: int) -> Predictor | None:
+        """Return the predictor of a group; None if its images are rendered.
+
+        It is made by the group alone, so that a sweep that was stopped goes on with the
+        same.
+
+        Args:
+            group: its index.
+            number: of an image of the group, in the scene.
+        """
+        if group in self._predictors:
+            return self._predictors[group]
+        if len(self._predictors) >= self._groups.at_once:
+            self._predictors.pop(next(iter(self._predictors)))
+        begin = time.perf_counter()
+        seed = seeds.stream(self.seed, "light", self.before + group)
+        predictor = self.method.make_predictor(self._configuration(number, 0), seed)
+        deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
-        self._spent[group] = made.lights + deviation.pictures
+        self._traced[group] = predictor.lights + deviation.pictures
         if not deviation.good:
             self.left.add(group)
-        self._held[group] = made if deviation.good else None
-        self.seconds += time.perf_counter() - begun
-        return self._held[group]
+        self._predictors[group] = predictor if deviation.good else None
+        self.seconds += time.perf_counter() - begin
+        return self._predictors[group]
 
-    def _configuration(self, number: int, place: int) -> Tensor:
-        member = self._groups.member(number, place)
+    def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
+        """Compare predicted images of a group with traced ones.
+
+        Args:
+            predictor: of the group.
+            number: of an image of the group, in the scene.
+            seed: selects the images that are compared.
+        """
+
+        def margin(image: Tensor, u: Tensor) -> float:
+            return self.problem.judge(to_8_bit(image), u).margin
+
+        def view(check: int) -> ComparedView:
+            index = seeds.stream(seed, "check", check) % self._groups.size
+            u = self._configuration(number, index)
+            (predicted,) = predictor.pictures([u])
+            noise_seed = seeds.stream(seed, "traced", check)
+            return view_of(
+                self.renderer, predicted, u, noise_seed, self.problem.spp, margin
+            )
+
+        with torch.no_grad():
+            return compared(view)
+
+    def _configuration(self, number: int, index: int) -> Tensor:
+        """Return a configuration (d,) of the group of an image, by its index there."""
+        member = self._groups.member(number, index)
         return self.points.configurations(member, 1, self.before)[0]
 
     @property
     def not_finite(self) -> int:
         """How many values were not finite, and were set to 0."""
-        return sum(one.non_finite for one in self._held.values() if one is not None)
+        return sum(
+            predictor.non_finite
+            for predictor in self._predictors.values()
+            if predictor is not None
+        )
 
     def summary(self) -> LinearTransport | None:
-        """What a result holds of it; None where nothing moves that it follows."""
+        """Return what a result holds of the predictions.
+
+        None if nothing moves that any method follows.
+        """
         if self.refusal is NOTHING_MOVES:
             return None
         if self.refusal is not None:
             return LinearTransport(used=False, reason=str(self.refusal))
-        worst = (
-            max(self.deviations, key=lambda one: one.levels)
-            if self.deviations
-            else None
-        )
-        several = (
-            f"{len(self.left)} of {self._groups.count} groups were rendered: "
-            "predicted pictures were too far off"
+        error = None
+        if self.deviations:
+            worst = max(self.deviations, key=lambda deviation: deviation.levels)
+            error = PredictionError.of(worst)
+        reason = None
+        if self.left:
+            reason = (
+                f"{len(self.left)} of {self._groups.count} groups were rendered: "
+                "predicted pictures were too far off"
+            )
+        predictor_bytes = sum(
+            predictor.bytes
+            for predictor in self._predictors.values()
+            if predictor is not None
         )
         return LinearTransport(
             used=True,
             way=self.method.name,
-            reason=several if self.left else None,
+            reason=reason,
             entries=0,
-            bytes=self.method.bytes
-            + sum(one.bytes for one in self._held.values() if one is not None),
+            bytes=self.method.bytes + predictor_bytes,
             seconds=self.seconds,
             renewed=0,
-            error=None if worst is None else PredictionError.of(worst),
+            error=error,
         )
 
 
-def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
-    """Return what a result holds of several scenes: the worst error, the largest
-    memory, all seconds.
+def combined(all_summaries: Sequence[LinearTransport | None]) -> LinearTransport | None:
+    """Combine what predicted the images of several scenes.
+
+    Returns:
+        The worst error, the largest memory, and all seconds; None if nothing moves in
+        any scene.
     """
-    told = [one for one in found if one is not None]
-    used = [one for one in told if one.used]
+    summaries = [summary for summary in all_summaries if summary is not None]
+    used = [summary for summary in summaries if summary.used]
     if not used:
-        return told[-1] if told else None
-    worst = {
-        "reason": next((one.reason for one in used if one.reason), None),
-        "bytes": max(one.bytes or 0 for one in used),
-        "seconds": math.fsum(one.seconds or 0.0 for one in used),
-        "error": max(
-            (one.error for one in used if one.error),
-            key=lambda error: error.levels or 0.0,
-            default=None,
-        ),
+        return summaries[-1] if summaries else None
+    reasons = [summary.reason for summary in used if summary.reason]
+    errors = [summary.error for summary in used if summary.error]
+    update = {
+        "reason": reasons[0] if reasons else None,
+        "bytes": max(summary.bytes or 0 for summary in used),
+        "seconds": math.fsum(summary.seconds or 0.0 for summary in used),
+        "error": max(errors, key=lambda error: error.levels or 0.0, default=None),
     }
-    return used[0].model_copy(update=worst)
+    return used[0].model_copy(update=update)
 
 
 def prepare_surface_light(
     verifier: Verifier, at: Tensor, coordinates: Tensor, n_images: int
 ) -> None:
-    """Find the light on surfaces around a configuration, if it predicts trials there
-    more cheaply than renders.
+    """Prepare light on surfaces around a configuration, if it is cheaper than renders.
 
     The verifier's findings then have it as `transport`, or state why images are
     rendered where cameras move.
@@ -478,7 +599,7 @@ def prepare_surface_light(
         return
     findings = verifier.findings
     findings.rendered_because = why_not_kept(problem.renderer)
-    min_images = pays_from(problem.renderer, findings.spp)
+    min_images = find_break_even(problem.renderer, findings.spp)
     if findings.rendered_because is None and n_images < min_images:
         reason = f"light on surfaces pays from {min_images} pictures on"
         findings.rendered_because = Refusal(reason, RefusalCause.TOO_FEW_STEPS)

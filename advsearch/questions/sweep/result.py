@@ -1,6 +1,7 @@
-"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its
-result as Python has it; sweeps that another program made are read into a run here, too.
-Counting takes some 15 bytes a configuration.
+"""Counts of a sweep, and its result as Python has it.
+
+docs/sweeps.md, "What it says". Counting takes some 15 bytes a configuration. Sweeps
+that another program made are imported here, too.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
 FINISHED = "finished"
-MOST_CELLS = 4096  # cells of a map; with more pairs of values there is none
+MAX_CELLS = 4096  # of a map; with more pairs of values there is none
 # wrong predictions that the summary lists, the most frequent first
-MOST_PREDICTIONS = 20
+MAX_LISTED_PREDICTIONS = 20
 
 
 OUTCOMES = tuple(Outcome)
-UNKNOWN_OUTCOME = 255  # in arrays of places among `OUTCOMES`
+UNKNOWN_OUTCOME = 255  # in arrays of indices among `OUTCOMES`
 
 
 def counted_by_unit(
@@ -62,170 +63,211 @@ def counted_by_unit(
     units: npt.NDArray[np.int64],
     outcome: npt.NDArray[np.uint8] | None = None,
 ) -> CountedPredictions:
-    """Count predictions (n,) that are of some units (n,), with their accuracy and its
-    95 % interval.
+    """Count predictions, with their accuracy and its 95 % interval.
 
-    The accuracy is the mean over units of the share of each. One unit with several
-    predictions has no interval. `outcome` (n,) has places among `OUTCOMES`, where there
-    are some; those of wrong predictions are counted.
+    The accuracy is the mean over units of the fraction of right predictions in each.
+    One unit with several predictions has no interval.
+
+    Args:
+        right: (n,) whether each prediction is right.
+        units: (n,) the unit of each; predictions of one are not independent.
+        outcome: (n,) indices among `OUTCOMES`; those of wrong predictions are counted.
     """
     right = np.asarray(right)
     if not len(right):
         return rate(0, 0)
     right_in_unit = per_unit(right, units)
     unit_size = per_unit(np.ones(len(right)), units)
-    has_interval = len(unit_size) > 1 or len(right) == 1
+    interval = None
+    if len(unit_size) > 1 or len(right) == 1:
+        interval = share_interval(right_in_unit, unit_size)
     return CountedPredictions(
         configurations=len(right),
         correct=int(right.sum()),
         accuracy=mean_share(right_in_unit, unit_size),
-        interval=share_interval(right_in_unit, unit_size) if has_interval else None,
+        interval=interval,
         outcomes=None if outcome is None else _count_outcomes(outcome[right == 0]),
     )
 
 
 def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
-    """Return how often each outcome occurs, by its name; None where none is known."""
+    """Return how often each outcome occurs, by its name; None if none is known."""
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
-    named = {
+    count_by_name = {
         known.value: int(count)
         for known, count in zip(OUTCOMES, counts, strict=False)
         if count
     }
-    return named or None
+    return count_by_name or None
 
 
 def rate(
-    correct: int, seen: int, interval: tuple[float, float] | None = None
+    correct: int, n_predictions: int, interval: tuple[float, float] | None = None
 ) -> CountedPredictions:
-    """Return count, accuracy and its 95 % interval, by default that of Clopper and
-    Pearson, of predictions that are independent; None where nothing was seen.
+    """Return the accuracy of independent predictions with its 95 % interval.
+
+    Both are None without predictions.
+
+    Args:
+        correct: right predictions.
+        n_predictions: predictions.
+        interval: by default that of Clopper and Pearson.
     """
-    accuracy, interval = (
-        (correct / seen, interval or clopper_pearson(correct, seen))
-        if seen
-        else (None, None)
-    )
+    if not n_predictions:
+        return CountedPredictions(
+            configurations=n_predictions, correct=correct, accuracy=None, interval=None
+        )
     return CountedPredictions(
-        configurations=seen, correct=correct, accuracy=accuracy, interval=interval
+        configurations=n_predictions,
+        correct=correct,
+        accuracy=correct / n_predictions,
+        interval=interval or clopper_pearson(correct, n_predictions),
     )
 
 
 class Predictions:
-    """What is predicted so far, by the number of the configuration (n,): whether there
-    is a prediction, whether it is right and whether it is wrong, its margin, NaN where
-    that is no number, and what it is; of a detector its outcome, as a place among
-    `OUTCOMES`. `hidden` are those with nothing of what is judged in the picture.
+    """The predictions so far, by the number of the row.
+
+    Attributes:
+        seen: (n,) whether there is a prediction.
+        right: (n,) whether it is right.
+        hidden: (n,) whether nothing of what is judged is in the image.
+        margin: (n,) NaN where it is not a number.
+        outcome: (n,) of a detector, indices among `OUTCOMES`.
     """
 
-    def __init__(self, total: int) -> None:
-        self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self.right, self._wrong, self.hidden = (
-            self.seen.copy(),
-            self.seen.copy(),
-            self.seen.copy(),
-        )
-        self.margin = np.full(total, np.nan)
-        self.outcome = np.full(total, UNKNOWN_OUTCOME, np.uint8)
-        self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
+    def __init__(self, n_rows: int) -> None:
+        self.seen: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.margin = np.full(n_rows, np.nan)
+        self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
+        self._label_index = np.zeros(n_rows, np.uint32)
+        self._index_by_label = dict[str, int]()
 
-    def add(self, number: int, said: Judgement) -> None:
-        self.seen[number], self.right[number], self._wrong[number] = (
-            True,
-            said.right,
-            said.success,
-        )
-        self.margin[number] = said.margin
-        self.hidden[number] = said.prediction.label == OUT_OF_VIEW
-        outcome = get_outcome(said.payload)
+    def add(self, row: int, judgement: Judgement) -> None:
+        """Add the judgement of a row; one that was there before is replaced."""
+        label = judgement.prediction.label
+        self.seen[row] = True
+        self.right[row] = judgement.right
+        self._wrong[row] = judgement.success
+        self.margin[row] = judgement.margin
+        self.hidden[row] = label == OUT_OF_VIEW
+        outcome = get_outcome(judgement.payload)
         if outcome is not None:
-            self.outcome[number] = OUTCOMES.index(outcome)
-        self._labels[number] = self._names.setdefault(
-            said.prediction.label, len(self._names)
-        )
+            self.outcome[row] = OUTCOMES.index(outcome)
+        n_labels = len(self._index_by_label)
+        self._label_index[row] = self._index_by_label.setdefault(label, n_labels)
 
     @property
     def counted(self) -> npt.NDArray[np.bool_]:
-        """(n,) which there is a prediction of and something to see in."""
+        """(n,) whether there is a prediction, and the object is in the image."""
         return np.asarray(self.seen & ~self.hidden)
 
     @property
     def phantoms_out_of_view(self) -> int:
-        """In how many pictures without the object a detector finds it all the same."""
-        return int(
-            (self.hidden & (self.outcome == OUTCOMES.index(Outcome.PHANTOM))).sum()
-        )
+        """Images without the object in which a detector finds it all the same."""
+        is_phantom = self.outcome == OUTCOMES.index(Outcome.PHANTOM)
+        return int((self.hidden & is_phantom).sum())
 
     @property
     def worst(self) -> int | None:
-        """The first configuration of the smallest margin; None where none is a
-        number.
+        """The first row of the smallest margin; None if none is a number.
+
+        Rows without the object count only if there are no others.
         """
-        margin = (
-            self.margin
-            if self.hidden[self.seen].all()
-            else np.where(self.hidden, np.nan, self.margin)
-        )
+        margin = self.margin
+        if not self.hidden[self.seen].all():
+            margin = np.where(self.hidden, np.nan, margin)
         return None if np.isnan(margin).all() else int(np.nanargmin(margin))
 
     @property
     def not_finite(self) -> int:
-        """How many margins are no number; these predictions count as not right."""
+        """How many margins are not numbers; these predictions count as not right."""
         return int((self.seen & np.isnan(self.margin)).sum())
 
     @property
     def frequent(self) -> dict[str, int]:
-        """How often each of the most frequent wrong predictions was given, the most
-        frequent first.
-        """
-        names = list(self._names)
-        wrong = Counter(names[label] for label in self._labels[self._wrong])
-        return dict(
-            sorted(
-                wrong.most_common(MOST_PREDICTIONS),
-                key=lambda label: (-label[1], label[0]),
-            )
+        """How often each of the most frequent wrong predictions occurs, in order."""
+        labels = list(self._index_by_label)
+        wrong_labels = Counter(
+            labels[index] for index in self._label_index[self._wrong]
         )
+        most_frequent = wrong_labels.most_common(MAX_LISTED_PREDICTIONS)
+        return dict(sorted(most_frequent, key=lambda item: (-item[1], item[0])))
 
     def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
-        """Return both rates of each model without and with an adversarial scene, of the
-        pairs of which both are known: the second half of the configurations are the
-        first with the adversarial scene.
+        """Compare the predictions without and with an adversarial configuration.
+
+        The second half of the rows are those of the first with the adversarial
+        configuration. Only pairs of which both are known are counted.
+
+        Args:
+            models: their names.
+            units: how rows follow from draws.
         """
-        halves = (2, -1, len(models))
+        by_arm = (2, -1, len(models))
+        right = self.right.reshape(by_arm)
+        outcome = self.outcome.reshape(by_arm)
+        both_counted = np.asarray(self.counted.reshape(by_arm).all(axis=0))
         pairs = list[PairedRates]()
-        seen: npt.NDArray[np.bool_] = np.logical_and(*self.counted.reshape(halves))
         for model, name in enumerate(models):
-            known = np.flatnonzero(seen[:, model])
-            if not len(known):
-                continue
-            before, after = self.right.reshape(halves)[:, known, model]
-            outcome_before, outcome_after = self.outcome.reshape(halves)[
-                :, known, model
-            ]
-            draws = units.draw(known)
-            difference, interval, _ = paired_by_unit(before, after, draws)
-            pairs.append(
-                PairedRates(
-                    model=name,
-                    clean=counted_by_unit(before, draws, outcome_before),
-                    answer=counted_by_unit(after, draws, outcome_after),
-                    both=int((before & after).sum()),
-                    clean_only=int((before & ~after).sum()),
-                    answer_only=int((~before & after).sum()),
-                    neither=int((~before & ~after).sum()),
-                    difference=difference,
-                    interval=interval,
+            images = np.flatnonzero(both_counted[:, model])
+            if len(images):
+                draws = units.draw(images)
+                pairs.append(
+                    _compare_pairs(
+                        name,
+                        right[:, images, model],
+                        outcome[:, images, model],
+                        np.asarray(draws),
+                    )
                 )
-            )
         return pairs
+
+
+def _compare_pairs(
+    model: str,
+    right: npt.NDArray[np.bool_],
+    outcome: npt.NDArray[np.uint8],
+    draws: npt.NDArray[np.int64],
+) -> PairedRates:
+    """Compare the predictions of a model without and with an adversarial scene.
+
+    Args:
+        model: its name.
+        right: (2, n) whether each is right, first without.
+        outcome: (2, n) indices among `OUTCOMES`.
+        draws: (n,) the draw of each pair.
+    """
+    clean, adversarial = right
+    clean_outcome, adversarial_outcome = outcome
+    difference, interval, _ = paired_by_unit(clean, adversarial, draws)
+    return PairedRates(
+        model=model,
+        clean=counted_by_unit(clean, draws, clean_outcome),
+        answer=counted_by_unit(adversarial, draws, adversarial_outcome),
+        both=int((clean & adversarial).sum()),
+        clean_only=int((clean & ~adversarial).sum()),
+        answer_only=int((~clean & adversarial).sum()),
+        neither=int((~clean & ~adversarial).sum()),
+        difference=difference,
+        interval=interval,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class SweptAxis:
-    """Something that a table is by: an axis outside the scene (object, environment,
-    model), of the grid, or a number that is drawn; its values, or the ends of its
-    parts; and the place of each configuration among them (n,).
+    """Something that a table is by.
+
+    Attributes:
+        name: of the axis.
+        unit: of its values.
+        values: or the bounds of parts of a range.
+        places: (n,) the index of each row among these.
+        kind: outside of the scene (object, environment, model), of the grid, or a
+            sampled number.
     """
 
     name: str
@@ -240,28 +282,24 @@ class SweptAxis:
         units: npt.NDArray[np.int64],
         outcome: npt.NDArray[np.uint8] | None = None,
     ) -> list[AxisRow]:
-        """Return the table: right predictions (n,), which are of units (n,) and have an
-        outcome (n,), by value; values without any are left out.
+        """Return the table: counts by value, without values that have none.
+
+        Args:
+            right: (n,) whether each prediction is right.
+            units: (n,) the unit of each.
+            outcome: (n,) indices among `OUTCOMES`.
         """
-        outcome = (
-            np.full(len(right), UNKNOWN_OUTCOME, np.uint8)
-            if outcome is None
-            else outcome
-        )
-        by_place = pd.DataFrame(
-            {"right": right, "unit": units, "outcome": outcome}
-        ).groupby(self.places)
-        counts = (
-            (
-                self.values[place],
-                counted_by_unit(rows.right, rows.unit, rows.outcome.to_numpy()),
+        if outcome is None:
+            outcome = np.full(len(right), UNKNOWN_OUTCOME, np.uint8)
+        predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
+        axis_rows = list[AxisRow]()
+        for index, group in predictions.groupby(self.places):
+            counts = counted_by_unit(group.right, group.unit, group.outcome.to_numpy())
+            value = self.values[index]
+            axis_rows.append(
+                AxisRow(axis=self.name, unit=self.unit, value=value, **vars(counts))
             )
-            for place, rows in by_place
-        )
-        return [
-            AxisRow(axis=self.name, unit=self.unit, value=value, **vars(count))
-            for value, count in counts
-        ]
+        return axis_rows
 
 
 def map_over(
@@ -269,43 +307,62 @@ def map_over(
     right: npt.NDArray[np.bool_],
     margin: npt.NDArray[np.float64],
 ) -> SweepMap | None:
-    """Return counts, and the mean of the margins, for every pair of values of two axes:
-    the first of the grid and the last outside, or drawn ones where there are none of
-    these; None of fewer axes, or of too many values.
-    """
-    outside, grid, drawn = (
-        [one for one in axes if one.kind == kind]
-        for kind in ("outside", "grid", "drawn")
-    )
-    axes = [*grid, *reversed(outside)] or drawn
-    if len(axes) < 2 or len(axes[0].values) * len(axes[1].values) > MOST_CELLS:
-        return None
-    wide, high = (len(one.values) for one in axes[:2])
-    cell = axes[1].places * wide + axes[0].places
-    told = ~np.isnan(margin)
+    """Count predictions, and average margins, over every pair of values of two axes.
 
-    def table(
+    Args:
+        axes: all of the tables.
+        right: (n,) whether each prediction is right.
+        margin: (n,) NaN where it is not a number.
+
+    Returns:
+        The map over the first axes of the grid, or the last outside of the scene, or
+        sampled ones if there are none of these; None of fewer than two axes, or of
+        too many values.
+    """
+    axes = _order_for_map(axes)
+    if len(axes) < 2:
+        return None
+    x_axis, y_axis = axes[:2]
+    width = len(x_axis.values)
+    height = len(y_axis.values)
+    if width * height > MAX_CELLS:
+        return None
+    cell = y_axis.places * width + x_axis.places
+
+    def sum_over_cells(
         cells: npt.NDArray[np.integer[Any]],
         weights: npt.NDArray[np.float64] | None = None,
     ) -> Any:
-        return np.bincount(cells, weights, minlength=wide * high).reshape(high, wide)
+        sums = np.bincount(cells, weights, minlength=width * height)
+        return sums.reshape(height, width)
 
-    count = table(cell[told])
-    total = table(cell[told], margin[told])
-    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
-    first, second = (
-        MapAxis(axis=one.name, unit=one.unit, values=list(one.values))
-        for one in axes[:2]
-    )
+    is_known = ~np.isnan(margin)
+    n_margins = sum_over_cells(cell[is_known])
+    margin_sum = sum_over_cells(cell[is_known], margin[is_known])
+    no_margins = np.full(n_margins.shape, np.nan)
+    mean_margin = np.divide(margin_sum, n_margins, out=no_margins, where=n_margins > 0)
     return SweepMap(
-        axes=(first, second),
-        over=[one.name for one in axes[2:]],
-        configurations=table(cell).tolist(),
-        correct=table(cell[right]).tolist(),
+        axes=(_describe_map_axis(x_axis), _describe_map_axis(y_axis)),
+        over=[axis.name for axis in axes[2:]],
+        configurations=sum_over_cells(cell).tolist(),
+        correct=sum_over_cells(cell[right]).tolist(),
         margin=[
-            [None if math.isnan(one) else one for one in row] for row in mean.tolist()
+            [None if math.isnan(value) else value for value in row]
+            for row in mean_margin.tolist()
         ],
     )
+
+
+def _order_for_map(axes: Sequence[SweptAxis]) -> list[SweptAxis]:
+    """Return the axes in the order in which a map takes them."""
+    grid = [axis for axis in axes if axis.kind == "grid"]
+    outside = [axis for axis in axes if axis.kind == "outside"]
+    sampled = [axis for axis in axes if axis.kind == "drawn"]
+    return [*grid, *reversed(outside)] or sampled
+
+
+def _describe_map_axis(axis: SweptAxis) -> MapAxis:
+    return MapAxis(axis=axis.name, unit=axis.unit, values=list(axis.values))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -329,15 +386,11 @@ class SweepResult:
 
     @property
     def accuracy(self) -> float | None:
-        """Share of the configurations that the model got right; None where there was
-        none.
-        """
+        """Fraction of the configurations that the model got right; None without any."""
         return self.summary.accuracy
 
     def rows(self) -> Iterator[store.Row]:
-        """Yield every configuration with its values and what the model said, in
-        order.
-        """
+        """Yield every configuration with its values and the prediction, in order."""
         if self.run is None:
             yield from self.in_memory
             return
@@ -377,68 +430,79 @@ class SweepResult:
         return sweep_figure(self.summary).get("png")
 
 
-MOST_PIXELS = 1 << 22  # of a picture that is read
-MOST_VALUES = 96  # different values of a parameter that the result lists
-AT_ONCE = 1000  # rows that are stored at once
+MAX_PIXELS = 1 << 22  # of an image that is imported
+MAX_LISTED_VALUES = 96  # different values of a parameter that the result lists
+STORED_BATCH = 1000  # rows that are stored together
 
 
 def import_threedb(
     folder: Path, run: str | Path | None = None, *, overwrite: bool = False
 ) -> Path:
-    """Read a folder that 3DB wrote into a run, by default ``runs/NAME-3db-NNN``, and
-    return its folder.
+    """Import a folder that 3DB wrote into a run directory, and return that.
+
+    Args:
+        folder: of 3DB.
+        run: by default ``runs/NAME-3db-NNN``.
+        overwrite: whether another run may be there.
+
+    Raises:
+        FileFormatError: the log of 3DB is empty or corrupt.
     """
-    with RunDirectory.create(
-        run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])
-    ) as kept:
+    default = default_name(folder.resolve().name, ["3db"])
+    with RunDirectory.create(run, overwrite=overwrite, default=default) as directory:
         lines = read_threedb(folder)
-        while some := list(islice(lines, AT_ONCE)):
-            for row, picture in some:
-                if picture is not None:
-                    thumbnails.keep(
-                        kept.path, row.step, thumbnails.thumbnail(read_picture(picture))
-                    )
-            kept.record(*(row for row, _ in some))
-        rows = read_sweep(kept.path)
+        while batch := list(islice(lines, STORED_BATCH)):
+            for row, image_file in batch:
+                if image_file is not None:
+                    thumbnail = thumbnails.thumbnail(read_picture(image_file))
+                    thumbnails.keep(directory.path, row.step, thumbnail)
+            directory.record(*(row for row, _ in batch))
+        rows = read_sweep(directory.path)
         if rows.empty:
             raise FileFormatError(
                 f"{folder}: expected the log of 3DB with at least "
                 "one line, got an empty one"
             )
-        summary = _summary_of(rows, kept.path, folder)
-        write_sweep_page(kept.path, summary)
-        kept.write_summary(summary)
-        return kept.path
+        summary = _summarize_threedb(rows, directory.path, folder)
+        write_sweep_page(directory.path, summary)
+        directory.write_summary(summary)
+        return directory.path
 
 
-def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
+def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
+    """Return the summary of a sweep that 3DB made.
+
+    Args:
+        rows: of the sweep.
+        run: the run directory.
+        folder: of 3DB.
+    """
     right = np.asarray(rows["correct"] == 1)
     tables = list[AxisRow]()
     for name in rows.attrs["units"]:
-        values, places = np.unique(rows[name].astype(object), return_inverse=True)
-        if 1 < len(values) <= MOST_VALUES:
-            tables += SweptAxis(name, "", values.tolist(), places).rows(
-                right, rows["unit"]
-            )
-    called = dict.fromkeys(("object", "environment", "model"), "unknown")
-    for name in called:
-        names = rows[name].unique().tolist() if name in rows else []
-        more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-        called[name] = ",".join(map(str, names[:20])) + more or "unknown"
-    not_told = dict.fromkeys(
+        values, indices = np.unique(rows[name].astype(object), return_inverse=True)
+        if 1 < len(values) <= MAX_LISTED_VALUES:
+            axis = SweptAxis(name, "", values.tolist(), indices)
+            tables += axis.rows(right, rows["unit"])
+    names = {
+        column: _join_names(rows, column)
+        for column in ("object", "environment", "model")
+    }
+    unknown = dict.fromkeys(
         ("image_formation", "cells", "worst", "sampler", "renders_per_second")
     )
+    wrong_labels = Counter(rows["label"][~right])
     return SweepSummary(
         run=str(run),
-        **called,
+        **names,
         **vars(rate(int(right.sum()), len(rows))),
-        **not_told,
+        **unknown,
         **dict.fromkeys(("not_finite", "spp", "seed"), 0),
         task="classification",
         controls=[],
         ending=FINISHED,
         planned=len(rows),
-        answers=dict(Counter(rows["label"][~right]).most_common(MOST_PREDICTIONS)),
+        answers=dict(wrong_labels.most_common(MAX_LISTED_PREDICTIONS)),
         axes=tables,
         grid={},
         samples=1,
@@ -449,7 +513,15 @@ def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
     )
 
 
+def _join_names(rows: pd.DataFrame, column: str) -> str:
+    """Return the names in a column, the first 20; "unknown" if there is none."""
+    names = rows[column].unique().tolist() if column in rows else []
+    more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+    return ",".join(map(str, names[:20])) + more or "unknown"
+
+
 def read_picture(path: Path) -> object:
+    """Read an image file as float32 (H, W, 3), sRGB in [0, 1]."""
     with opened(path, LARGEST_FILE) as image:
-        check_pixels(path, *image.size, MOST_PIXELS)
+        check_pixels(path, *image.size, MAX_PIXELS)
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)

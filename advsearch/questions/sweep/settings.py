@@ -1,4 +1,4 @@
-"""What `sweep` needs to know."""
+"""The settings of `sweep`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ BLIND = {
     "covered": "the camera is covered (one even colour, the picture's mean)",
     "away": "the object is taken away",
 }
-"""Changes with which nothing is left to see of the object: a model that looks at it
-says something else.
+"""Changes after which nothing of the object is visible: a model that looks at it
+predicts something else.
 """
 
 HARMLESS = {
@@ -38,14 +38,12 @@ HARMLESS = {
     "shift": "the picture moves by one pixel to the right",
     "jpeg": "the picture is a JPEG file of quality 95",
 }
-"""Changes that mean nothing: it says the same."""
-Grid = dict[str, object]  # values, or numbers of them, by the parameters of the grid
+"""Changes that mean nothing: it predicts the same."""
+Grid = dict[str, object]  # values, or ranges of them, by the parameters of the grid
 
 
 class SweepConfig(SceneConfig):
-    """Everything that decides what `sweep` does: the average case over a grid, over
-    random draws, or both.
-    """
+    """The settings of `sweep`: the average case over a grid, random draws, or both."""
 
     command: ClassVar[str] = "sweep"
     blind_changes: ClassVar[Mapping[str, str]] = BLIND
@@ -58,142 +56,203 @@ class SweepConfig(SceneConfig):
         "log",
     )
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
-    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
         Clash(
-            "sampler", lambda one: not one.controls,
+            "sampler",
+            lambda config: not config.controls,
             "is how `controls` are drawn, and none are; add `controls`, or leave "
             "`sampler` out",
         ),
-        Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or "
-                                                   "leave `fps` out"),
         Clash(
-            "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` "
-                                                       "is 0; leave one of the two out"
+            "fps",
+            lambda config: config.path is None,
+            "is of a drive; add `path`, or leave `fps` out",
+        ),
+        Clash(
+            "verify_spp",
+            lambda config: config.trials == 0,
+            "is of the trials, and `trials` is 0; leave one of the two out",
         ),
     )
 
     object: str = setting_as_in(
-        SceneConfig, "object", description="the object that the model should "
-                                           "recognise; several, separated by commas",
+        SceneConfig,
+        "object",
+        description="the object that the model should "
+        "recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
-        SceneConfig, "environment",
+        SceneConfig,
+        "environment",
         description="the environment map that lights the scene; several, separated by "
-                    "commas",
+        "commas",
         expects="names of environments or .hdr or .exr files",
     )
     model: str = setting_as_in(
-        SceneConfig, "model",
+        SceneConfig,
+        "model",
         description="the network under test; several, separated by commas, are shown "
-                    "the same pictures",
+        "the same pictures",
     )
     grid: Grid = setting(
-        dict, "sweep", "one axis of the grid; may be repeated",
-        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas", metavar="PARAMETER=VALUES",
+        dict,
+        "sweep",
+        "one axis of the grid; may be repeated",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
+        metavar="PARAMETER=VALUES",
     )
     controls: ControlsByName = setting_as_in(
-        SceneConfig, "controls", default=dict, group="sweep",
+        SceneConfig,
+        "controls",
+        default=dict,
+        group="sweep",
         description="controls that are drawn at random at each grid point, separated "
-                    "by commas", min_length=None,
+        "by commas",
+        min_length=None,
     )
 
     adversarial_of: str | None = setting(
-        None, "sweep",
+        None,
+        "sweep",
         "sweep the adversarial scene of this attack beside the clean scene, under the "
         "same draws; scene and model "
         "come from that run, and so does what its --over drew if nothing else varies",
-        "the name or the folder of a run", metavar="RUN", otherwise="none", min_length=1,
+        "the name or the folder of a run",
+        metavar="RUN",
+        otherwise="none",
+        min_length=1,
     )
     samples: int | None = setting(
-        None, "sweep", "number of random draws at each grid point", otherwise="1, or 100 without a grid", ge=1,
+        None,
+        "sweep",
+        "number of random draws at each grid point",
+        otherwise="1, or 100 without a grid",
+        ge=1,
         le=1_000_000_000,
     )
     sampler: Literal["sobol", "random"] = setting(
         "sobol", "sweep", "how the draws are made, evenly spread or independent"
     )
     batch: int = setting(
-        16, "sweep", "pictures that are classified and stored together", unit="pictures", ge=1, le=1024
+        16,
+        "sweep",
+        "pictures that are classified and stored together",
+        unit="pictures",
+        ge=1,
+        le=1024,
     )
     path: str | None = setting_as_in(
-        AttackConfig, "path", group="sweep",
+        AttackConfig,
+        "path",
+        group="sweep",
         description="sweep the frames of a drive, in which camera or object travel "
-                    "along this path",
+        "along this path",
         otherwise="no path",
     )
     shutter: float | None = setting_as_in(AttackConfig, "shutter", group="sweep")
     rolling: float | None = setting_as_in(AttackConfig, "rolling", group="sweep")
     fps: float = setting(
-        2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
+        2.0,
+        "sweep",
+        "frames of the drive that are looked at",
+        unit="frames a second",
+        gt=0.0,
+        le=1000.0,
     )
-    keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these "
-    "predictions")
+    keep_pictures: Literal["all", "wrong", "none"] = setting(
+        "none", "sweep", "keep small pictures of these predictions"
+    )
     specialise: bool = setting_as_in(
-        DerivativeConfig, "specialise", group="sweep", description="predict pictures that differ in light alone",
+        DerivativeConfig,
+        "specialise",
+        group="sweep",
+        description="predict pictures that differ in light alone",
         switched="render every picture, also those that differ in light alone",
     )
     aov: str | None = setting_as_in(
-        RenderConfig, "aov", group="sweep",
+        RenderConfig,
+        "aov",
+        group="sweep",
         description="write ground truth of each pixel, names separated by commas, as "
-                    "layers of an EXR, for every "
+        "layers of an EXR, for every "
         "configuration",
     )
     must_change: str | None = setting(
-        None, "sweep", "show each picture also black, covered (one even colour) or "
-                       "with the object taken away, and "
+        None,
+        "sweep",
+        "show each picture also black, covered (one even colour) or "
+        "with the object taken away, and "
         "count how often the model says something else, as it must",
-        f"names among {', '.join(BLIND)}, separated by commas", otherwise="none",
+        f"names among {', '.join(BLIND)}, separated by commas",
+        otherwise="none",
     )
     must_not_change: str | None = setting(
-        None, "sweep", "show each picture also with a third of a stop more exposure, a "
-                       "shift by one pixel or as a JPEG "
+        None,
+        "sweep",
+        "show each picture also with a third of a stop more exposure, a "
+        "shift by one pixel or as a JPEG "
         "file, and count how often the model says the same, as it must",
-        f"names among {', '.join(HARMLESS)}, separated by commas", otherwise="none",
+        f"names among {', '.join(HARMLESS)}, separated by commas",
+        otherwise="none",
     )
     surface: bool = setting(
-        False, "sweep", "map which parts of the object's surface, when visible, go "
-                        "with wrong predictions"
+        False,
+        "sweep",
+        "map which parts of the object's surface, when visible, go "
+        "with wrong predictions",
     )
     spp: int | None = setting_as_in(
-        SceneConfig, "spp", group="sweep", description="samples per pixel of each "
-                                                       "picture", expects="", ge=1, le=65536
+        SceneConfig,
+        "spp",
+        group="sweep",
+        description="samples per pixel of each picture",
+        expects="",
+        ge=1,
+        le=65536,
     )
     trials: int = setting(
-        20, "verification", "fresh renders that verify the worst configuration; 0 for "
-                            "none",
-        f"0, or a whole number from {FEWEST_TRIALS} to 100000", unit="renders", ge=0, le=100_000,
+        20,
+        "verification",
+        "fresh renders that verify the worst configuration; 0 for none",
+        f"0, or a whole number from {FEWEST_TRIALS} to 100000",
+        unit="renders",
+        ge=0,
+        le=100_000,
     )
-    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these trials")
-    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
+    verify_spp: int | None = setting_as_in(
+        AttackConfig, "verify_spp", description="samples per pixel of these trials"
+    )
+    run: str | None = setting_as_in(
+        SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN"
+    )
     metrics: dict[str, str] = setting_as_in(AttackConfig, "metrics")
-    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
-    workers: int | None = setting_as_in(
-        AttackConfig, "workers",
-        description="worker processes that share the sweep, each with one thread "
-                    "unless `threads` says more",
+    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(
+        AttackConfig, "log"
     )
-    # fmt: on
+    workers: int | None = setting_as_in(
+        AttackConfig,
+        "workers",
+        description="worker processes that share the sweep, each with one thread "
+        "unless `threads` says more",
+    )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
 
     _changes = each_once("must_change", "must_not_change")
 
     @property
     def claims(self) -> tuple[tuple[str, str], ...]:
-        """What is claimed of changed pictures: ``("must_change", "black")`` and so
-        on.
-        """
-        claimed = {
+        """What is claimed of changed images: ``("must_change", "black")`` and so on."""
+        changes_by_claim = {
             "must_change": self.must_change,
             "must_not_change": self.must_not_change,
         }
-        return tuple(
-            (claim, when)
-            for claim, names in claimed.items()
-            if names
-            for when in split_names(names)
-        )
+        claims = list[tuple[str, str]]()
+        for claim, changes in changes_by_claim.items():
+            if changes:
+                claims += [(claim, change) for change in split_names(changes)]
+        return tuple(claims)
 
     @field_validator("must_change", "must_not_change")
     @classmethod
@@ -212,8 +271,9 @@ class SweepConfig(SceneConfig):
         return split_names(self.lit_by)
 
     def find_control_type(self, instance: str) -> type[Control] | None:
-        """Return the class of a control by its instance's name; None where no control
-        has it.
+        """Return the class of a control by the name of its instance.
+
+        None if no control has that name.
         """
         from advsearch.controls import CONTROLS  # imports torch
 
@@ -223,8 +283,9 @@ class SweepConfig(SceneConfig):
         return CONTROLS.get(kind)
 
     def declared_parameters(self, instance: str) -> dict[str, Parameter] | None:
-        """Return the parameters that a control declares, by name; None where the scene
-        declares them.
+        """Return the parameters that a control declares, by name.
+
+        None if the scene declares them.
         """
         control_type = self.find_control_type(instance)
         if control_type is None or control_type.kind == BY_KEY:
@@ -234,12 +295,15 @@ class SweepConfig(SceneConfig):
 
     @classmethod
     def of_attack(cls, file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings that a sweep of an attack's adversarial scene takes from
-        the `run.yaml` of the attack, where it says nothing else. Unless what was
-        `typed` says what varies, that is what the attack was over.
+        """Return the settings that a sweep takes from the attack it is about.
+
+        Args:
+            file: `run.yaml` of the attack.
+            typed: settings of the sweep. If neither `grid` nor `controls` is among
+                them, what the attack was over varies.
         """
-        attacked = AttackConfig.from_yaml(file)
-        apart = (
+        attack_config = AttackConfig.from_yaml(file)
+        excluded = (
             "controls",
             "texture_resolution",
             "spp",
@@ -247,16 +311,14 @@ class SweepConfig(SceneConfig):
             "threads",
             "deterministic",
         )
-        kept = {
+        settings = {
             name: value
-            for name, value in cls.shared(attacked).items()
-            if name not in apart
+            for name, value in cls.shared(attack_config).items()
+            if name not in excluded
         }
-        return (
-            kept
-            if typed.get("grid") or typed.get("controls")
-            else {**kept, "controls": attacked.over}
-        )
+        if not typed.get("grid") and not typed.get("controls"):
+            settings["controls"] = attack_config.over
+        return settings
 
     @field_validator("adversarial_of", mode="before")
     @classmethod
@@ -272,31 +334,33 @@ class SweepConfig(SceneConfig):
 
     @field_validator("grid", mode="before")
     @classmethod
-    def _grid_of_values(cls, value: Any) -> Any:
-        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``;
+    def _parse_grid(cls, value: Any) -> Any:
+        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``.
+
         FIRST:LAST:COUNT stays text.
         """
         if not isinstance(value, Mapping):
             return value
-        axes: dict[str, Any] = {}
-        for name, listed in value.items():
-            if isinstance(listed, Mapping) and set(listed) == {"choices"}:
-                listed = listed["choices"]
-            if isinstance(listed, str):
-                text = listed.strip().removeprefix("[").removesuffix("]")
-                if ":" in text and "," not in text:
-                    axes[str(name)] = text
-                    continue
-                listed = [part.strip() for part in text.split(",") if part.strip()]
-            listed = listed.tolist() if hasattr(listed, "tolist") else listed
-            listed = listed if isinstance(listed, (range, tuple, list)) else [listed]
-            values = [
-                entry.item() if hasattr(entry, "item") else entry for entry in listed
-            ]
-            if not values or any(
-                entry is None or isinstance(entry, (bool, list, Mapping))
-                for entry in values
-            ):
-                raise ValueError("not values")
-            axes[str(name)] = [number_or_text(entry) for entry in values]
-        return axes
+        return {str(name): _parse_axis(axis) for name, axis in value.items()}
+
+
+def _parse_axis(axis: Any) -> str | list[Any]:
+    """Return the values of an axis as a list, or FIRST:LAST:COUNT as text."""
+    if isinstance(axis, Mapping) and set(axis) == {"choices"}:
+        axis = axis["choices"]
+    if isinstance(axis, str):
+        text = axis.strip().removeprefix("[").removesuffix("]")
+        if ":" in text and "," not in text:
+            return text
+        axis = [part.strip() for part in text.split(",") if part.strip()]
+    if hasattr(axis, "tolist"):
+        axis = axis.tolist()
+    if not isinstance(axis, (range, tuple, list)):
+        axis = [axis]
+    values = [value.item() if hasattr(value, "item") else value for value in axis]
+    are_invalid = any(
+        value is None or isinstance(value, (bool, list, Mapping)) for value in values
+    )
+    if not values or are_invalid:
+        raise ValueError("not values")
+    return [number_or_text(value) for value in values]

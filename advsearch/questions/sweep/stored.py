@@ -35,8 +35,10 @@ class StoredSweep:
 
     @classmethod
     def read(cls, folder: Path) -> StoredSweep:
-        """Read settings and result of a sweep. Raises FileFormatError: the run is one
-        of another experiment.
+        """Read settings and result of a sweep.
+
+        Raises:
+            FileFormatError: the run is one of another experiment.
         """
         summary = read_result(folder)
         if not isinstance(summary, SweepSummary):
@@ -47,10 +49,12 @@ class StoredSweep:
         return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary)
 
     def read_rows(self) -> pd.DataFrame:
-        """Read the rows, by ascending `step`. Raises FileFormatError: they cannot be
-        read.
+        """Read the rows, by ascending `step`.
 
         `runs.tables.read_sweep` describes the columns and the attributes of the frame.
+
+        Raises:
+            FileFormatError: they cannot be read.
         """
         rows = read_sweep(self.folder, is_drawn=self.summary.sampler is not None)
         return rows.sort_values("step", ignore_index=True)
@@ -65,7 +69,5 @@ class StoredSweep:
         return scenes_of(self.config)
 
     def find_thumbnail(self, number: int) -> Path | None:
-        """Return the file of the stored thumbnail of an image; None where there is
-        none.
-        """
+        """Return the file of an image's stored thumbnail; None if there is none."""
         return thumbnails.kept_file(self.folder, number)

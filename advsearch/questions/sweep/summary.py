@@ -61,8 +61,9 @@ class WorstClaim(Fields):
 
 
 class WorstVerified(VerifiedRate):
-    """What fresh renders of the worst configuration say; a success is a wrong
-    prediction.
+    """The rate of wrong predictions in fresh renders of the worst configuration.
+
+    A success is a wrong prediction.
     """
 
     converged: bool = Field(
@@ -148,8 +149,9 @@ class SurfaceMap(Fields):
 
 
 class PairedRates(Fields):
-    """The same configurations without and with an adversarial scene, which one model
-    was shown with the same noise.
+    """The predictions of a model without and with an adversarial scene.
+
+    Configurations and noise are the same in both.
     """
 
     model: str
@@ -176,7 +178,7 @@ class BesideClean(Fields):
 
 
 class OverDrives(Fields):
-    """A number of each drive."""
+    """A value of each drive, over all drives."""
 
     mean: float = Field(description="over drives")
     interval: Interval | None = Field(
@@ -222,8 +224,9 @@ class TrackRates(Fields):
 
 
 class DriveRates(Fields):
-    """What a model says along whole drives; intervals are over drives, not over
-    frames.
+    """The predictions of a model along full drives.
+
+    Intervals are over drives, not over frames.
     """
 
     model: str
@@ -260,8 +263,9 @@ class DriveRates(Fields):
 
 
 class ChangeRates(CountedPredictions):
-    """Pictures that were shown to a model a second time, changed; `correct` are those
-    in which it is as claimed.
+    """The predictions of a model on changed images.
+
+    `correct` are those that are as claimed.
     """
 
     model: str
@@ -360,11 +364,12 @@ class SweepSummary(CountedPredictions, RunResult):
 
     @property
     def looked_at(self) -> int:
-        """Of how many configurations there is a prediction, those out of view too."""
+        """Configurations with a prediction, also those out of view."""
         return self.configurations + self.out_of_view
 
     @property
     def brief(self) -> str:
+        """The result in a few words."""
         if self.beside and self.beside.pairs:
             rates = self.beside.pairs[0]
             return (

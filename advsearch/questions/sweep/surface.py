@@ -1,10 +1,10 @@
-"""Which parts of an object's surface, when seen, go with wrong predictions
-(docs/sweeps.md, "The surface"): the interval of a difference is Newcombe's (1998,
-Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
-sharing the wrong predictions out anew, each time with the part that stands out most
-(Westfall and Young 1993, the single-step maximum) by the likelihood ratio. Where
-pictures share a draw (frames of a drive), draws are exchanged whole, and no interval is
-told.
+"""Find which parts of an object's surface, when visible, go with wrong predictions.
+
+docs/sweeps.md, "The surface". The interval of a difference is Newcombe's (1998,
+Statistics in Medicine 17, method 10) from Wilson's (1927). What may be chance is found
+by permuting the wrong predictions, each time with the part that stands out most
+(Westfall and Young 1993, the single-step maximum) by the likelihood ratio. Where images
+share a draw (frames of a drive), full draws are permuted, and there is no interval.
 """
 
 from __future__ import annotations
@@ -43,140 +43,189 @@ from advsearch.scene.surface_parts import CELLS, SurfaceParts
 from advsearch.statistics.intervals import wilson
 from advsearch.trust.writing import write_bytes
 
-Counts = npt.NDArray[np.int64]
-Doubles = npt.NDArray[np.float64]
-# how often the wrong predictions are shared out anew, so that no p-value is under 0.005
+Int64Array = npt.NDArray[np.int64]
+Float64Array = npt.NDArray[np.float64]
+# permutations of the wrong predictions, so that no p-value is under 0.005
 SHARINGS = 199
-# where no part has to do with the predictions, the chance that any is told from chance
-LEVEL = 0.05
+# the chance that any part is significant if none has to do with the predictions
+SIGNIFICANCE_LEVEL = 0.05
 
 
 class PartCounts:
-    """Counts of n parts over so many pictures, of which some are `failures`: those that
-    show each (`seen`), and of these the failures (`wrong`), both (n,); `chance`
-    (SHARINGS, n) is the same for failures that are shared out: each by itself, or as
-    `exchanged` says, bits of (SHARINGS, pictures) packed along the first axis.
+    """Counts of images and of wrong predictions for n parts of a surface.
+
+    Attributes:
+        pictures: images in all.
+        failures: images whose prediction is wrong.
+        seen: (n,) images that show each part.
+        wrong: (n,) failures among these.
+        chance: (SHARINGS, n) the same after each permutation of the failures.
+        exchanged: bits of (SHARINGS, images), packed along the first axis: the
+            permuted failures, from `exchange`; None permutes single images.
     """
 
     def __init__(
         self,
-        parts: int,
-        pictures: int,
-        failures: int,
+        n_parts: int,
+        n_images: int,
+        n_failures: int,
         seed: int,
         exchanged: npt.NDArray[np.uint8] | None = None,
     ) -> None:
         self.exchanged = exchanged
-        self.pictures = pictures
-        self.failures = failures
-        self.seen, self.wrong = np.zeros((2, parts), np.int64)
-        self.chance = np.zeros((SHARINGS, parts), np.uint32)
-        self._left, self._to_go = pictures, np.full(SHARINGS, failures)
+        self.pictures = n_images
+        self.failures = n_failures
+        self.seen = np.zeros(n_parts, np.int64)
+        self.wrong = np.zeros(n_parts, np.int64)
+        self.chance = np.zeros((SHARINGS, n_parts), np.uint32)
+        self._images_left = n_images
+        self._failures_left = np.full(SHARINGS, n_failures)
         self._random = np.random.default_rng(seed)
 
-    def add(self, parts: Counts, failed: bool) -> None:
-        """Count a picture, by the numbers of the parts that hold in it, each once."""
+    def add(self, parts: Int64Array, failed: bool) -> None:
+        """Count an image, by the indices of the parts that it shows, each once."""
         self.seen[parts] += 1
         self.wrong[parts] += failed
         if self.exchanged is not None:
-            drawn = np.unpackbits(
-                self.exchanged[:, self.pictures - self._left], count=SHARINGS
-            ).astype(bool)
-        else:  # so that each choice of pictures is equally likely
-            drawn = self._random.random(SHARINGS) * self._left < self._to_go
-        self._left = self._left - 1
-        self._to_go = self._to_go - drawn
-        self.chance[np.ix_(np.flatnonzero(drawn), parts)] += 1
+            image = self.pictures - self._images_left
+            bits = np.unpackbits(self.exchanged[:, image], count=SHARINGS)
+            permuted_failure = bits.astype(bool)
+        else:
+            # Sequential sampling: each choice of images is equally likely.
+            draw = self._random.random(SHARINGS) * self._images_left
+            permuted_failure = draw < self._failures_left
+        self._images_left -= 1
+        self._failures_left = self._failures_left - permuted_failure
+        self.chance[np.ix_(np.flatnonzero(permuted_failure), parts)] += 1
 
 
-def association(tally: PartCounts, some: slice, least: int) -> pd.DataFrame:
-    """Compare the predictions where each of some parts holds with those where it does
-    not; at least so many pictures of either kind.
+def association(counts: PartCounts, part_slice: slice, min_images: int) -> pd.DataFrame:
+    """Compare the predictions where a part is visible with those where it is not.
 
-    Of each part, by its number, NaN where it was not `compared`: the `difference` of
-    the share of wrong predictions where it holds less that where it does not, both ends
-    of the 95 % interval (`low`, `high`) for the part by itself, and how likely it is
-    that by chance any part stands out as far (`p`); whether it is `told` from chance;
-    and as its `strength` the end of the interval that is nearer to 0, without its sign;
-    0 where the interval contains 0. Without an interval that is how large the
-    difference is.
+    Intervals: Newcombe (1998), method 10. P-values: single-step maximum of the
+    likelihood ratio over permutations (Westfall and Young 1993).
+
+    Args:
+        counts: of all parts.
+        part_slice: the parts that are compared.
+        min_images: images of either kind that a comparison takes.
+
+    Returns:
+        A row per part, by its index; NaN where it was not `compared`. `difference`:
+        fraction of wrong predictions where the part is visible, less that where it is
+        not; `low` and `high`: bounds of its 95 % interval, for the part by itself, NaN
+        where images share a draw; `p`: probability that any part stands out as far by
+        chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`; `strength`:
+        the bound that is nearer to 0, without its sign, 0 if the interval contains 0.
+        Without an interval `strength` is the absolute difference.
     """
-    seen = tally.seen[some]
-    wrong = tally.wrong[some]
-    pictures = tally.pictures
-    failures = tally.failures
-    compared = (seen >= least) & (pictures - seen >= least)
-    columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
-    parts = pd.DataFrame(columns, index=np.arange(len(tally.seen))[some]).assign(
-        compared=compared
-    )
-    if compared.any():
-        n = seen[compared]
-        k = wrong[compared]
-        difference, low, high = _newcombe(k, n, failures - k, pictures - n)
-        if tally.exchanged is not None:
-            low = high = np.full(len(n), np.nan)
-        dealt = (shared[some][compared].astype(np.int64) for shared in tally.chance)
-        most = np.sort(
-            [_likelihood_ratio(wrongs, n, failures, pictures).max() for wrongs in dealt]
-        )
-        above = len(most) - np.searchsorted(
-            most, _likelihood_ratio(k, n, failures, pictures) - 1e-9
-        )
-        parts.loc[compared, list(columns)] = np.stack(
-            [difference, low, high, (1 + above) / (1 + len(most))], axis=1
-        )
-    nearer = np.where(
+    seen = counts.seen[part_slice]
+    wrong = counts.wrong[part_slice]
+    n_images = counts.pictures
+    n_failures = counts.failures
+    is_compared = (seen >= min_images) & (n_images - seen >= min_images)
+    nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
+    part_indices = np.arange(len(counts.seen))[part_slice]
+    parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
+    if is_compared.any():
+        n = seen[is_compared]
+        k = wrong[is_compared]
+        difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
+        if counts.exchanged is not None:
+            low = np.full(len(n), np.nan)
+            high = low
+        p_value = _permutation_p_value(counts, k, n, part_indices[is_compared])
+        columns = np.stack([difference, low, high, p_value], axis=1)
+        parts.loc[is_compared, list(nan_columns)] = columns
+    nearer_bound = np.where(
         parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high)
     )
     return parts.assign(
-        told=parts.p <= LEVEL, strength=np.nan_to_num(np.maximum(nearer, 0.0))
+        significant=parts.p <= SIGNIFICANCE_LEVEL,
+        strength=np.nan_to_num(np.maximum(nearer_bound, 0.0)),
     )
 
 
-def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Doubles:
-    """Twice the log of how much likelier k of n, and the rest of the failures beside
-    them, are with shares of their own than with one share: 0 or more.
+def _permutation_p_value(
+    counts: PartCounts, k: Int64Array, n: Int64Array, parts: Int64Array
+) -> Float64Array:
+    """Compute how likely it is that any part stands out as far as each by chance.
+
+    Args:
+        counts: with the permuted failures of all parts.
+        k: (m,) failures among the images that show each compared part.
+        n: (m,) these images.
+        parts: (m,) indices of the compared parts.
     """
-    counts = (k, n - k, failures - k, pictures - n - failures + k)
-    sums = (n, pictures - n, np.array(failures), np.array(pictures - failures))
-    told = (
-        xlogy(pictures, pictures)
-        + sum(xlogy(one, one) for one in counts)
-        - sum(xlogy(one, one) for one in sums)
+    images = counts.pictures
+    failures = counts.failures
+    max_statistics = np.sort(
+        [
+            _likelihood_ratio(
+                permuted[parts].astype(np.int64), n, failures, images
+            ).max()
+            for permuted in counts.chance
+        ]
     )
-    return np.asarray(2.0 * told)
+    statistic = _likelihood_ratio(k, n, failures, images)
+    n_permutations = len(max_statistics)
+    n_above = n_permutations - np.searchsorted(max_statistics, statistic - 1e-9)
+    return np.asarray((1 + n_above) / (1 + n_permutations))
+
+
+def _likelihood_ratio(
+    k: Int64Array, n: Int64Array, n_failures: int, n_images: int
+) -> Float64Array:
+    """Compute the likelihood ratio statistic of two failure rates against one.
+
+    Twice the log of how much likelier k failures of n images, and the rest of the
+    failures in the other images, are with a rate each than with a common rate; at
+    least 0. The shapes of `k` and `n` are broadcast.
+    """
+    cells = (k, n - k, n_failures - k, n_images - n - n_failures + k)
+    margins = (n, n_images - n, np.array(n_failures), np.array(n_images - n_failures))
+    log_ratio = (
+        xlogy(n_images, n_images)
+        + sum(xlogy(count, count) for count in cells)
+        - sum(xlogy(count, count) for count in margins)
+    )
+    return np.asarray(2.0 * log_ratio)
 
 
 def _newcombe(
-    k: Counts, n: Counts, others: Counts, rest: Counts
-) -> tuple[Doubles, Doubles, Doubles]:
-    one = k / n
-    two = others / rest
-    (below, above) = wilson(one, n)
-    (under, over) = wilson(two, rest)
-    difference = one - two
-    low = difference - np.hypot(one - below, over - two)
-    high = difference + np.hypot(above - one, two - under)
+    k: Int64Array, n: Int64Array, other_k: Int64Array, other_n: Int64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Compute the difference k/n - other_k/other_n with its 95 % interval.
+
+    Newcombe (1998), method 10, from the Wilson intervals of both rates. Returns the
+    difference and the bounds.
+    """
+    rate_1 = k / n
+    rate_2 = other_k / other_n
+    lower_1, upper_1 = wilson(rate_1, n)
+    lower_2, upper_2 = wilson(rate_2, other_n)
+    difference = rate_1 - rate_2
+    low = difference - np.hypot(rate_1 - lower_1, upper_2 - rate_2)
+    high = difference + np.hypot(upper_1 - rate_1, rate_2 - lower_2)
     return difference, low, high
 
 
-# pictures that have to see a part, and as many that do not, before its predictions are
+# images that have to show a part, and as many that do not, before its predictions are
 # compared
 LEAST = 5
-RAYS = 4 * CELLS
-"""Least number of rays along each side of a picture: in smaller ones, many cells would
-lie between two pixels.
+MIN_RAYS = 4 * CELLS
+"""Rays along each side of an image, at least: in smaller images, many cells would lie
+between two pixels.
 """
-STRONGEST = 5
-"""Parts of each kind that the summary lists: so many that go with wrong predictions,
-and so many with right ones.
+MAX_LISTED_PARTS = 5
+"""Parts of each kind that the summary lists, at most, that go with wrong predictions, and
+as many with right ones.
 """
-# distance of two listed parts, in units of the object's largest extent, so that one
-# spot is listed once
-APART = 0.1
-FILE = "artifacts/surface.npz"
-SIDES = (
+# distance between two listed parts, in units of the object's largest extent, so that
+# a spot is listed once
+MIN_PART_DISTANCE = 0.1
+COUNTS_FILE = "artifacts/surface.npz"
+VIEW_ANGLES = (
     (0.0, 20.0),
     (90.0, 20.0),
     (180.0, 20.0),
@@ -185,368 +234,545 @@ SIDES = (
     (0.0, -60.0),
 )
 """Azimuth and elevation of the cameras that show the object in colours, degrees."""
-SIDE_PIXELS = 240
-# stands for the prediction of a picture of which there is no row, or that has nothing
-# of the object
+VIEW_SIZE = 240
+# the prediction of an image without a row, or without the object
 UNKNOWN = -1
-AT_ONCE = 16  # pictures whose places are worked out at once
+BATCH_SIZE = 16  # images whose configurations are computed at once
 
 
 class SurfaceCounts:
-    """How often each part of an object's surface was seen, and how often the
-    predictions of each model were wrong then.
+    """Counts of visible parts and wrong predictions on the surface of one object.
+
+    Attributes:
+        parts: the parts of the surface.
+        tallies: their counts for each model.
     """
 
-    def __init__(self, parts: SurfaceParts, tallies: Sequence[PartCounts]) -> None:
+    def __init__(self, parts: SurfaceParts, part_counts: Sequence[PartCounts]) -> None:
         self.parts = parts
-        self.tallies = tuple(tallies)
+        self.tallies = tuple(part_counts)
 
-    def add(self, shown: Surfaces, wrong: Mapping[int, bool]) -> None:
-        """Count a picture, by what it shows and the models whose predictions are
-        wrong.
+    def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
+        """Count an image, by its surfaces and whether each model's prediction is wrong.
+
+        Args:
+            surfaces: what the image shows.
+            wrong_by_model: by the index of the model.
         """
-        there = shown.seen(OBJECT)
-        face = shown.face[there].numpy()
-        uv = shown.uv[there].numpy().astype(np.float64)
-        seen = np.unique(self.parts.cells(face, uv))
+        is_object = surfaces.seen(OBJECT)
+        face = surfaces.face[is_object].numpy()
+        uv = surfaces.uv[is_object].numpy().astype(np.float64)
+        visible_parts = np.unique(self.parts.cells(face, uv))
         if self.parts.by_face:
-            seen = np.concatenate([seen, np.unique(face) + CELLS * CELLS])
-        for model, failed in wrong.items():
-            self.tallies[model].add(seen, failed)
+            visible_faces = np.unique(face) + CELLS * CELLS
+            visible_parts = np.concatenate([visible_parts, visible_faces])
+        for model, failed in wrong_by_model.items():
+            self.tallies[model].add(visible_parts, failed)
 
     def table(
         self,
-        name: str,
+        object_name: str,
         model: str,
-        tally: PartCounts,
+        counts: PartCounts,
         kind: str,
         compared: pd.DataFrame,
     ) -> SurfaceTable:
-        """Return what a model's predictions have to do with the parts of a kind. Listed
-        are those that are told from chance most clearly, none close to another: those
-        that go with wrong predictions, and then with right ones.
+        """Return how a model's predictions go with the parts of one kind.
+
+        `strongest` lists the most significant parts, none close to another: those that
+        go with wrong predictions, and then with right ones.
+
+        Args:
+            object_name: its name.
+            model: its name.
+            counts: of the model.
+            kind: of the parts, a key of `SurfaceParts.kinds`.
+            compared: from `association`.
         """
-        extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
         strongest = list[SurfacePart]()
-        for side in (compared.difference > 0.0, compared.difference < 0.0):
-            listed: list[int] = []
-            for part in (
-                compared[compared.told & side]
-                .sort_values("strength", ascending=False, kind="stable")
-                .index
-            ):
-                away = np.linalg.norm(
-                    self.parts.place[listed] - self.parts.place[part], axis=1
-                )
-                if away.min(initial=np.inf) >= APART * extent:
-                    listed.append(int(part))
-                if len(listed) == STRONGEST:
-                    break
-            for part in listed:
-                seen = int(tally.seen[part])
-                wrong = int(tally.wrong[part])
-                hidden = tally.pictures - seen
-                others = tally.failures - wrong
-                u, v = self.parts.at[part].tolist()
-                strongest.append(
-                    SurfacePart(
-                        face=int(self.parts.face[part]),
-                        u=u,
-                        v=v,
-                        place=self.parts.place[part].tolist(),
-                        seen=rate(seen - wrong, seen),
-                        hidden=rate(hidden - others, hidden),
-                        difference=float(compared.difference[part]),
-                        interval=(
-                            float(compared.low[part]),
-                            float(compared.high[part]),
-                        ),
-                        p=float(compared.p[part]),
-                    )
-                )
+        for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
+            candidates = compared[compared.significant & has_sign]
+            strongest += [
+                self._describe_part(part, counts, compared)
+                for part in self._select_spread(candidates)
+            ]
+        is_worse = compared.significant & (compared.difference > 0)
+        is_better = compared.significant & (compared.difference < 0)
         return SurfaceTable(
-            object=name,
+            object=object_name,
             model=model,
             part=kind,
             unwrapped=self.parts.unwrapped,
-            seen=int((tally.seen[self.parts.kinds[kind]] > 0).sum()),
+            seen=int((counts.seen[self.parts.kinds[kind]] > 0).sum()),
             compared=int(compared.compared.sum()),
-            worse=int((compared.told & (compared.difference > 0)).sum()),
-            better=int((compared.told & (compared.difference < 0)).sum()),
+            worse=int(is_worse.sum()),
+            better=int(is_better.sum()),
             strongest=strongest,
+        )
+
+    def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
+        """Select the strongest parts of which none is close to another."""
+        extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
+        position = self.parts.place
+        selected: list[int] = []
+        by_strength = candidates.sort_values("strength", ascending=False, kind="stable")
+        for part in by_strength.index:
+            distance = np.linalg.norm(position[selected] - position[part], axis=1)
+            if distance.min(initial=np.inf) >= MIN_PART_DISTANCE * extent:
+                selected.append(int(part))
+            if len(selected) == MAX_LISTED_PARTS:
+                break
+        return selected
+
+    def _describe_part(
+        self, part: int, tally: PartCounts, compared: pd.DataFrame
+    ) -> SurfacePart:
+        """Return the counts and the comparison of one part, as the summary has them."""
+        n_visible = int(tally.seen[part])
+        n_visible_wrong = int(tally.wrong[part])
+        n_hidden = tally.pictures - n_visible
+        n_hidden_wrong = tally.failures - n_visible_wrong
+        u, v = self.parts.at[part].tolist()
+        return SurfacePart(
+            face=int(self.parts.face[part]),
+            u=u,
+            v=v,
+            place=self.parts.place[part].tolist(),
+            seen=rate(n_visible - n_visible_wrong, n_visible),
+            hidden=rate(n_hidden - n_hidden_wrong, n_hidden),
+            difference=float(compared.difference[part]),
+            interval=(float(compared.low[part]), float(compared.high[part])),
+            p=float(compared.p[part]),
         )
 
 
 def map_surface(
     scenes: OpenScenes, rows: Iterable[Row], run: RunDirectory, progress: Progress
 ) -> SurfaceMap:
-    """Count over the surface of each object, write the counts and their figure, and
-    return what the summary says.
+    """Count wrong predictions over the surface of each object of a sweep.
+
+    Writes the counts and their figure into the run directory.
+
+    Args:
+        scenes: of the sweep.
+        rows: all of its rows.
+        run: where the files are written.
+        progress: advances by the number of predictions.
+
+    Returns:
+        What the summary says.
     """
     job = scenes.job
-    points = scenes.open(0).points[scenes.job.sizes[0]]
-    per_scene = points.count
-    models = len(job.models)
-    wrong: npt.NDArray[np.int8] = np.full(
-        (len(job.places), per_scene, models), UNKNOWN, np.int8
-    )
+    wrong = _read_wrong(scenes, rows)
+    assets = {
+        named_scene.object: named_scene.scene.description.object
+        for named_scene in job.places
+    }
+    counts = _make_counts(scenes, assets, wrong)
+    for scene, wrong_in_scene in enumerate(wrong):
+        scene_counts = counts[job.places[scene].object]
+        _count_scene(scenes, scene, wrong_in_scene, scene_counts, progress)
+    return _write_map(counts, assets, [model.name for model in job.models], run)
+
+
+def _read_wrong(scenes: OpenScenes, rows: Iterable[Row]) -> npt.NDArray[np.int8]:
+    """Return which predictions are wrong: 1, 0 or UNKNOWN, (scenes, images, models)."""
+    job = scenes.job
+    shape = (len(job.places), job.per_scene, len(job.models))
+    wrong: npt.NDArray[np.int8] = np.full(shape, UNKNOWN, np.int8)
     for row in rows:
-        # nor is it hidden in a picture that has nothing of the object
+        # An image without the object doesn't count as one that hides a part either.
         if row.label != OUT_OF_VIEW:
             wrong.flat[row.step] = not judgement_of(row).right
-    draws = np.asarray(points.units.draw(np.arange(wrong[..., 0].size))).reshape(
-        wrong.shape[:2]
-    )
-    assets = {place.object: place.scene.description.object for place in job.places}
+    return wrong
+
+
+def _make_counts(
+    scenes: OpenScenes,
+    assets: Mapping[str, ObjectAsset],
+    wrong: npt.NDArray[np.int8],
+) -> dict[str, SurfaceCounts]:
+    """Create the counts of each object, before any image is added.
+
+    Args:
+        scenes: of the sweep.
+        assets: the objects by name.
+        wrong: from `_read_wrong`.
+    """
+    job = scenes.job
+    units = scenes.open(0).points[job.sizes[0]].units
+    image_numbers = np.arange(wrong[..., 0].size)
+    draws = np.asarray(units.draw(image_numbers)).reshape(wrong.shape[:2])
+    n_models = len(job.models)
     counts = dict[str, SurfaceCounts]()
-    for number, (name, asset) in enumerate(assets.items()):
+    for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
-        tallies = list[PartCounts]()
-        here = [place.object == name for place in job.places]
-        for model in range(models):
-            seed = seeds.stream(job.config.seed, "surface", number * models + model)
-            own = wrong[here][..., model]
-            exchanged = exchange(own.ravel(), draws[here].ravel(), seed)
-            tallies.append(
-                PartCounts(
-                    parts.count,
-                    int((own >= 0).sum()),
-                    int((own >= 1).sum()),
-                    seed,
-                    exchanged,
-                )
+        has_object = [named_scene.object == name for named_scene in job.places]
+        model_seeds = [
+            seeds.stream(job.config.seed, "surface", object_index * n_models + model)
+            for model in range(n_models)
+        ]
+        part_counts = [
+            _make_part_counts(
+                parts, wrong[has_object][..., model], draws[has_object], seed
             )
-        counts[name] = SurfaceCounts(parts, tallies)
-    for scene, pictures in enumerate(wrong):
-        view = scenes.open(scene)
-        mine = counts[job.places[scene].object]
-        for some in batches(0, per_scene, AT_ONCE):
-            for size in dict.fromkeys(job.sizes):
-                asked = [model for model in range(models) if job.sizes[model] == size]
-                us = view.points[size].configurations(
-                    some.start, len(some), scene * per_scene
-                )
-                fineness = ceil(RAYS / min(size))
-                seen = (view.renderers[size].surfaces(u, fineness) for u in us)
-                for said, shown in zip(
-                    pictures[some.start : some.stop], seen, strict=True
-                ):
-                    mine.add(
-                        shown,
-                        {
-                            model: bool(said[model])
-                            for model in asked
-                            if said[model] != UNKNOWN
-                        },
-                    )
-            progress.advance(len(some) * models)
-    return _written(counts, assets, [model.name for model in job.models], run)
+            for model, seed in enumerate(model_seeds)
+        ]
+        counts[name] = SurfaceCounts(parts, part_counts)
+    return counts
+
+
+def _make_part_counts(
+    parts: SurfaceParts, wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
+) -> PartCounts:
+    """Create the counts of one object and one model, before any image is added.
+
+    Args:
+        parts: of the object.
+        wrong: (scenes, images) 1, 0 or UNKNOWN.
+        draws: (scenes, images) the draw of each image.
+        seed: of the permutations.
+    """
+    permuted = exchange(wrong.ravel(), draws.ravel(), seed)
+    n_known = int((wrong >= 0).sum())
+    n_failures = int((wrong >= 1).sum())
+    return PartCounts(parts.count, n_known, n_failures, seed, permuted)
+
+
+def _count_scene(
+    scenes: OpenScenes,
+    scene: int,
+    wrong: npt.NDArray[np.int8],
+    counts: SurfaceCounts,
+    progress: Progress,
+) -> None:
+    """Trace the surface in every image of a scene and count it.
+
+    Args:
+        scenes: of the sweep.
+        scene: the index of the scene.
+        wrong: (images, models) of the scene, from `_read_wrong`.
+        counts: of the scene's object.
+        progress: advances by the number of predictions.
+    """
+    job = scenes.job
+    swept_scene = scenes.open(scene)
+    n_images, n_models = wrong.shape
+    for batch in batches(0, n_images, BATCH_SIZE):
+        for size in dict.fromkeys(job.sizes):
+            models = [model for model in range(n_models) if job.sizes[model] == size]
+            configurations = swept_scene.points[size].configurations(
+                batch.start, len(batch), scene * n_images
+            )
+            rays_per_pixel = ceil(MIN_RAYS / min(size))
+            renderer = swept_scene.renderers[size]
+            for number, u in zip(batch, configurations, strict=True):
+                surfaces = renderer.surfaces(u, rays_per_pixel)
+                counts.add(surfaces, _select_known(wrong[number], models))
+        progress.advance(len(batch) * n_models)
+
+
+def _select_known(
+    wrong: npt.NDArray[np.int8], models: Sequence[int]
+) -> dict[int, bool]:
+    """Return which of some models are wrong, from (models,), if that is known."""
+    return {model: bool(wrong[model]) for model in models if wrong[model] != UNKNOWN}
 
 
 def exchange(
-    wrong: npt.NDArray[np.int8], draws: Counts, seed: int
+    wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
-    """Return the predictions of whole draws dealt out to draws anew, as `PartCounts`
-    takes them; None where each picture has a draw of its own. Both (n,), predictions
-    that are not known are left out.
+    """Permute the predictions of full draws among the draws, SHARINGS times.
+
+    Args:
+        wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as
+            many images.
+        draws: (n,) the draw of each image.
+        seed: of the permutations.
+
+    Returns:
+        Whether the permuted predictions are wrong, without unknown ones, packed as
+        `PartCounts` takes them; None if each image has a draw of its own.
     """
-    known = wrong != UNKNOWN
-    (_, of) = np.unique(draws, return_counts=True)
-    if of.max(initial=1) == 1:
+    is_known = wrong != UNKNOWN
+    draw_sizes = np.unique(draws, return_counts=True)[1]
+    n_draws = len(draw_sizes)
+    if draw_sizes.max(initial=1) == 1:
         return None
-    # each has as many pictures
-    order = np.argsort(draws, kind="stable").reshape(len(of), -1)
+    images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
-    found = np.zeros((SHARINGS, len(wrong)), bool)
-    for one in found:
-        one[order] = (wrong == 1)[order[generator.permutation(len(order))]]
-    return np.packbits(found[:, known], axis=0)
+    permuted = np.zeros((SHARINGS, len(wrong)), bool)
+    for permutation in permuted:
+        order = generator.permutation(n_draws)
+        permutation[images_of_draw] = (wrong == 1)[images_of_draw[order]]
+    return np.packbits(permuted[:, is_known], axis=0)
 
 
-def _written(
+def _write_map(
     counts: Mapping[str, SurfaceCounts],
     assets: Mapping[str, ObjectAsset],
     models: Sequence[str],
     run: RunDirectory,
 ) -> SurfaceMap:
-    tables = []
-    panels = []
+    """Compare the counts of all objects, and write them with their figure.
+
+    Args:
+        counts: by the name of the object.
+        assets: the objects by name.
+        models: their names.
+        run: where the files are written.
+    """
+    tables = list[SurfaceTable]()
+    panels = list[Panel]()
     arrays: dict[str, Any] = {
         "objects": np.array(list(counts)),
         "models": np.array(models),
     }
-    for number, (name, mine) in enumerate(counts.items()):
-        parts = mine.parts
-        views = tuple(_views(assets[name], mine.parts))
-        compared = [
-            {
-                kind: association(tally, some, LEAST)
-                for kind, some in parts.kinds.items()
-            }
-            for tally in mine.tallies
+    for number, (name, object_counts) in enumerate(counts.items()):
+        comparisons = [
+            _compare_kinds(tally, object_counts.parts)
+            for tally in object_counts.tallies
         ]
-        for what in ("pictures", "failures", "seen", "wrong"):
-            arrays[f"{what}_{number}"] = np.stack(
-                [getattr(tally, what) for tally in mine.tallies]
-            )
-        for what in ("difference", "low", "high", "p"):
-            joined = [
-                np.concatenate([frame[what] for frame in kinds.values()])
-                for kinds in compared
-            ]
-            arrays[f"{what}_{number}"] = np.stack(joined).astype(np.float32)
-        arrays[f"map_{number}"] = parts.corners.astype(np.float32)
-        for model, tally, kinds in zip(models, mine.tallies, compared, strict=True):
-            cells = kinds["cell"]
-            there = parts.covered.ravel() | (tally.seen[parts.kinds["cell"]] > 0)
-            colours = np.where(cells.compared.to_numpy()[:, None], UNTOLD, UNCOMPARED)
-            colours = np.where(there[:, None], colours, NOTHING)
-            title = f"{short_name(name)}, {short_name(model)}"
-            panels.append(
-                Panel(
-                    title, colours, cells.difference.where(cells.told).to_numpy(), views
-                )
-            )
+        for array_name, array in _stored_arrays(object_counts, comparisons).items():
+            arrays[f"{array_name}_{number}"] = array
+        panels += _make_panels(assets[name], object_counts, comparisons, name, models)
+        for model, tally, frames in zip(
+            models, object_counts.tallies, comparisons, strict=True
+        ):
             tables += [
-                mine.table(name, model, tally, kind, frame)
-                for kind, frame in kinds.items()
+                object_counts.table(name, model, tally, kind, frame)
+                for kind, frame in frames.items()
             ]
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
-    write_bytes(run.path / FILE, stream.getvalue())
-    panels = panels[:MOST_PANELS]
-    for suffix, data in drawn(
-        partial(_draw, panels), (10.0, 0.5 + 3.6 * len(panels)), kinds=("png",)
-    ).items():
+    write_bytes(run.path / COUNTS_FILE, stream.getvalue())
+    _save_figure(panels[:MAX_PANELS], run)
+    return SurfaceMap(file=COUNTS_FILE, cells=CELLS, least=LEAST, tables=tables)
+
+
+def _compare_kinds(counts: PartCounts, parts: SurfaceParts) -> dict[str, pd.DataFrame]:
+    """Compare the predictions of a model by the parts of each kind."""
+    return {
+        kind: association(counts, part_slice, LEAST)
+        for kind, part_slice in parts.kinds.items()
+    }
+
+
+def _make_panels(
+    asset: ObjectAsset,
+    counts: SurfaceCounts,
+    comparisons: Sequence[Mapping[str, pd.DataFrame]],
+    object_name: str,
+    models: Sequence[str],
+) -> Iterator[Panel]:
+    """Yield what the figure shows of an object, for each model.
+
+    Args:
+        asset: the object.
+        counts: of it.
+        comparisons: from `_compare_kinds`, for each model.
+        object_name: its name.
+        models: their names.
+    """
+    views = tuple(_render_views(asset, counts.parts))
+    for model, tally, frames in zip(models, counts.tallies, comparisons, strict=True):
+        cells = frames["cell"]
+        yield Panel(
+            f"{short_name(object_name)}, {short_name(model)}",
+            _grey_colors(counts.parts, tally, cells),
+            cells.difference.where(cells.significant).to_numpy(),
+            views,
+        )
+
+
+def _save_figure(panels: Sequence[Panel], run: RunDirectory) -> None:
+    size = (10.0, 0.5 + 3.6 * len(panels))
+    figures = drawn(partial(_draw, panels), size, kinds=("png",))
+    for suffix, data in figures.items():
         write_bytes(run.path / "images" / f"surface.{suffix}", data)
-    return SurfaceMap(file=FILE, cells=CELLS, least=LEAST, tables=tables)
 
 
-MOST_PANELS = 12  # objects times models that are drawn; the file of the counts has all
-# the direction that the object is shaded from, world space; of length 1
-LIGHT = (0.36, 0.48, 0.80)
-COLOURS = "PuOr_r"
-"""ColorBrewer's purple to orange, which people see apart who see no red or no green:
-orange is wrong more often.
+def _stored_arrays(
+    counts: SurfaceCounts, comparisons: Sequence[Mapping[str, pd.DataFrame]]
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays that the file holds of an object, by their names.
+
+    Args:
+        counts: of the object.
+        comparisons: from `association`, by the kind of part, for each model.
+    """
+    tallies = counts.tallies
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "pictures": np.stack([tally.pictures for tally in tallies]),
+        "failures": np.stack([tally.failures for tally in tallies]),
+        "seen": np.stack([tally.seen for tally in tallies]),
+        "wrong": np.stack([tally.wrong for tally in tallies]),
+    }
+    for column in ("difference", "low", "high", "p"):
+        values = [
+            np.concatenate([frame[column] for frame in frames.values()])
+            for frames in comparisons
+        ]
+        arrays[column] = np.stack(values).astype(np.float32)
+    arrays["map"] = counts.parts.corners.astype(np.float32)
+    return arrays
+
+
+def _grey_colors(
+    parts: SurfaceParts, tally: PartCounts, cells: pd.DataFrame
+) -> Float64Array:
+    """Return the colors (cells, 3) of cells without a significant difference."""
+    has_surface = parts.covered.ravel() | (tally.seen[parts.kinds["cell"]] > 0)
+    is_compared = cells.compared.to_numpy()
+    colors = np.where(is_compared[:, None], NOT_SIGNIFICANT_GREY, NOT_COMPARED_GREY)
+    return np.where(has_surface[:, None], colors, WHITE)
+
+
+MAX_PANELS = 12  # pairs of object and model in the figure; the file has all counts
+# the direction to the light that shades the object, world space; of length 1
+LIGHT_DIRECTION = (0.36, 0.48, 0.80)
+COLORMAP = "PuOr_r"
+"""ColorBrewer's purple to orange, which color-blind people can tell apart: orange is
+wrong more often.
 """
-UNTOLD = (0.78, 0.78, 0.78)
-UNCOMPARED = (0.45, 0.45, 0.45)
-NOTHING = (1.0, 1.0, 1.0)
-"""Grey where a part is not told from chance, darker where too few pictures show it or
-do not; white beside charts.
+NOT_SIGNIFICANT_GREY = (0.78, 0.78, 0.78)
+NOT_COMPARED_GREY = (0.45, 0.45, 0.45)
+WHITE = (1.0, 1.0, 1.0)
+"""Grey where the difference may be chance, darker where too few images show the part or
+too few do not; white outside of charts.
 """
-ROWS = 2  # rows of the views of an object
+GREY_LABELS = {
+    NOT_SIGNIFICANT_GREY: "not told from chance",
+    NOT_COMPARED_GREY: "too few pictures with or without it",
+}
+N_VIEW_ROWS = 2  # of the views of an object
 
 
 class MapView(NamedTuple):
-    """What a camera sees of an object: where it stands, as text; the number of the cell
-    in each pixel (H, W), row by row of the map, -1 beside the object; and how bright
-    that is (H, W).
+    """What a camera sees of an object.
+
+    Attributes:
+        title: where the camera stands.
+        cells: (H, W) index of the cell in each pixel, row by row of the map; -1 where
+            the object is not.
+        shade: (H, W) brightness in [0, 1].
     """
 
     title: str
-    cells: Counts
-    shade: Doubles
+    cells: Int64Array
+    shade: Float64Array
 
 
 class Panel(NamedTuple):
-    """What is drawn of one object and one model: the colours (cells, 3) of what is not
-    told from chance, and by how much predictions are wrong more often where a cell is
-    seen, NaN where that is not told, (cells,).
+    """What the figure shows of one object and one model.
+
+    Attributes:
+        title: names of both.
+        grey_colors: (cells, 3) of cells without a significant difference.
+        difference: (cells,) by how much predictions are wrong more often where the
+            cell is visible; NaN where that is not significant.
+        views: of the object.
     """
 
     title: str
-    colours: Doubles
-    difference: Doubles
+    grey_colors: Float64Array
+    difference: Float64Array
     views: tuple[MapView, ...]
 
 
-def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
-    alone = framed(
-        load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS
-    )
-    scene = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS))
-    for azimuth, elevation in SIDES:
-        camera = camera_to_world(
-            alone.with_values(camera__azimuth=azimuth, camera__elevation=elevation), 1.0
+def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
+    """Yield the object by itself from the cameras in `VIEW_ANGLES`."""
+    scene_of_object = load_scene(asset, settings={"ground.size": 0.0})
+    description = framed(scene_of_object.description, VIEW_SIZE)
+    scene = MitsubaScene(description, (VIEW_SIZE, VIEW_SIZE))
+    for azimuth, elevation in VIEW_ANGLES:
+        viewed = description.with_values(
+            camera__azimuth=azimuth, camera__elevation=elevation
         )
-        shown = scene.surfaces(
-            {"camera.to_world": torch.from_numpy(camera.astype(np.float32))}
-        )
-        there = shown.seen(OBJECT).numpy()
-        cells = np.full(there.shape, -1, np.int64)
-        cells[there] = parts.cells(
-            shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64)
-        )
-        shade = 0.7 + 0.3 * np.clip(shown.normal.numpy() @ np.array(LIGHT), 0.0, 1.0)
+        to_world = camera_to_world(viewed, 1.0).astype(np.float32)
+        surfaces = scene.surfaces({"camera.to_world": torch.from_numpy(to_world)})
+        is_object = surfaces.seen(OBJECT).numpy()
+        face = surfaces.face.numpy()[is_object]
+        uv = surfaces.uv.numpy()[is_object].astype(np.float64)
+        cells = np.full(is_object.shape, -1, np.int64)
+        cells[is_object] = parts.cells(face, uv)
+        cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
+        shade = 0.7 + 0.3 * cosine
         yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
 
 
 def _draw(panels: Sequence[Panel], figure: Any) -> None:
-    """Draw a row for each panel, at one scale: the map, and the object in its colours
-    from some sides.
+    """Draw a row per panel, at one scale: the map, and the object from some sides.
+
+    Args:
+        panels: from the first row on.
+        figure: of matplotlib.
     """
     import matplotlib as mpl  # takes long to import
 
-    largest = max(
-        (float(np.nanmax(np.abs(one.difference), initial=0.0)) for one in panels),
-        default=0.0,
-    )
-    end = max(ceil(10.0 * largest - 1e-9) / 10.0, 0.1)
+    limit = _find_scale_limit(panels)
     scale = mpl.cm.ScalarMappable(
-        mpl.colors.Normalize(-end, end), mpl.colormaps[COLOURS]
+        mpl.colors.Normalize(-limit, limit), mpl.colormaps[COLORMAP]
     )
     axes = figure.subplots(len(panels), 2, squeeze=False, width_ratios=(1.0, 1.55))
-    for (flat, solid), (title, greys, difference, views) in zip(
-        axes, panels, strict=True
-    ):
-        colours = np.where(
-            np.isnan(difference)[:, None], greys, scale.to_rgba(difference)[:, :3]
-        )
-        flat.imshow(
-            colours.reshape(CELLS, CELLS, 3),
+    for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
+        is_grey = np.isnan(panel.difference)[:, None]
+        scale_colors = scale.to_rgba(panel.difference)[:, :3]
+        cell_colors = np.where(is_grey, panel.grey_colors, scale_colors)
+        map_axes.imshow(
+            cell_colors.reshape(CELLS, CELLS, 3),
             extent=(0, 1, 0, 1),
             interpolation="nearest",
         )
-        flat.set(xlabel="u", ylabel="v")
-        flat.set_title(title)
-        solid.axis("off")
-        across = ceil(len(views) / ROWS)
-        # white beside the object
-        mosaic = np.ones((ROWS * SIDE_PIXELS, across * SIDE_PIXELS, 3))
-        for number, (side, cells, shade) in enumerate(views):
-            row, column = (SIDE_PIXELS * at for at in divmod(number, across))
-            worn = np.where(
-                cells[..., None] >= 0,
-                colours[np.maximum(cells, 0)] * shade[..., None],
-                1.0,
-            )
-            mosaic[row : row + SIDE_PIXELS, column : column + SIDE_PIXELS] = worn
-            solid.text(
-                column + 0.5 * SIDE_PIXELS,
-                row + 4,
-                side,
-                ha="center",
-                va="top",
-                fontsize=7,
-            )
-        solid.imshow(mosaic)
+        map_axes.set(xlabel="u", ylabel="v")
+        map_axes.set_title(panel.title)
+        _draw_views(view_axes, panel.views, cell_colors)
 
-    def percent(value: float, _: object) -> str:
-        return f"{100.0 * value:+.3g} %" if value else "0 %"
-
-    bar = figure.colorbar(
-        scale, ax=axes, shrink=0.8 if len(panels) == 1 else 0.4, format=percent
-    )
+    shrink = 0.8 if len(panels) == 1 else 0.4
+    bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
     bar.set_label(
         "share of wrong predictions where it is seen,\nless that where it is not"
     )
-    texts = {
-        UNTOLD: "not told from chance",
-        UNCOMPARED: "too few pictures with or without it",
-    }
-    marks = [
-        mpl.patches.Patch(facecolor=colour, label=text)
-        for colour, text in texts.items()
+    patches = [
+        mpl.patches.Patch(facecolor=color, label=label)
+        for color, label in GREY_LABELS.items()
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=2)
+    figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _find_scale_limit(panels: Sequence[Panel]) -> float:
+    """Return the largest difference of all panels, rounded up to 10 %."""
+    max_difference = max(
+        (float(np.nanmax(np.abs(panel.difference), initial=0.0)) for panel in panels),
+        default=0.0,
+    )
+    return max(ceil(10.0 * max_difference - 1e-9) / 10.0, 0.1)
+
+
+def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) -> None:
+    """Draw the views of an object side by side in the colors (cells, 3) of its map."""
+    axes.axis("off")
+    n_columns = ceil(len(views) / N_VIEW_ROWS)
+    mosaic = np.ones((N_VIEW_ROWS * VIEW_SIZE, n_columns * VIEW_SIZE, 3))
+    for number, view in enumerate(views):
+        row, column = divmod(number, n_columns)
+        top = row * VIEW_SIZE
+        left = column * VIEW_SIZE
+        is_object = view.cells[..., None] >= 0
+        # white where the object is not
+        shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
+        image = np.where(is_object, shaded, 1.0)
+        mosaic[top : top + VIEW_SIZE, left : left + VIEW_SIZE] = image
+        axes.text(
+            left + 0.5 * VIEW_SIZE,
+            top + 4,
+            view.title,
+            ha="center",
+            va="top",
+            fontsize=7,
+        )
+    axes.imshow(mosaic)
+
+
+def _format_percent(value: float, _: object) -> str:
+    return f"{100.0 * value:+.3g} %" if value else "0 %"

@@ -1,5 +1,4 @@
-"""Tracks: what a tracker makes of a detector's boxes along a drive, judged by the true
-box of each frame.
+"""Track the boxes of a detector along a drive, and compare with the true boxes.
 
 A frame is lost where the object is seen and no track of that frame overlaps its true
 box; an identity switch is a frame whose track has another number than the one before
@@ -20,8 +19,8 @@ from scipy.optimize import linear_sum_assignment
 
 from advsearch.tasks.boxes import overlap
 
-Doubles = NDArray[np.float64]
-Step = Callable[[Doubles, Doubles], Sequence[tuple[int, Any]]]
+Float64Array = NDArray[np.float64]
+Step = Callable[[Float64Array, Float64Array], Sequence[tuple[int, Any]]]
 """From the boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their scores (n,) to
 the tracks that are in it: a number that stays the same, and a box.
 """
@@ -30,18 +29,26 @@ Tracker = Callable[[], Step]
 
 
 class DetectedFrame(NamedTuple):
-    """What a picture of a drive shows (its true box, None where nothing is seen), and
-    what a detector says of it.
+    """The boxes of an image of a drive, x0, y0, x1, y1 in pixels.
+
+    Attributes:
+        true: (4,) of the object; None if it is not visible.
+        boxes: (n, 4) that a detector predicts.
+        scores: (n,) theirs.
     """
 
-    true: Doubles | None
-    boxes: Doubles
-    scores: Doubles
+    true: Float64Array | None
+    boxes: Float64Array
+    scores: Float64Array
 
 
 class Tracked(NamedTuple):
-    """Of one drive: the share of frames that are lost, identity switches, and the most
-    lost frames in a row.
+    """What a tracker makes of one drive.
+
+    Attributes:
+        lost: fraction of the frames that are lost.
+        switches: identity switches.
+        gap: lost frames in a row, at most.
     """
 
     lost: float
@@ -51,18 +58,27 @@ class Tracked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Track:
+    """A track.
+
+    Attributes:
+        number: which stays the same.
+        box: (4,) in the last frame, or the predicted one.
+        speed: (4,) change of the box per frame.
+        missed: frames since it had a box.
+    """
+
     number: int
-    box: Doubles
-    speed: Doubles
+    box: Float64Array
+    speed: Float64Array
     missed: int = 0
 
 
 class ConstantVelocity:
-    """A tracker in which boxes go on as they went.
+    """A tracker that predicts boxes with constant velocity.
 
-    Boxes are given to the tracks whose predicted boxes they overlap most, all together
-    (Kuhn 1955): first those with a score of `sure`, then the others, which begin no
-    track (Zhang et al. 2022, *ByteTrack*, section 3).
+    Boxes are assigned to the tracks whose predicted boxes they overlap most, all
+    jointly (Kuhn 1955): first those with a score of `sure`, then the others, which
+    begin no track (Zhang et al. 2022, *ByteTrack*, section 3).
 
     Args:
         sure: score of a box that begins a track.
@@ -79,80 +95,122 @@ class ConstantVelocity:
         self._tracks: list[_Track] = []
         self._numbers = itertools.count(1)
 
-    def __call__(self, boxes: Doubles, scores: Doubles) -> list[tuple[int, Doubles]]:
-        """Return the tracks that have a box in this frame."""
+    def __call__(
+        self, boxes: Float64Array, scores: Float64Array
+    ) -> list[tuple[int, Float64Array]]:
+        """Return the tracks that have a box in this frame.
+
+        Args:
+            boxes: (n, 4).
+            scores: (n,).
+        """
+        is_sure = scores >= self.sure
         waiting = [
-            replace(one, box=one.box + one.speed, missed=one.missed + 1)
-            for one in self._tracks
+            replace(track, box=track.box + track.speed, missed=track.missed + 1)
+            for track in self._tracks
         ]
-        seen = list[_Track]()
-        new = list[Doubles]()
-        for sure in (True, False):
-            left = boxes[(scores >= self.sure) == sure]
-            table = np.array([overlaps(left, one.box) for one in waiting]).reshape(
-                len(waiting), len(left)
-            )
-            pairs = {
-                a: b
-                for a, b in zip(*linear_sum_assignment(-table), strict=True)
-                if table[a, b] >= self.overlap
-            }
-            for a, b in pairs.items():
-                before = waiting[a].box - waiting[a].speed * waiting[a].missed
-                seen.append(
-                    _Track(
-                        waiting[a].number,
-                        left[b],
-                        (left[b] - before) / waiting[a].missed,
-                    )
-                )
-            waiting = [
-                track for number, track in enumerate(waiting) if number not in pairs
-            ]
-            new += [
-                box
-                for number, box in enumerate(left)
-                if number not in pairs.values() and sure
-            ]
-        seen += [_Track(next(self._numbers), box, np.zeros(4)) for box in new]
-        self._tracks = [*seen, *(one for one in waiting if one.missed <= self.patience)]
-        return [(one.number, one.box) for one in seen]
+        sure_tracks, waiting, new_boxes = self._assign(waiting, boxes[is_sure])
+        unsure_tracks, waiting, _ = self._assign(waiting, boxes[~is_sure])
+        new_tracks = [
+            _Track(next(self._numbers), box, np.zeros(4)) for box in new_boxes
+        ]
+        visible = [*sure_tracks, *unsure_tracks, *new_tracks]
+        still_waiting = [track for track in waiting if track.missed <= self.patience]
+        self._tracks = [*visible, *still_waiting]
+        return [(track.number, track.box) for track in visible]
+
+    def _assign(
+        self, tracks: Sequence[_Track], boxes: Float64Array
+    ) -> tuple[list[_Track], list[_Track], list[Float64Array]]:
+        """Assign boxes (n, 4) to tracks.
+
+        Returns:
+            The tracks with a box, those without, and the boxes without a track.
+        """
+        overlap_rows = [overlaps(boxes, track.box) for track in tracks]
+        overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
+        pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
+        box_of_track = {
+            track: box
+            for track, box in pairs
+            if overlap_table[track, box] >= self.overlap
+        }
+        assigned = list[_Track]()
+        for track_index, box_index in box_of_track.items():
+            track = tracks[track_index]
+            box = boxes[box_index]
+            last_box = track.box - track.speed * track.missed
+            speed = (box - last_box) / track.missed
+            assigned.append(_Track(track.number, box, speed))
+        used_boxes = set(box_of_track.values())
+        free_tracks = [
+            track for index, track in enumerate(tracks) if index not in box_of_track
+        ]
+        free_boxes = [box for index, box in enumerate(boxes) if index not in used_boxes]
+        return assigned, free_tracks, free_boxes
 
 
-def overlaps(boxes: Doubles, box: Doubles) -> Doubles:
-    """Return intersection over union of boxes (n, 4) with one box (4,), (n,)."""
+def overlaps(boxes: Float64Array, box: Float64Array) -> Float64Array:
+    """Compute the intersection over union (n,) of boxes (n, 4) with one box (4,)."""
     return np.asarray(overlap(torch.from_numpy(boxes), torch.from_numpy(box)))
 
 
 def frame_of(payload: Any, names: Collection[str]) -> DetectedFrame:
-    found = [one for one in payload["found"] if one["label"] in names]
-    boxes = np.array([one["box"] for one in found], dtype=float).reshape(-1, 4)
-    true = None if payload["box"] is None else np.array(payload["box"], dtype=float)
-    return DetectedFrame(true, boxes, np.array([one["score"] for one in found]))
+    """Return the boxes that a row of a detector stores.
+
+    Args:
+        payload: of the row.
+        names: of the classes whose boxes count.
+    """
+    found = [box for box in payload["found"] if box["label"] in names]
+    boxes = np.array([box["box"] for box in found], dtype=float).reshape(-1, 4)
+    scores = np.array([box["score"] for box in found])
+    true_box = None
+    if payload["box"] is not None:
+        true_box = np.array(payload["box"], dtype=float)
+    return DetectedFrame(true_box, boxes, scores)
 
 
 def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tracked:
-    """Return what a tracker makes of a drive; a track is on the object where it
-    overlaps the true box by `iou`.
+    """Track the boxes of a drive, and compare the tracks with the true boxes.
+
+    Args:
+        frames: of the drive, in their order.
+        tracker: makes the tracker.
+        iou: intersection over union with the true box from which on a track is on the
+            object.
     """
     step = tracker()
-    last = None
-    lost = list[bool]()
-    switches = 0
-    for true, boxes, scores in frames:
-        tracks = step(boxes, scores)
-        places = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)
-        shares = [] if true is None else overlaps(places, true).tolist()
-        on = [
-            (share, number)
-            for share, (number, _) in zip(shares, tracks, strict=False)
-            if share >= iou
-        ]
-        lost.append(true is not None and not on)
-        if on:
-            number = last if any(number == last for _, number in on) else max(on)[1]
-            switches += last is not None and number != last
-            last = number
-    gaps = [sum(run) for is_lost, run in itertools.groupby(lost) if is_lost]
-    seen = sum(true is not None for true, _, _ in frames)
-    return Tracked(sum(lost) / max(1, seen), switches, max(gaps, default=0))
+    last_number: int | None = None
+    is_lost = list[bool]()
+    n_switches = 0
+    for frame in frames:
+        tracks = step(frame.boxes, frame.scores)
+        is_visible = frame.true is not None
+        on_object = _find_tracks_on(tracks, frame.true, iou)
+        is_lost.append(is_visible and not on_object)
+        if not on_object:
+            continue
+        if any(number == last_number for _, number in on_object):
+            continue
+        _, number = max(on_object)
+        n_switches += last_number is not None
+        last_number = number
+    gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
+    n_visible = sum(frame.true is not None for frame in frames)
+    return Tracked(sum(is_lost) / max(1, n_visible), n_switches, max(gaps, default=0))
+
+
+def _find_tracks_on(
+    tracks: Sequence[tuple[int, Any]], true_box: Float64Array | None, iou: float
+) -> list[tuple[float, int]]:
+    """Return overlap and number of the tracks that are on the true box."""
+    if true_box is None:
+        return []
+    boxes = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)
+    track_overlaps = overlaps(boxes, true_box).tolist()
+    return [
+        (track_overlap, number)
+        for track_overlap, (number, _) in zip(track_overlaps, tracks, strict=True)
+        if track_overlap >= iou
+    ]
