@@ -278,6 +278,18 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "CONTROLS", "Budget", "Choice", "Control", "Group", "NumberControl", "Parameter", "Space",
-    "compose", "gathered", "make_control", "make_space", "names_of", "settings_by_name",
-]  # fmt: skip
+    "CONTROLS",
+    "Budget",
+    "Choice",
+    "Control",
+    "Group",
+    "NumberControl",
+    "Parameter",
+    "Space",
+    "compose",
+    "gathered",
+    "make_control",
+    "make_space",
+    "names_of",
+    "settings_by_name",
+]

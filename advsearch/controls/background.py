@@ -69,9 +69,14 @@ class BackgroundControl(Control):
             (0.0, 1.0),
         ),
     )
-    choices = (Choice("ground", "hide", "Whether the ground plane stays in the "
-                                        "picture: keep or hide.",
-                      options=("keep", "hide")),)  # fmt: skip
+    choices = (
+        Choice(
+            "ground",
+            "hide",
+            "Whether the ground plane stays in the picture: keep or hide.",
+            options=("keep", "hide"),
+        ),
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)

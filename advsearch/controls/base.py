@@ -143,9 +143,21 @@ def check_prepared(
 
 
 HANDED = (
-    "prepare", "bind", "inputs", "picture", "describe", "artifacts", "printed", "numbers", "files", "scene_inputs",
-    "on_picture", "measured", "kept_pictures", "kept_files",
-)  # fmt: skip
+    "prepare",
+    "bind",
+    "inputs",
+    "picture",
+    "describe",
+    "artifacts",
+    "printed",
+    "numbers",
+    "files",
+    "scene_inputs",
+    "on_picture",
+    "measured",
+    "kept_pictures",
+    "kept_files",
+)
 """Methods of controls to which those of another package are handed copies of
 tensors.
 """
@@ -458,7 +470,6 @@ class Control:
         )
 
     # ---- in a scene
-    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a
@@ -658,7 +669,6 @@ class Control:
         return frozenset()
 
     # ---- at a configuration
-    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         """Return every parameter's value at a slice of u: float32 of the parameter's

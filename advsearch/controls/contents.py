@@ -237,16 +237,28 @@ class ContentsControl(Control):
     refines = frozenset({"object.to_world"})
     parameters = (
         Parameter.moving(
-            Parameter.ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is "
-                                                          "empty, 1 is full to the "
-                                                          "brim.",
+            Parameter.ORBIT,
+            "level",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Height of the liquid: 0 is empty, 1 is full to the brim.",
             (0.0, 0.95),
         ),
         *(
-            _lit(name, "1", 0.0, 1.0, float(name == "coffee"), f"Share of {name}.", (0.0, 1.0))
+            _lit(
+                name,
+                "1",
+                0.0,
+                1.0,
+                float(name == "coffee"),
+                f"Share of {name}.",
+                (0.0, 1.0),
+            )
             for name in INGREDIENTS
         ),
-    )  # fmt: skip
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
@@ -366,7 +378,6 @@ class ContentsControl(Control):
         return inputs
 
     # ---- proportions
-    # ------------------------------------------------------------------------------------------------
 
     def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is
@@ -416,7 +427,6 @@ class ContentsControl(Control):
 
 
 # ---- how it looks
-# ---------------------------------------------------------------------------------------------------
 
 
 def liquid(shares: Tensor, vessel: Tensor) -> Tensor:

@@ -48,20 +48,42 @@ class EnvironmentControl(Control):
 
     kind = "environment"
     parameters = (
-        Parameter.named("which", (OWN_MAP, *MAPS), OWN_MAP,
-                        "Another environment instead of the scene's own, metered "
-                        "afresh: bundled, or a .hdr or .exr "
-                        "file."),
+        Parameter.named(
+            "which",
+            (OWN_MAP, *MAPS),
+            OWN_MAP,
+            "Another environment instead of the scene's own, metered "
+            "afresh: bundled, or a .hdr or .exr "
+            "file.",
+        ),
         *settings.ENVIRONMENT,
-        *(_lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
-        Parameter("harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
-                  "Low-order light that is added: spherical-harmonic coefficients, 9 "
-                  "for each channel, inside the "
-                  "ball.", estimators=Parameter.LIT),
-    )  # fmt: skip
-    choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of "
-                                      "all coefficients.", "epsilon",
-                      "harmonics", most=100.0),)  # fmt: skip
+        *(
+            _lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.")
+            for color in CHANNELS
+        ),
+        Parameter(
+            "harmonics",
+            (COEFFICIENTS,),
+            "mean radiances",
+            -1.0,
+            1.0,
+            0.0,
+            "Low-order light that is added: spherical-harmonic coefficients, 9 "
+            "for each channel, inside the "
+            "ball.",
+            estimators=Parameter.LIT,
+        ),
+    )
+    choices = (
+        Choice(
+            "epsilon",
+            0.5,
+            "Radius of the ball of `harmonics`: L2 norm of all coefficients.",
+            "epsilon",
+            "harmonics",
+            most=100.0,
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:

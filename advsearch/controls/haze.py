@@ -39,11 +39,21 @@ class HazeControl(Control):
     kind = "haze"
     amount = "density"
     parameters = (
-        Parameter.number(Parameter.LIT, "density", "per object size", 0.0, 2.0, 0.0,
-                         "Extinction: over 1 / density the haze takes 63 % of the "
-                         "light out of a ray.", (0.0, 0.3)),
-        *Parameter.colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
-    )  # fmt: skip
+        Parameter.number(
+            Parameter.LIT,
+            "density",
+            "per object size",
+            0.0,
+            2.0,
+            0.0,
+            "Extinction: over 1 / density the haze takes 63 % of the "
+            "light out of a ray.",
+            (0.0, 0.3),
+        ),
+        *Parameter.colors(
+            "of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02
+        ),
+    )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         own = _haze_of(self.scene)

@@ -30,9 +30,15 @@ _FAR = 40.0
 
 
 def _per_dot(
-    name: str, unit: str, default: float, text: str, search: tuple[float, float] = (0.0, 1.0), low: float = 0.0,
-    *, log: bool = False,
-) -> Parameter:  # fmt: skip
+    name: str,
+    unit: str,
+    default: float,
+    text: str,
+    search: tuple[float, float] = (0.0, 1.0),
+    low: float = 0.0,
+    *,
+    log: bool = False,
+) -> Parameter:
     return Parameter(
         name,
         (None,),
@@ -57,16 +63,37 @@ class LensControl(Control):
     parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
-        _per_dot("radius", "picture sizes", 0.12,
-                 "Distance at which a dot has lost 63 % of its opacity, as a share of "
-                 "the picture's smaller side.",
-                 (0.03, 0.25), 0.01, log=True),
-        *(_per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.") for name in color.CHANNELS),
-        _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
-        Parameter.number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
-                         "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a "
-                         "disc."),
-    )  # fmt: skip
+        _per_dot(
+            "radius",
+            "picture sizes",
+            0.12,
+            "Distance at which a dot has lost 63 % of its opacity, as a share of "
+            "the picture's smaller side.",
+            (0.03, 0.25),
+            0.01,
+            log=True,
+        ),
+        *(
+            _per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.")
+            for name in color.CHANNELS
+        ),
+        _per_dot(
+            "opacity",
+            "1",
+            0.0,
+            "Opacity in the middle of each dot; 0 is no dot.",
+            (0.0, 0.5),
+        ),
+        Parameter.number(
+            ("image",),
+            "falloff",
+            "1",
+            1.0,
+            8.0,
+            1.0,
+            "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
+        ),
+    )
     choices = (
         Choice(
             "dots",

@@ -69,20 +69,43 @@ class LightControl(Control):
     parameters = (
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
-        _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
+        _place(
+            "z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."
+        ),
         *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
-        Parameter.number(Parameter.LIT, "power", "1", 0.0, 1000.0, 0.0,
-                         "Irradiance at distance 1, in multiples of the one that shows "
-                         "a white surface just below "
-                         "white.",
-                         (0.0, 12.0)),
-        Parameter.moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
-                         "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
-    )  # fmt: skip
-    choices = (Choice("type", "area",
-                      "area (a ball that glows: soft shadows, visible) or point (sharp "
-                      "shadows, invisible).",
-                      options=("area", "point")),)  # fmt: skip
+        Parameter.number(
+            Parameter.LIT,
+            "power",
+            "1",
+            0.0,
+            1000.0,
+            0.0,
+            "Irradiance at distance 1, in multiples of the one that shows "
+            "a white surface just below "
+            "white.",
+            (0.0, 12.0),
+        ),
+        Parameter.moving(
+            ("differences",),
+            "size",
+            "object sizes",
+            0.001,
+            10.0,
+            0.2,
+            "Diameter of an area light; a point has none.",
+            (0.05, 0.6),
+            log=True,
+        ),
+    )
+    choices = (
+        Choice(
+            "type",
+            "area",
+            "area (a ball that glows: soft shadows, visible) or point (sharp "
+            "shadows, invisible).",
+            options=("area", "point"),
+        ),
+    )
 
     def check_choices(self) -> None:
         if self.chosen["type"] == "point" and "size" in self._given:

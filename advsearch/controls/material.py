@@ -30,7 +30,7 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.raster import looked_up, rasterised
 from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # Named materials made by procedure: seamless patterns with a surface of their own, and
 # how they cover an object.
 #
@@ -79,7 +79,6 @@ def pattern(
 
 
 # ---- ingredients: everything repeats after 1 in x and y
-# --------------------------------------------------------------
 
 
 def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
@@ -203,7 +202,6 @@ def _ramp(value: Doubles, *codes: str) -> Doubles:
 
 
 # ---- the patterns
-# ----------------------------------------------------------------------------------------------------
 
 
 @pattern(1.0, roughness=0.5)
@@ -467,7 +465,6 @@ def tile(name: str) -> Floats:
 
 
 # ---- on an object
-# ----------------------------------------------------------------------------------------------------
 
 
 def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
@@ -518,12 +515,18 @@ class MaterialControl(Control):
     kind = "material"
     of_a_mesh = True
     parameters = (
-        Parameter.named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or "
-                                                        "a named material in its place.",
-                        estimators=("differences",)),
+        Parameter.named(
+            "which",
+            (OWN, *PATTERNS),
+            OWN,
+            "The object's own surface, or a named material in its place.",
+            estimators=("differences",),
+        ),
         *MATERIAL,
-        *Parameter.colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
-    )  # fmt: skip
+        *Parameter.colors(
+            "of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)
+        ),
+    )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         numbers = [name for name in NUMBERS if self._varies(name)]

@@ -31,10 +31,19 @@ class PoseControl(Control):
     of_a_mesh = True
     parameters = (
         *POSE[:3],
-        Parameter("rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
-                  moves_silhouettes=True, estimators=Parameter.GEOMETRIC),
+        Parameter(
+            "rotation",
+            (3,),
+            "degrees",
+            -180.0,
+            180.0,
+            0.0,
+            "Rotation vector on top of the angles.",
+            moves_silhouettes=True,
+            estimators=Parameter.GEOMETRIC,
+        ),
         *POSE[3:],
-    )  # fmt: skip
+    )
     choices = (
         Choice(
             "on_ground",

@@ -39,25 +39,81 @@ class SensorControl(Control):
 
     kind = "sensor"
     parameters = (
-        _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing "
-                                                  "in the corners."),
-        _image("aberration", "1", -0.02, 0.02, 0.0,
-               "How much larger the red picture is than the green one; blue smaller.", (-0.005, 0.005)),
-        _image("shot", "1", 0.0, 0.5, 0.0,
-               "Standard deviation of the noise in white that grows with the root of "
-               "light.", (0.0, 0.1)),
-        _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is "
-                                           "there in the dark.", (0.0, 0.02)),
-        _image("mosaic", "1", 0.0, 1.0, 0.0,
-               "Share of the picture that goes through a Bayer mosaic; 1 is a real "
-               "camera.", (0.0, 1.0)),
-        _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much "
-                                               "brighter.", (-0.5, 0.5)),
-        _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much "
-                                                "brighter.", (-0.5, 0.5)),
-        Parameter.number((), "compression", "1", 0.0, 95.0, 0.0,
-                         "0 is no file; above, a JPEG file of quality 100 less this.", (0.0, 60.0)),
-    )  # fmt: skip
+        _image(
+            "vignetting",
+            "1",
+            0.0,
+            0.95,
+            0.0,
+            "Share of the light that is missing in the corners.",
+        ),
+        _image(
+            "aberration",
+            "1",
+            -0.02,
+            0.02,
+            0.0,
+            "How much larger the red picture is than the green one; blue smaller.",
+            (-0.005, 0.005),
+        ),
+        _image(
+            "shot",
+            "1",
+            0.0,
+            0.5,
+            0.0,
+            "Standard deviation of the noise in white that grows with the root of "
+            "light.",
+            (0.0, 0.1),
+        ),
+        _image(
+            "read",
+            "1",
+            0.0,
+            0.2,
+            0.0,
+            "Standard deviation of the noise that is there in the dark.",
+            (0.0, 0.02),
+        ),
+        _image(
+            "mosaic",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Share of the picture that goes through a Bayer mosaic; 1 is a real "
+            "camera.",
+            (0.0, 1.0),
+        ),
+        _image(
+            "red",
+            "stops",
+            -1.0,
+            1.0,
+            0.0,
+            "White balance: red is this much brighter.",
+            (-0.5, 0.5),
+        ),
+        _image(
+            "blue",
+            "stops",
+            -1.0,
+            1.0,
+            0.0,
+            "White balance: blue is this much brighter.",
+            (-0.5, 0.5),
+        ),
+        Parameter.number(
+            (),
+            "compression",
+            "1",
+            0.0,
+            95.0,
+            0.0,
+            "0 is no file; above, a JPEG file of quality 100 less this.",
+            (0.0, 60.0),
+        ),
+    )
     choices = (
         Choice(
             "seed",

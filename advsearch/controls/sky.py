@@ -232,18 +232,45 @@ class SkyControl(Control):
 
     kind = "sky"
     parameters = (
-        _by_differences("azimuth", "degrees", -3600.0, 3600.0, 90.0,
-                        "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
-        _by_differences("elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
-                        (5.0, 85.0)),
-        Parameter.number(Parameter.LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-                         "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
-                         "and moist, 10 hazy.", (2.0, 8.0)),
-    )  # fmt: skip
-    choices = (Choice("exposure", "metered",
-                      "metered (each sky anew, as an automatic camera does) or fixed "
-                      "(at the start).",
-                      options=("metered", "fixed")),)  # fmt: skip
+        _by_differences(
+            "azimuth",
+            "degrees",
+            -3600.0,
+            3600.0,
+            90.0,
+            "Direction of the sun about the vertical; 0 is +x.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
+        _by_differences(
+            "elevation",
+            "degrees",
+            2.0,
+            90.0,
+            45.0,
+            "Height of the sun above the horizon.",
+            (5.0, 85.0),
+        ),
+        Parameter.number(
+            Parameter.LIT,
+            "turbidity",
+            "1",
+            *TURBIDITIES,
+            3.0,
+            "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
+            "and moist, 10 hazy.",
+            (2.0, 8.0),
+        ),
+    )
+    choices = (
+        Choice(
+            "exposure",
+            "metered",
+            "metered (each sky anew, as an automatic camera does) or fixed "
+            "(at the start).",
+            options=("metered", "fixed"),
+        ),
+    )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)

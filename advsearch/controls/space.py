@@ -361,11 +361,17 @@ class _Held(Control):
 
 COLOR = (None, None, 3)
 EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
-    "base_color": (COLOR, 0.0, 1.0), "color": ((3,), 0.0, 1.0), "data": (COLOR, 0.0, math.inf),
-    "to_world": ((4, 4), -math.inf, math.inf), "offsets": ((None, 3), -math.inf, math.inf),
-    "exposure": ((), -math.inf, math.inf), "shift": ((2,), -math.inf, math.inf),
-    **dict.fromkeys(("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)),
-}  # fmt: skip
+    "base_color": (COLOR, 0.0, 1.0),
+    "color": ((3,), 0.0, 1.0),
+    "data": (COLOR, 0.0, math.inf),
+    "to_world": ((4, 4), -math.inf, math.inf),
+    "offsets": ((None, 3), -math.inf, math.inf),
+    "exposure": ((), -math.inf, math.inf),
+    "shift": ((2,), -math.inf, math.inf),
+    **dict.fromkeys(
+        ("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)
+    ),
+}
 """Shape and range of the inputs that a control of another package may set, by the last
 part of their names; None for any number or any shape.
 """

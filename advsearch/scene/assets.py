@@ -354,7 +354,7 @@ def _key(rows: Ints) -> Ints:
     return key
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # How large things really are: an object's longest side in metres, from what is said of
 # it or from its file.
 #
@@ -370,17 +370,54 @@ TRIPOD = 1.6
 SMALLEST = 1e-4  # metres of an object's longest side
 LARGEST = 1e4
 USUAL = {
-    "airplane": (6.0, 75.0), "apple": (0.05, 0.12), "backpack": (0.3, 0.8), "ball": (0.03, 0.4),
-    "banana": (0.12, 0.3), "bed": (1.6, 2.4), "bench": (1.0, 2.5), "bicycle": (1.3, 2.0), "bike": (1.3, 2.3),
-    "boat": (2.0, 40.0), "book": (0.12, 0.4), "bottle": (0.1, 0.4), "bowl": (0.08, 0.4), "bus": (6.0, 20.0),
-    "car": (2.5, 6.0), "cat": (0.25, 0.8), "chair": (0.6, 1.4), "cow": (1.5, 3.0), "cup": (0.05, 0.2),
-    "dog": (0.3, 1.4), "hammer": (0.15, 0.6), "horse": (1.6, 3.0), "hydrant": (0.5, 1.2), "keyboard": (0.2, 0.5),
-    "lamp": (0.2, 2.2), "laptop": (0.25, 0.5), "man": (1.4, 2.1), "motorcycle": (1.6, 2.7), "mug": (0.07, 0.2),
-    "pan": (0.25, 0.6), "person": (0.8, 2.1), "phone": (0.1, 0.2), "pickup": (4.0, 7.0), "sedan": (3.8, 5.5),
-    "shoe": (0.15, 0.4), "sign": (0.5, 4.0), "sofa": (1.3, 3.5), "suv": (3.8, 5.6), "table": (0.5, 3.0),
-    "teapot": (0.12, 0.4), "tractor": (2.5, 8.0), "train": (15.0, 400.0), "truck": (4.5, 20.0), "van": (3.8, 7.5),
-    "vase": (0.1, 0.9), "vehicle": (2.0, 20.0), "woman": (1.3, 2.0),
-}  # fmt: skip
+    "airplane": (6.0, 75.0),
+    "apple": (0.05, 0.12),
+    "backpack": (0.3, 0.8),
+    "ball": (0.03, 0.4),
+    "banana": (0.12, 0.3),
+    "bed": (1.6, 2.4),
+    "bench": (1.0, 2.5),
+    "bicycle": (1.3, 2.0),
+    "bike": (1.3, 2.3),
+    "boat": (2.0, 40.0),
+    "book": (0.12, 0.4),
+    "bottle": (0.1, 0.4),
+    "bowl": (0.08, 0.4),
+    "bus": (6.0, 20.0),
+    "car": (2.5, 6.0),
+    "cat": (0.25, 0.8),
+    "chair": (0.6, 1.4),
+    "cow": (1.5, 3.0),
+    "cup": (0.05, 0.2),
+    "dog": (0.3, 1.4),
+    "hammer": (0.15, 0.6),
+    "horse": (1.6, 3.0),
+    "hydrant": (0.5, 1.2),
+    "keyboard": (0.2, 0.5),
+    "lamp": (0.2, 2.2),
+    "laptop": (0.25, 0.5),
+    "man": (1.4, 2.1),
+    "motorcycle": (1.6, 2.7),
+    "mug": (0.07, 0.2),
+    "pan": (0.25, 0.6),
+    "person": (0.8, 2.1),
+    "phone": (0.1, 0.2),
+    "pickup": (4.0, 7.0),
+    "sedan": (3.8, 5.5),
+    "shoe": (0.15, 0.4),
+    "sign": (0.5, 4.0),
+    "sofa": (1.3, 3.5),
+    "suv": (3.8, 5.6),
+    "table": (0.5, 3.0),
+    "teapot": (0.12, 0.4),
+    "tractor": (2.5, 8.0),
+    "train": (15.0, 400.0),
+    "truck": (4.5, 20.0),
+    "van": (3.8, 7.5),
+    "vase": (0.1, 0.9),
+    "vehicle": (2.0, 20.0),
+    "woman": (1.3, 2.0),
+}
 """Metres that the longest side of a thing lies between, by the word for it in the name
 of a file: wide, to tell one unit from another.
 """

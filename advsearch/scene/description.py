@@ -611,13 +611,24 @@ def describe(
         name.startswith("camera.") and name != "camera.exposure" for name in given
     )
     described = SceneDescription(
-        around.object, environment, values, _spec(object_spec), _spec(lit_by), up, facing, size, unit,
-        given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
+        around.object,
+        environment,
+        values,
+        _spec(object_spec),
+        _spec(lit_by),
+        up,
+        facing,
+        size,
+        unit,
+        given=frozenset(given)
+        | (frozenset() if environment_spec is None else {ENVIRONMENT}),
         parts=around.surroundings,
         cameras=around.cameras,
-        camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
+        camera=next(iter(around.cameras), ORBIT_CAMERA)
+        if mitsuba and not orbits
+        else ORBIT_CAMERA,
         metered=not mitsuba,
-    )  # fmt: skip
+    )
     described = with_things(on_its_ground(described), things, _load_thing)
     described = with_lamps(with_solids_checked(described))
     check_meshes(described, values)

@@ -255,7 +255,7 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
 DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # How far and how high a camera may go before the picture around a scene no longer fits
 # the ground that is laid in it.
 #

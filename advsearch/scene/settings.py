@@ -69,9 +69,19 @@ class Parameter:
 
     @classmethod
     def number(
-        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
-        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-    ) -> Parameter:  # fmt: skip
+        cls,
+        estimators: tuple[str, ...],
+        name: str,
+        unit: str,
+        low: float,
+        high: float,
+        default: float | str,
+        text: str,
+        search: tuple[float, float] | None = None,
+        *,
+        periodic: bool = False,
+        log: bool = False,
+    ) -> Parameter:
         """Make a number that moves no outlines; see `moving` for one that does."""
         return cls(
             name,
@@ -90,9 +100,19 @@ class Parameter:
 
     @classmethod
     def moving(
-        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
-        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-    ) -> Parameter:  # fmt: skip
+        cls,
+        estimators: tuple[str, ...],
+        name: str,
+        unit: str,
+        low: float,
+        high: float,
+        default: float | str,
+        text: str,
+        search: tuple[float, float] | None = None,
+        *,
+        periodic: bool = False,
+        log: bool = False,
+    ) -> Parameter:
         """Make a number that can move an outline in the image."""
         return cls(
             name,
@@ -111,14 +131,29 @@ class Parameter:
 
     @classmethod
     def named(
-        cls, name: str, options: tuple[str, ...], default: str, text: str, *, estimators: tuple[str, ...] = (),
+        cls,
+        name: str,
+        options: tuple[str, ...],
+        default: str,
+        text: str,
+        *,
+        estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
-    ) -> Parameter:  # fmt: skip
+    ) -> Parameter:
         """Make a choice among names."""
         return cls(
-            name, (), "name", 0.0, len(options) - 1.0, default, text, False, moves_silhouettes, options=options,
+            name,
+            (),
+            "name",
+            0.0,
+            len(options) - 1.0,
+            default,
+            text,
+            False,
+            moves_silhouettes,
+            options=options,
             estimators=estimators,
-        )  # fmt: skip
+        )
 
     @classmethod
     def colors(
@@ -240,41 +275,117 @@ POSE = (
 ORBIT_CAMERA = "orbit"
 
 CAMERA = (
-    _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera "
-                                                         "around the object.", (0.0, 360.0),
-            periodic=True),
-    _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the "
-                                                       "ground plane.", (5.0, 60.0)),
-    _camera("roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, "
-                                                   "counter-clockwise.", (-15.0, 15.0),
-            periodic=True),
-    _camera("distance", "metres", 1e-4, 1e5, "fits the object",
-            "Distance to the object's middle; in object sizes where its size in metres "
-            "is not known.", (0.8, 1.5),
-            log=True),
-    _camera("height", "metres", -1e4, 1e5, "as the elevation says",
-            "Height of the lens above the ground, in place of `elevation`; in object "
-            "sizes as `distance`."),
-    _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side "
-                                                "of the picture."),
-    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered "
-                                                         "exposure.",
-              estimators=("image",)),
-)  # fmt: skip
+    _camera(
+        "azimuth",
+        "degrees",
+        -3600.0,
+        3600.0,
+        40.0,
+        "Direction of the camera around the object.",
+        (0.0, 360.0),
+        periodic=True,
+    ),
+    _camera(
+        "elevation",
+        "degrees",
+        -89.0,
+        89.0,
+        25.0,
+        "Height of the camera above the ground plane.",
+        (5.0, 60.0),
+    ),
+    _camera(
+        "roll",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation of the picture, counter-clockwise.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _camera(
+        "distance",
+        "metres",
+        1e-4,
+        1e5,
+        "fits the object",
+        "Distance to the object's middle; in object sizes where its size in metres "
+        "is not known.",
+        (0.8, 1.5),
+        log=True,
+    ),
+    _camera(
+        "height",
+        "metres",
+        -1e4,
+        1e5,
+        "as the elevation says",
+        "Height of the lens above the ground, in place of `elevation`; in object "
+        "sizes as `distance`.",
+    ),
+    _camera(
+        "fov",
+        "degrees",
+        1.0,
+        170.0,
+        35.0,
+        "Field of view along the larger side of the picture.",
+    ),
+    Parameter(
+        "exposure",
+        (),
+        "stops",
+        -10.0,
+        10.0,
+        0.0,
+        "Brightness over the metered exposure.",
+        estimators=("image",),
+    ),
+)
 EV = Parameter(
-    "ev", (), "EV at ISO 100", -10.0, 24.0, "metered",
+    "ev",
+    (),
+    "EV at ISO 100",
+    -10.0,
+    24.0,
+    "metered",
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
-    "for lit streets.", estimators=(),
-)  # fmt: skip
+    "for lit streets.",
+    estimators=(),
+)
 DROPS = (
-    Parameter("drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm "
-                                                  "before the camera.",
-              estimators=()),
-    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these "
-                                                     "drops.", estimators=()),
-    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a "
-                                                   "whole number.", estimators=()),
-)  # fmt: skip
+    Parameter(
+        "drops",
+        (),
+        "1",
+        0.0,
+        2000.0,
+        0.0,
+        "Raindrops on a sheet of glass 6 cm before the camera.",
+        estimators=(),
+    ),
+    Parameter(
+        "drop_size",
+        (),
+        "mm",
+        0.2,
+        10.0,
+        1.5,
+        "Median of the radii of these drops.",
+        estimators=(),
+    ),
+    Parameter(
+        "drop_seed",
+        (),
+        "1",
+        0.0,
+        1e6,
+        0.0,
+        "Where they are, and how large: a whole number.",
+        estimators=(),
+    ),
+)
 # what the lamps of a car may be: with either beam its tail lamps shine too
 LAMPS = ("off", "low", "high")
 
@@ -298,17 +409,55 @@ def _lamps(whose: str) -> Parameter:
 
 
 ENVIRONMENT = (
-    Parameter("rotation", (), "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", periodic=True,
-              search=(0.0, 360.0), estimators=Parameter.LIT),
-    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0),
-              estimators=Parameter.LIT),
-)  # fmt: skip
+    Parameter(
+        "rotation",
+        (),
+        "degrees",
+        -3600.0,
+        3600.0,
+        0.0,
+        "Rotation about the vertical.",
+        periodic=True,
+        search=(0.0, 360.0),
+        estimators=Parameter.LIT,
+    ),
+    Parameter(
+        "exposure",
+        (),
+        "stops",
+        -10.0,
+        10.0,
+        0.0,
+        "Brightness, after metering.",
+        search=(-1.0, 1.0),
+        estimators=Parameter.LIT,
+    ),
+)
 GROUND_KINDS = (
-    TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM, SNOW_AVENUE,
+    TABLE,
+    PHOTOGRAPH,
+    DRY_ROAD,
+    WET_ROAD,
+    DRY_AVENUE,
+    WET_AVENUE,
+    CROSSING,
+    CAR_PARK,
+    ROOM,
+    LIT_ROOM,
+    SNOW_AVENUE,
 ) = (
-    "table", "photograph", "road", "wet-road", "avenue", "wet-avenue", "crossing", "car-park", "room", "lit-room",
+    "table",
+    "photograph",
+    "road",
+    "wet-road",
+    "avenue",
+    "wet-avenue",
+    "crossing",
+    "car-park",
+    "room",
+    "lit-room",
     "snow-avenue",
-)  # fmt: skip
+)
 ROADS = (DRY_ROAD, WET_ROAD)
 PLACES = (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 # height above the floor of the camera of a photograph, where sizes are not known
@@ -316,24 +465,53 @@ PHOTOGRAPHED_FROM = 3.0
 # settings that only a table has
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 GROUND = (
-    Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
-              "what the environment has: photograph where the map is a file, a road in "
-              "a street, else table",
-              "What the object stands on: a square table, the floor that the "
-              "environment's photograph shows, a road, "
-              "or a place with all that stands in it: an avenue, a crossing, a car "
-              "park or a room.",
-              options=GROUND_KINDS),
-    Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
-    *Parameter.colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
-    Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} "
-                                                    "object sizes",
-              "Height above the floor from which the photograph was taken; in object "
-              "sizes as `camera.distance`."),
-    Parameter("radius", (), "metres", 1e-3, 1e5, "5 heights",
-              "How far from the photograph's camera its floor is empty; in object "
-              "sizes as `camera.distance`."),
-)  # fmt: skip
+    Parameter(
+        "kind",
+        (),
+        "name",
+        0.0,
+        len(GROUND_KINDS) - 1.0,
+        "what the environment has: photograph where the map is a file, a road in "
+        "a street, else table",
+        "What the object stands on: a square table, the floor that the "
+        "environment's photograph shows, a road, "
+        "or a place with all that stands in it: an avenue, a crossing, a car "
+        "park or a room.",
+        options=GROUND_KINDS,
+    ),
+    Parameter(
+        "size",
+        (),
+        "object sizes",
+        0.0,
+        1000.0,
+        3.0,
+        "Side of the table; 0 leaves the ground out.",
+    ),
+    *Parameter.colors(
+        "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
+    ),
+    Parameter(
+        "height",
+        (),
+        "metres",
+        1e-3,
+        1000.0,
+        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+        "Height above the floor from which the photograph was taken; in object "
+        "sizes as `camera.distance`.",
+    ),
+    Parameter(
+        "radius",
+        (),
+        "metres",
+        1e-3,
+        1e5,
+        "5 heights",
+        "How far from the photograph's camera its floor is empty; in object "
+        "sizes as `camera.distance`.",
+    ),
+)
 MATERIAL = (
     _surface(
         "roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)
@@ -349,9 +527,13 @@ MATERIAL = (
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
-    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
-    "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
-}  # fmt: skip
+    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")),
+    "pose": POSE,
+    "environment": ENVIRONMENT,
+    "ground": GROUND,
+    "material": MATERIAL,
+    "object": (_lamps("the object, a car"),),
+}
 
 SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{setting.name}": setting

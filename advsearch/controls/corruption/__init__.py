@@ -81,11 +81,23 @@ def jpeg(image: Tensor, whole: int) -> Tensor:
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     corruption.__name__: corruption
     for corruption in (
-        filters.gaussian_noise, filters.shot_noise, filters.impulse_noise, filters.speckle_noise,
-        filters.defocus_blur, filters.glass_blur, filters.motion_blur, filters.zoom_blur, filters.gaussian_blur,
-        filters.snow, filters.frost, filters.fog, brightness, contrast, saturate,
+        filters.gaussian_noise,
+        filters.shot_noise,
+        filters.impulse_noise,
+        filters.speckle_noise,
+        filters.defocus_blur,
+        filters.glass_blur,
+        filters.motion_blur,
+        filters.zoom_blur,
+        filters.gaussian_blur,
+        filters.snow,
+        filters.frost,
+        filters.fog,
+        brightness,
+        contrast,
+        saturate,
     )
-}  # fmt: skip
+}
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity
 and the seed.
 """
@@ -111,15 +123,29 @@ class CorruptionControl(Control):
     kind = "corruption"
     amount = "severity"
     parameters = (
-        replace(Parameter.named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
-        Parameter.number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
-                         "How strong it is: 0 is none, 1 to 5 are the published "
-                         "severities.",
-                         (0.0, float(filters.LEVELS))),
-    )  # fmt: skip
-    choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a "
-                                 "whole number from 0.",
-                      whole=(0, 2**32 - 1)),)  # fmt: skip
+        replace(
+            Parameter.named("which", NAMES, NAMES[0], "Which corruption."),
+            search=(0, len(NAMES) - 1),
+        ),
+        Parameter.number(
+            ("image",),
+            "severity",
+            "1",
+            0.0,
+            float(filters.LEVELS),
+            0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.",
+            (0.0, float(filters.LEVELS)),
+        ),
+    )
+    choices = (
+        Choice(
+            "seed",
+            0,
+            "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
+            whole=(0, 2**32 - 1),
+        ),
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)

@@ -128,25 +128,65 @@ class OcclusionControl(Control):
     # none is changed; but it comes after whatever moves the camera or the object
     refines = frozenset(geometry.SURROUNDINGS)
     parameters = (
-        Parameter.named("which", OPTIONS, "card",
-                        "What it is: a piece of cardboard, a grey sphere, or a bundled "
-                        "object.",
-                        estimators=("differences",), moves_silhouettes=True),
-        _moving("coverage", "1", 0.0, 0.9, 0.0,
-                "Share of the object's picture area that it hides; at 0 it is out of "
-                "the frame.", (0.0, 0.5)),
-        _moving("direction", "degrees", -3600.0, 3600.0, 0.0,
-                "Side of the picture it comes in from: 0 is the right, 90 the top, "
-                "counter-clockwise.", (0.0, 360.0),
-                periodic=True),
-        _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", (0.3, 1.0), log=True),
-        _moving("distance", "1", 0.1, 0.9, 0.5,
-                "Where between the camera and the object's middle: 0 is the camera, 1 "
-                "the middle.", (0.3, 0.7)),
-        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder "
-                                                         "about its own upright axis.",
-                periodic=True),
-    )  # fmt: skip
+        Parameter.named(
+            "which",
+            OPTIONS,
+            "card",
+            "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+            estimators=("differences",),
+            moves_silhouettes=True,
+        ),
+        _moving(
+            "coverage",
+            "1",
+            0.0,
+            0.9,
+            0.0,
+            "Share of the object's picture area that it hides; at 0 it is out of "
+            "the frame.",
+            (0.0, 0.5),
+        ),
+        _moving(
+            "direction",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Side of the picture it comes in from: 0 is the right, 90 the top, "
+            "counter-clockwise.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
+        _moving(
+            "size",
+            "object sizes",
+            0.05,
+            5.0,
+            0.6,
+            "Its largest extent.",
+            (0.3, 1.0),
+            log=True,
+        ),
+        _moving(
+            "distance",
+            "1",
+            0.1,
+            0.9,
+            0.5,
+            "Where between the camera and the object's middle: 0 is the camera, 1 "
+            "the middle.",
+            (0.3, 0.7),
+        ),
+        _moving(
+            "turn",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Rotation of the occluder about its own upright axis.",
+            periodic=True,
+        ),
+    )
     choices = (
         Choice(
             "object",
@@ -277,7 +317,6 @@ class OcclusionControl(Control):
 
 
 # ---- what the camera sees
-# -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +424,6 @@ def _numpy(
 
 
 # ---- where the occluder goes
-# ----------------------------------------------------------------------------------------
 
 
 def _fitting(

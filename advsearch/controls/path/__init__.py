@@ -168,38 +168,77 @@ class PathControl(Control):
         ),
     )
     choices = (
-        Choice("path", APPROACH,
-               "approach (straight up to where it stands), pass (straight past it), "
-               "orbit (once around), a .csv file "
-               "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
-               "Two of them with a + between: the "
-               "camera's and the object's. Several with commas between: each "
-               "configuration has one of them, `way`.",
-               "path"),
-        Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
-        Choice("seconds", SECONDS, "How long it takes; a file says so itself, but for "
-                                   "KITTI's poses.", most=LONGEST),
-        Choice("reach", REACH,
-               "How far it goes, in distances of the scene's own camera: where "
-               "approach begins, half of what pass "
-               "takes.", most=1000.0),
-        Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
-        Choice("rolling", None, "Seconds in which the rows are read, one after the "
-                                "other; below 0 from the bottom.",
-               "rolling", most=60.0, signed=True),
-        Choice("axes", None,
-               "The axes of a trajectory's poses: optical (x right, y down, z ahead), "
-               "opengl (x right, y up, z back), "
-               "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
-               "up, y right, z ahead), or none: "
-               "the camera looks at the object. By default optical.", options=tuple(AXES_MEAN)),
-        Choice("up", None, "What is up in a trajectory's world; by default z, of KITTI "
-                           "-y.",
-               options=tuple(WORLD_TO_Z_UP)),
-        Choice("object_at", None, "Where the object's middle is in a trajectory's "
-                                  "world, as [x, y, z]; by default its "
-               "origin."),
-    )  # fmt: skip
+        Choice(
+            "path",
+            APPROACH,
+            "approach (straight up to where it stands), pass (straight past it), "
+            "orbit (once around), a .csv file "
+            "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
+            "Two of them with a + between: the "
+            "camera's and the object's. Several with commas between: each "
+            "configuration has one of them, `way`.",
+            "path",
+        ),
+        Choice(
+            "moves",
+            CAMERA,
+            "What travels along a single path: camera or object.",
+            options=MOVERS,
+        ),
+        Choice(
+            "seconds",
+            SECONDS,
+            "How long it takes; a file says so itself, but for KITTI's poses.",
+            most=LONGEST,
+        ),
+        Choice(
+            "reach",
+            REACH,
+            "How far it goes, in distances of the scene's own camera: where "
+            "approach begins, half of what pass "
+            "takes.",
+            most=1000.0,
+        ),
+        Choice(
+            "shutter",
+            None,
+            "Seconds that each row is exposed: motion blur.",
+            "shutter",
+            most=60.0,
+        ),
+        Choice(
+            "rolling",
+            None,
+            "Seconds in which the rows are read, one after the "
+            "other; below 0 from the bottom.",
+            "rolling",
+            most=60.0,
+            signed=True,
+        ),
+        Choice(
+            "axes",
+            None,
+            "The axes of a trajectory's poses: optical (x right, y down, z ahead), "
+            "opengl (x right, y up, z back), "
+            "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
+            "up, y right, z ahead), or none: "
+            "the camera looks at the object. By default optical.",
+            options=tuple(AXES_MEAN),
+        ),
+        Choice(
+            "up",
+            None,
+            "What is up in a trajectory's world; by default z, of KITTI -y.",
+            options=tuple(WORLD_TO_Z_UP),
+        ),
+        Choice(
+            "object_at",
+            None,
+            "Where the object's middle is in a trajectory's "
+            "world, as [x, y, z]; by default its "
+            "origin.",
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:

@@ -75,49 +75,139 @@ class ProjectorControl(PictureControl):
     shown = "pattern"
     default_epsilon = 1.0  # every picture is inside
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
-                  "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0),
-                  estimators=("adjoint",)),
-        _moving("azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
-                "Direction of the projector around the object.", periodic=True),
-        _moving("elevation", "degrees", -89.0, 89.0, "the camera's", "Height of the projector above the ground plane."),
-        _moving("distance", "object sizes", 0.01, 1e4, "the camera's",
-                "Distance to the object's middle; in metres where the object's size is "
-                "known.", log=True),
-        _lit("lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as "
-                                           "bright as the place",
-             "Light of a white picture."),
-        _lit("ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
-             "Light on the object without the projector.", log=True),
-        _lit("black", "1", 0.0, 1.0, 0.0,
-             "Share of white that a black texel still throws: 0.001 at a contrast of "
-             "1000."),
-        _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard "
-                                               "deviation of the blur."),
-        Parameter.number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
-                         "How often a second it flashes: light in one half of each "
-                         "period; at 0 it does not."),
-        Parameter.number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
-                         "Where in its period a flashing light is at the time of the "
-                         "picture; up to 180 it is on.",
-                         periodic=True),
-    )  # fmt: skip
+        Parameter(
+            "pattern",
+            (None, None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "black, or grey",
+            "Display-referred texels of the picture, rounded to 8 bits.",
+            search=(0.0, 1.0),
+            estimators=("adjoint",),
+        ),
+        _moving(
+            "azimuth",
+            "degrees",
+            -3600.0,
+            3600.0,
+            f"{BESIDE:g} from the camera",
+            "Direction of the projector around the object.",
+            periodic=True,
+        ),
+        _moving(
+            "elevation",
+            "degrees",
+            -89.0,
+            89.0,
+            "the camera's",
+            "Height of the projector above the ground plane.",
+        ),
+        _moving(
+            "distance",
+            "object sizes",
+            0.01,
+            1e4,
+            "the camera's",
+            "Distance to the object's middle; in metres where the object's size is "
+            "known.",
+            log=True,
+        ),
+        _lit(
+            "lumens",
+            "lumens",
+            0.0,
+            1e6,
+            f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            "Light of a white picture.",
+        ),
+        _lit(
+            "ambient",
+            "lux",
+            1e-3,
+            2e5,
+            f"the place's, or {AMBIENT:g}",
+            "Light on the object without the projector.",
+            log=True,
+        ),
+        _lit(
+            "black",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Share of white that a black texel still throws: 0.001 at a contrast of "
+            "1000.",
+        ),
+        _lit(
+            "blur",
+            "texels",
+            0.0,
+            64.0,
+            0.0,
+            "How far it is out of focus: standard deviation of the blur.",
+        ),
+        Parameter.number(
+            ("differences",),
+            "flicker",
+            "Hz",
+            0.0,
+            1e5,
+            0.0,
+            "How often a second it flashes: light in one half of each "
+            "period; at 0 it does not.",
+        ),
+        Parameter.number(
+            ("differences",),
+            "phase",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Where in its period a flashing light is at the time of the "
+            "picture; up to 180 it is on.",
+            periodic=True,
+        ),
+    )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
-        Choice("fov", None, "Angle of the picture's width, degrees; by default it just "
-                            "covers the object.", most=150.0),
-        Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
-        Choice("norm", "linf", "Norm of the ball around that start: linf (per texel "
-                               "value) or l2 (over all of them).",
-               "norm", options=("linf", "l2")),
-        Choice("epsilon", None, "Radius of that ball, display-referred; by default "
-                                "every picture is inside.", "epsilon",
-               most=PictureControl.LARGEST_EPSILON),
-        Choice("picture", None, "A picture file to project as it is; then the pattern "
-                                "is not searched.",
-               fixes="pattern"),
-    )  # fmt: skip
+        Choice(
+            "fov",
+            None,
+            "Angle of the picture's width, degrees; by default it just "
+            "covers the object.",
+            most=150.0,
+        ),
+        Choice(
+            "start",
+            "black",
+            "What the search begins with: black or grey.",
+            options=("black", "grey"),
+        ),
+        Choice(
+            "norm",
+            "linf",
+            "Norm of the ball around that start: linf (per texel "
+            "value) or l2 (over all of them).",
+            "norm",
+            options=("linf", "l2"),
+        ),
+        Choice(
+            "epsilon",
+            None,
+            "Radius of that ball, display-referred; by default "
+            "every picture is inside.",
+            "epsilon",
+            most=PictureControl.LARGEST_EPSILON,
+        ),
+        Choice(
+            "picture",
+            None,
+            "A picture file to project as it is; then the pattern is not searched.",
+            fixes="pattern",
+        ),
+    )
 
     def check_choices(self) -> None:
         pattern = self._given.get("pattern")
@@ -151,7 +241,6 @@ class ProjectorControl(PictureControl):
             )
 
     # ---- in a scene
-    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         picture = self.read_picture()
@@ -288,7 +377,6 @@ class ProjectorControl(PictureControl):
         return then
 
     # ---- at a configuration
-    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)

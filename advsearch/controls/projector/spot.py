@@ -34,19 +34,50 @@ class SpotControl(ProjectorControl):
     kind = "spot"
     amount = "lumens"
     parameters = (
-        _lit("x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, "
-                                                    "seen from the light.",
-             (-0.5, 0.5)),
-        _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
-        _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of "
-                                                         "its light falls.", (0.05, 0.6),
-             log=True),
+        _lit(
+            "x",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of its middle to the right, seen from the light.",
+            (-0.5, 0.5),
+        ),
+        _lit(
+            "y",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of its middle upwards.",
+            (-0.5, 0.5),
+        ),
+        _lit(
+            "width",
+            "object sizes",
+            0.02,
+            10.0,
+            WIDTH,
+            "Diameter in which half of its light falls.",
+            (0.05, 0.6),
+            log=True,
+        ),
         *Parameter.colors("of its light.", (0.0, 1.0)),
-        _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the "
-                                           "place", "All of its light.",
-             (0.0, LUMENS)),
-        *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
-    )  # fmt: skip
+        _lit(
+            "lumens",
+            "lumens",
+            0.0,
+            1e6,
+            "0, or what is 20 times as bright as the place",
+            "All of its light.",
+            (0.0, LUMENS),
+        ),
+        *(
+            parameter
+            for parameter in ProjectorControl.parameters
+            if parameter.name in OF_THE_SOURCE
+        ),
+    )
     choices = (
         Choice(
             "resolution",

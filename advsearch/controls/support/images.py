@@ -16,6 +16,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.color import levels_of, linear_to_srgb, srgb_to_linear
 from advsearch.scene.color import to_8_bit as to_8_bit
+from advsearch.scene.raster import Charts as Charts
 from advsearch.scene.raster import MeshSurface as MeshSurface
 from advsearch.scene.raster import pixels_in as pixels_in
 from advsearch.scene.raster import rasterised as rasterised
