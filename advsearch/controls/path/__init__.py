@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -110,18 +110,23 @@ class Waypoints:
     notes: tuple[str, ...] = ()  # sentences about how it is read
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
-        """Return a column, or several, at times (...,), linear between waypoints;
-        differentiable in the times.
+        """Interpolate a column, or several, linearly between waypoints.
+
+        Args:
+            time: (...,) seconds; the result is differentiable in it.
+            of: (n,) or (n, k) at the waypoints.
+
+        Returns:
+            (...,) or (..., k).
         """
-        place = torch.searchsorted(self.times, time.detach(), right=True).clamp(
-            1, len(self.times) - 1
-        )
-        begin = self.times[place - 1]
-        end = self.times[place]
-        share = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
-        return torch.lerp(
-            of[place - 1], of[place], share[..., None] if of.ndim > 1 else share
-        )
+        index = torch.searchsorted(self.times, time.detach(), right=True)
+        index = index.clamp(1, len(self.times) - 1)
+        begin = self.times[index - 1]
+        end = self.times[index]
+        fraction = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
+        if of.ndim > 1:
+            fraction = fraction[..., None]
+        return torch.lerp(of[index - 1], of[index], fraction)
 
     def rotation_at(self, time: Tensor) -> Tensor:
         """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's
@@ -242,20 +247,18 @@ class PathControl(Control):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """The time, and of several paths which it is."""
-        names = (
-            _names(settings.get("path", APPROACH))
-            if isinstance(settings, Mapping)
-            else ()
-        )
+        """Return the time, and of several paths which it is."""
+        if not isinstance(settings, Mapping):
+            return cls.parameters
+        names = _split_paths(settings.get("path", APPROACH))
         if len(names) < 2:
             return cls.parameters
-        return *cls.parameters, Parameter.named(
-            Control.WAY, names, names[0], "Which of the paths."
-        )
+        choice = Parameter.named(Control.WAY, names, names[0], "Which of the paths.")
+        return (*cls.parameters, choice)
 
     def check_choices(self) -> None:
-        names = _names(self.chosen["path"])
+        """Read the paths, and check the choices that go with them."""
+        names = _split_paths(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MOST_PATHS:
             raise InputError(
                 f"{self.name}.path: expected at most {MOST_PATHS} "
@@ -264,39 +267,38 @@ class PathControl(Control):
         self._check_object_at()
         self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
         self._movers = {mover for ways in self._paths for mover in ways}
-        every = [way for ways in self._paths for way in ways.values()]
-        self._files = [way for way in every if isinstance(way, Waypoints)]
-        if "moves" in self._given and not any(
-            len(one.split(BOTH)) == 1 for one in names
-        ):
+        all_ways = [way for ways in self._paths for way in ways.values()]
+        self._files = [way for way in all_ways if isinstance(way, Waypoints)]
+        has_single_path = any(BOTH not in name for name in names)
+        if "moves" in self._given and not has_single_path:
             raise InputError(
                 f"{self.name}: {names[0]} says what the camera does and "
                 "what the object; leave moves out"
             )
         if "path" in self._given:  # otherwise the run may say it, later
             self._check_needless()
-        timed = any(way.has_times for way in self._files)
-        for setting, said in (
-            ("seconds", timed),
-            ("reach", len(self._files) == len(every)),
-        ):
-            if said and setting in self._given:
-                asked = self.chosen["path"]
-                raise InputError(
-                    f"{self.name}: {setting}: the file in {asked} says "
-                    "that itself; leave it out"
-                )
+        if any(way.has_times for way in self._files):
+            self._check_not_set("seconds")
+        if len(self._files) == len(all_ways):
+            self._check_not_set("reach")
         if self._files:
             self.chosen["seconds"] = max(float(way.times[-1]) for way in self._files)
         self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
+    def _check_not_set(self, setting: str) -> None:
+        """Check that a choice which files state is not set. Raises InputError: it is."""
+        if setting in self._given:
+            raise InputError(
+                f"{self.name}: {setting}: the file in {self.chosen['path']} says "
+                "that itself; leave it out"
+            )
+
     def _read(self, name: str) -> Ways:
-        """What a path makes of camera and object."""
-        names = (
-            two
-            if len(two := name.split(BOTH)) == 2 and all(map(_is_path, two))
-            else [name]
-        )
+        """Return what the path of a name makes of camera and object."""
+        names = [name]
+        both = name.split(BOTH)
+        if len(both) == 2 and all(map(_is_path, both)):
+            names = both
         alone = len(names) == 1
         if alone and not _is_path(name):
             raise InputError(
@@ -305,15 +307,13 @@ class PathControl(Control):
                 f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got "
                 f"{name!r}"
             )
+        movers = [str(self.chosen["moves"])] if alone else MOVERS
         ways: dict[str, Way] = {}
-        for mover, part in zip(
-            [str(self.chosen["moves"])] if alone else MOVERS, names, strict=True
-        ):
-            ways |= (
-                {mover: part}
-                if part in PATHS
-                else self._read_file(Path(part), mover, alone)
-            )
+        for mover, path_name in zip(movers, names, strict=True):
+            if path_name in PATHS:
+                ways[mover] = path_name
+            else:
+                ways |= self._read_file(Path(path_name), mover, alone)
         return ways
 
     def _check_needless(self) -> None:
@@ -355,49 +355,22 @@ class PathControl(Control):
         return {mover: self._follow(path, trajectory)}
 
     def _follow(self, path: Path, trajectory: Trajectory) -> Waypoints:
-        """Return the way of the camera on a trajectory, with notes on what its file
-        does not state.
-        """
-        count = len(trajectory.positions)
-        notes = list(trajectory.notes)
-        assumed = dict[str, str]()
-        times = trajectory.times
-        if times is None:
-            seconds = (count - 1) / KITTI_RATE
-            if "seconds" in self._given:
-                seconds = float(self.chosen["seconds"])
-            else:
-                assumed["seconds"] = (
-                    f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
-                )
-            times = np.linspace(0.0, seconds, count)
-        check_times(path, times)
+        """Return the path of the camera on a trajectory.
 
-        axes = str(self.chosen["axes"] or OPTICAL)
-        up = str(self.chosen["up"] or trajectory.default_up)
-        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
-        if trajectory.rotations is None and axes == UNUSED:
-            raise InputError(
-                f"{self.name}: axes: {path} has no rotations; leave it out"
-            )
-        if self.chosen["axes"] is None and trajectory.rotations is not None:
-            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
-        if self.chosen["up"] is None:
-            assumed["up"] = up
-        if self.chosen["object_at"] is None:
-            assumed["object_at"] = "[0, 0, 0]"
-        positions, rotations = trajectory.orient(axes, up, origin)
-        if np.abs(positions).max() > FARTHEST:
-            raise errors.FileFormatError(
-                f"{path}: expected positions within {FARTHEST:g} of the object, got "
-                "larger ones; object_at says where "
-                "that is in the file's world"
-            )
+        Its notes say what the file does not state.
+        """
+        assumed = dict[str, str]()
+        times = self._times_of(trajectory, assumed)
+        check_times(path, times)
+        positions, rotations = self._orient(path, trajectory, assumed)
+        notes = list(trajectory.notes)
         if assumed:
-            listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
+            assumptions = ", ".join(
+                f"{name} {value}" for name, value in assumed.items()
+            )
             notes.append(
                 f"{path}: not everything is stated by {trajectory.format.value}. "
-                f"Assumed: {listed}. If that is wrong, "
+                f"Assumed: {assumptions}. If that is wrong, "
                 f"say {', '.join(assumed)} of the control path; with axes none the "
                 "camera looks at the object."
             )
@@ -424,6 +397,53 @@ class PathControl(Control):
             notes=tuple(notes),
         )
 
+    def _times_of(
+        self, trajectory: Trajectory, assumed: dict[str, str]
+    ) -> assets.Doubles:
+        """Return the times (n,) of a trajectory, in seconds; note what is assumed."""
+        if trajectory.times is not None:
+            return trajectory.times
+        count = len(trajectory.positions)
+        seconds = (count - 1) / KITTI_RATE
+        if "seconds" in self._given:
+            seconds = float(self.chosen["seconds"])
+        else:
+            assumed["seconds"] = (
+                f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
+            )
+        return np.linspace(0.0, seconds, count)
+
+    def _orient(
+        self, path: Path, trajectory: Trajectory, assumed: dict[str, str]
+    ) -> tuple[assets.Doubles, Rotation | None]:
+        """Return positions and rotations as `Trajectory.orient`; note what is assumed.
+
+        Raises:
+            InputError: axes are set for a file without rotations.
+            FileFormatError: it is too far from the object.
+        """
+        axes = str(self.chosen["axes"] or OPTICAL)
+        up = str(self.chosen["up"] or trajectory.default_up)
+        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
+        if trajectory.rotations is None and axes == UNUSED:
+            raise InputError(
+                f"{self.name}: axes: {path} has no rotations; leave it out"
+            )
+        if self.chosen["axes"] is None and trajectory.rotations is not None:
+            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
+        if self.chosen["up"] is None:
+            assumed["up"] = up
+        if self.chosen["object_at"] is None:
+            assumed["object_at"] = "[0, 0, 0]"
+        positions, rotations = trajectory.orient(axes, up, origin)
+        if np.abs(positions).max() > FARTHEST:
+            raise errors.FileFormatError(
+                f"{path}: expected positions within {FARTHEST:g} of the object, got "
+                "larger ones; object_at says where "
+                "that is in the file's world"
+            )
+        return positions, rotations
+
     def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         # whatever else is asked for
         if parameter.name == Control.WAY and Control.WAY not in self.specs:
@@ -447,6 +467,11 @@ class PathControl(Control):
         return then
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add notes on the files, and check the paths in the scene.
+
+        Raises InputError: another control or camera has the camera, or a path is
+        impossible.
+        """
         if CAMERA in self._movers and not scene.is_seen_from_orbit:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by "
@@ -454,47 +479,50 @@ class PathControl(Control):
                 f"moves=object, or have it seen by 'orbit'"
             )
         self._check_needless()
-        there = self.within(scene)
-        for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
+        in_scene = self.within(scene)
+        names = _split_paths(self.chosen["path"])
+        for name, ways in zip(names, self._paths, strict=True):
             if CAMERA in ways:
-                there._check_looks(name, ways)
+                in_scene._check_looks(name, ways)
         notes = [note for way in self._files for note in way.notes]
-        shortest = min(
-            (float(one.times[-1]) for one in self._files), default=self.seconds
-        )
+        durations = [float(way.times[-1]) for way in self._files]
+        shortest = min(durations, default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
                 f"path: the shortest of the files takes {_round_text(shortest)} s of "
                 f"{_round_text(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
-        return (
-            replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes))))
-            if notes
-            else scene
-        )
+        if not notes:
+            return scene
+        remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
+        return replace(scene, remarks=remarks)
 
     def _check_looks(self, name: str, ways: Ways) -> None:
-        """Refuse a path on which the camera is at what it looks at, at a waypoint or
-        between two.
+        """Check that the camera is never at what it looks at, also between waypoints.
+
+        Raises InputError: it is.
         """
         files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = start_of(self.scene, time.device)
-        place, target = self._camera(
-            ways, begin, time, self._object(ways, begin, time)[0]
-        )
-        gap = (target - place).expand(len(time), 3).double()
+        shift, _ = self._object(ways, begin, time)
+        position, target = self._camera(ways, begin, time, shift)
+        gap = (target - position).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
-        share = (
-            -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)
-        ).clamp(0.0, 1.0)
-        away = (gap[:-1] + share[:, None] * step).norm(dim=1)
-        if float(away.min()) < NEAREST:
-            at = int(away.argmin())
-            when = float(torch.lerp(time[at], time[at + 1], share[at].float()))
+        # of each step, where the gap is smallest
+        fraction = -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(
+            1e-300
+        )
+        fraction = fraction.clamp(0.0, 1.0)
+        distance = (gap[:-1] + fraction[:, None] * step).norm(dim=1)
+        if float(distance.min()) < NEAREST:
+            index = int(distance.argmin())
+            seconds = float(
+                torch.lerp(time[index], time[index + 1], fraction[index].float())
+            )
             raise InputError(
-                f"`controls` {self.name}: {name}: {when:.4g} s after its start the "
+                f"`controls` {self.name}: {name}: {seconds:.4g} s after its start the "
                 "camera is where it "
                 "looks, so that it has no direction; lead it past that place, or say "
                 "what it looks at (look_x, look_y, "
@@ -516,21 +544,21 @@ class PathControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the poses of the camera, the object or both at the time."""
         time = values["time"] + self._later
         ways = self._ways(values)
         start = start_of(self.scene, time.device)
         shift, heading = self._object(ways, start, time)
         inputs = {}
         if CAMERA in self._movers:
-            place, target = self._camera(ways, start, time, shift)
+            position, target = self._camera(ways, start, time, shift)
             roll = self.scene.number("camera.roll")
             way = ways.get(CAMERA)
             if isinstance(way, Waypoints) and way.rotations is not None:
-                inputs["camera.to_world"] = pose_camera(
-                    place, way.rotation_at(time), roll
-                )
+                pose = pose_camera(position, way.rotation_at(time), roll)
             else:
-                inputs["camera.to_world"] = looking(place, target, roll)
+                pose = looking(position, target, roll)
+            inputs["camera.to_world"] = pose
         if THING in self._movers:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
@@ -538,13 +566,10 @@ class PathControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the distance of the camera from the object."""
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {
-            "distance": Value(
-                value=float(self._distance(self._ways(values), values["time"])),
-                unit=unit,
-            )
-        }
+        distance = self._distance(self._ways(values), values["time"])
+        return {"distance": Value(value=float(distance), unit=unit)}
 
     def distances(self, times: Tensor) -> Tensor:
         """Return the distances (ways, n) of the camera from the object on each of the
@@ -557,22 +582,31 @@ class PathControl(Control):
     def _distance(self, ways: Ways, time: Tensor) -> Tensor:
         start = start_of(self.scene, time.device)
         shift, _ = self._object(ways, start, time)
-        away = self._camera(ways, start, time, shift)[0] - start.middle - shift
-        distance: Tensor = away.norm(dim=-1).double() * self.scene.metres
+        position, _ = self._camera(ways, start, time, shift)
+        offset = position - start.middle - shift
+        distance: Tensor = offset.norm(dim=-1).double() * self.scene.metres
         return distance
 
     def _ways(self, values: Values) -> Ways:
-        return (
-            self._paths[int(values[Control.WAY])]
-            if Control.WAY in values
-            else self._paths[0]
-        )
+        if Control.WAY in values:
+            return self._paths[int(values[Control.WAY])]
+        return self._paths[0]
 
     def _camera(
         self, ways: Ways, begin: Start, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Where the camera is, and what it looks at: an object that is shifted, unless
-        a file says something else.
+        """Return where the camera is, and what it looks at.
+
+        That is the object, which is shifted, unless a file says something else.
+
+        Args:
+            ways: what camera and object do.
+            begin: the scene as it is described.
+            time: (...,) seconds.
+            shift: (..., 3) of the object.
+
+        Returns:
+            Two positions (..., 3), object sizes.
         """
         pose = begin.camera
         center = begin.middle
@@ -581,57 +615,54 @@ class PathControl(Control):
         if way is None:
             return start, center
         if isinstance(way, Waypoints):
-            place = center + way.at(time, way.places) / self.scene.metres
-            if way.rotations is not None:
-                return place, place + way.rotation_at(time)[..., 2]
-            target = center + (
-                shift
-                if way.targets is None
-                else way.at(time, way.targets) / self.scene.metres
-            )
-            return place, target
-        away = (start - center).norm()
+            return self._camera_on_waypoints(way, center, time, shift)
+        distance = (start - center).norm()
         reach = float(self.chosen["reach"])
-        share = (time / self.seconds).clamp(0.0, 1.0)
+        progress = (time / self.seconds).clamp(0.0, 1.0)
         if way == APPROACH:
-            return start - _level(pose[:3, 2]) * away * (reach - 1.0) * (1.0 - share)[
-                ..., None
-            ], center + shift
+            ahead = _level(pose[:3, 2])
+            to_go = (1.0 - progress)[..., None]
+            return start - ahead * distance * (reach - 1.0) * to_go, center + shift
         if way == PASS:
-            return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[
-                ..., None
-            ], center + shift
-        angle = 2.0 * math.pi * share
-        (x, y, z) = start - center
-        cos = angle.cos()
-        sin = angle.sin()
-        around = torch.stack(
-            [cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1
-        )
-        return center + around, center + shift
+            from_middle = (1.0 - 2.0 * progress)[..., None]
+            return start + pose[:3, 0] * distance * reach * from_middle, center + shift
+        return center + _turn_about_vertical(start - center, progress), center + shift
+
+    def _camera_on_waypoints(
+        self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return where the camera is on waypoints, and what it looks at; see `_camera`."""
+        position = center + waypoints.at(time, waypoints.places) / self.scene.metres
+        if waypoints.rotations is not None:
+            return position, position + waypoints.rotation_at(time)[..., 2]
+        if waypoints.targets is None:
+            return position, center + shift
+        target = waypoints.at(time, waypoints.targets) / self.scene.metres
+        return position, center + target
 
     def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the object is shifted, and how many degrees it is turned by."""
-        own = begin.camera
+        """Return how far the object is shifted, and the degrees that it is turned by."""
+        camera = begin.camera
         way = ways.get(THING)
-        still = own.new_zeros(())
+        no_shift = camera.new_zeros(3)
+        no_turn = camera.new_zeros(())
         if way is None:
-            return own.new_zeros(3), still
+            return no_shift, no_turn
         if isinstance(way, Waypoints):
             shift = way.at(time, way.places) / self.scene.metres
-            return shift, still if way.headings is None else way.at(time, way.headings)
-        share = (time / self.seconds).clamp(0.0, 1.0)
+            if way.headings is None:
+                return shift, no_turn
+            return shift, way.at(time, way.headings)
+        progress = (time / self.seconds).clamp(0.0, 1.0)
         reach = float(self.chosen["reach"])
         if way == TURN:
-            return own.new_zeros(3), 360.0 * share
-        away = (own[:3, 3] - begin.middle).norm()
+            return no_shift, 360.0 * progress
+        distance = (camera[:3, 3] - begin.middle).norm()
         if way == APPROACH:
-            return _level(own[:3, 2]) * (away * (reach - 1.0) * (1.0 - share))[
-                ..., None
-            ], still
-        return _level(-own[:3, 0]) * (away * reach * (1.0 - 2.0 * share))[
-            ..., None
-        ], still
+            to_go = distance * (reach - 1.0) * (1.0 - progress)
+            return _level(camera[:3, 2]) * to_go[..., None], no_turn
+        from_middle = distance * reach * (1.0 - 2.0 * progress)
+        return _level(-camera[:3, 0]) * from_middle[..., None], no_turn
 
 
 @lru_cache(maxsize=4)
@@ -645,10 +676,21 @@ def start_of(scene: SceneDescription, device: torch.device) -> Start:
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
-def _level(along: Tensor) -> Tensor:
-    """The level direction (3,) of one: what travels keeps its height, as a car does."""
-    ahead = torch.stack([along[0], along[1], along.new_zeros(())])
-    return torch.as_tensor(ahead / ahead.norm().clamp_min(1e-6))
+def _level(direction: Tensor) -> Tensor:
+    """Return the level direction (3,) of one: what travels keeps its height."""
+    flat = torch.stack([direction[0], direction[1], direction.new_zeros(())])
+    return torch.as_tensor(flat / flat.norm().clamp_min(1e-6))
+
+
+def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
+    """Turn an offset (3,) about the vertical by a number of turns (...,)."""
+    angle = 2.0 * math.pi * turns
+    x, y, z = offset
+    cos = angle.cos()
+    sin = angle.sin()
+    return torch.stack(
+        [cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1
+    )
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
@@ -730,19 +772,19 @@ def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
 
 
 def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None]:
-    """Return headings (n,) so that one goes to the next the shorter way round, and what
-    is said of it.
+    """Return headings (n,) that go to the next one the shorter way round, and a note.
 
     Only where all are within one turn, from 0 to 360 or from -180 to 180: others count
-    on, as 0 to 360 does for a whole turn.
+    on, as 0 to 360 does for a whole turn. The note is None where nothing changes.
     """
     low = float(degrees.min())
     high = float(degrees.max())
-    places = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    within = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(places) or high - low >= 360.0 or not within:
+    jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
+    is_one_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(jumps) or high - low >= 360.0 or not is_one_turn:
         return degrees, None
-    first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
+    first = f"{degrees[jumps[0]]:g}"
+    last = f"{degrees[jumps[0] + 1]:g}"
     note = (
         f"it turns the shorter way from {first} to {last} degrees; for the longer "
         "one, add a waypoint between them"
@@ -755,14 +797,10 @@ def _round_text(number: float) -> str:
     return f"{float(f'{number:.3g}'):g}"
 
 
-def _names(path: object) -> tuple[str, ...]:
-    """The paths in a list, or in a text with commas between them."""
-    return tuple(
-        str(one).strip()
-        for one in (
-            path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
-        )
-    )
+def _split_paths(path: object) -> tuple[str, ...]:
+    """Return the paths in a list, or in a text with commas between them."""
+    names = path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
+    return tuple(str(name).strip() for name in names)
 
 
 def _is_path(name: str) -> bool:
@@ -783,86 +821,135 @@ def _read_text(path: Path) -> str:
 def read_waypoints(
     path: Path, mover: str, *, text: str, alone: bool = True
 ) -> dict[str, Waypoints]:
-    """Return the way of all that travels, from the text of a .csv file with the columns
-    time, x, y, z, and look_x, look_y, look_z or heading. It is about the `mover`;
-    unless `alone`, one about the camera may say what the object does at the same times.
+    """Read the paths of all that travels from a table of waypoints.
 
-    Raises FileFormatError: it is no table of numbers with the columns that a path
-    needs, or its times do not ascend.
+    Args:
+        path: of the file, for messages.
+        mover: the camera or the object, which the file is about.
+        text: of a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
+            or heading.
+        alone: whether a file about the camera may say what the object does at the same
+            times.
+
+    Raises:
+        FileFormatError: it is no table of numbers with the columns that a path needs,
+            or its times do not ascend.
     """
-    further = (
-        (HEADING,)
-        if mover == THING
-        else (*LOOKING, *SHIFT, TURNING)
-        if alone
-        else LOOKING
-    )
+    if mover == THING:
+        optional = (HEADING,)
+    elif alone:
+        optional = (*LOOKING, *SHIFT, TURNING)
+    else:
+        optional = LOOKING
+    header, rows = _read_csv(path, text)
+    _check_header(path, header, optional)
+    table = _parse_numbers(path, header, rows)
+    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
+    check_times(path, times)
+    column = {
+        name: table[:, index] for index, name in enumerate(header) if name != TIME
+    }
+    if not all(np.abs(values).max() <= FARTHEST for values in column.values()):
+        raise errors.FileFormatError(
+            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
+        )
+    notes = _unwrap_headings(path, column)
+
+    positions = _stack_columns(column, PLACE)
+    seconds = torch.from_numpy(times.astype(np.float32))
+    assert positions is not None
+    waypoints = {
+        mover: Waypoints(
+            seconds,
+            positions,
+            _stack_columns(column, LOOKING),
+            _stack_columns(column, (HEADING,)),
+            notes=notes.get(HEADING, ()),
+        )
+    }
+    shift = _stack_columns(column, SHIFT)
+    turn = _stack_columns(column, (TURNING,))
+    if shift is None and turn is not None:
+        shift = torch.zeros_like(positions)
+    if shift is not None:
+        waypoints[THING] = Waypoints(
+            seconds, shift, None, turn, notes=notes.get(TURNING, ())
+        )
+    return waypoints
+
+
+def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of a .csv file, without empty rows."""
+    rows = []
     try:
-        header, *rows = [
-            [cell.strip() for cell in row]
-            for row in csv.reader(text.splitlines())
-            if any(row)
-        ] or [[]]
+        for row in csv.reader(text.splitlines()):
+            if any(row):
+                rows.append([cell.strip() for cell in row])
     except csv.Error as error:
         raise errors.FileFormatError(
             f"{path}: expected a table of waypoints, got one with a {error}"
         ) from error
-    columns = (TIME, *PLACE)
-    parts = [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
-    missing = set(columns) - set(header)
-    twice = len(set(header)) < len(header)
-    if missing or twice or set(header) - {*columns, *further} or any(parts):
+    if not rows:
+        return [], []
+    return rows[0], rows[1:]
+
+
+def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> None:
+    """Check the names of columns. Raises FileFormatError: some lack, or are unknown."""
+    required = (TIME, *PLACE)
+    names = set(header)
+    is_missing = not set(required) <= names
+    has_duplicates = len(names) < len(header)
+    is_unknown = not names <= {*required, *optional}
+    is_incomplete = any(
+        0 < len(names.intersection(group)) < len(group) for group in (LOOKING, SHIFT)
+    )
+    if is_missing or has_duplicates or is_unknown or is_incomplete:
         raise errors.FileFormatError(
-            f"{path}: expected columns {', '.join(columns)}, and perhaps "
-            f"{', '.join(further)}, got "
+            f"{path}: expected columns {', '.join(required)}, and perhaps "
+            f"{', '.join(optional)}, got "
             f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or "
             "KITTI"
         )
+
+
+def _parse_numbers(
+    path: Path, header: list[str], rows: list[list[str]]
+) -> assets.Doubles:
+    """Return the numbers (rows, columns) of a table of waypoints.
+
+    Raises FileFormatError: it has too few or many rows, or something else than numbers.
+    """
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
         raise errors.FileFormatError(
             f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}"
         )
     try:
-        table = np.array(
-            [[float(one) for one in row] for row in rows], np.float64
-        ).reshape(len(rows), len(header))
+        numbers = [[float(cell) for cell in row] for row in rows]
+        return np.array(numbers, np.float64).reshape(len(rows), len(header))
     except ValueError as error:
         raise errors.FileFormatError(
             f"{path}: expected {len(header)} numbers in each row, got something else"
         ) from error
-    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
-    check_times(path, times)
-    column = {
-        name: table[:, place] for place, name in enumerate(header) if name != TIME
-    }
-    if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
-        raise errors.FileFormatError(
-            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
-        )
 
+
+def _unwrap_headings(
+    path: Path, column: dict[str, assets.Doubles]
+) -> dict[str, tuple[str, ...]]:
+    """Let headings turn the shorter way, in place; return notes by column."""
     notes = dict[str, tuple[str, ...]]()
-    for heading in [name for name in (HEADING, TURNING) if name in column]:
-        column[heading], note = the_shorter_way(column[heading])
-        notes[heading] = (f"{path}: {heading}: {note}",) if note else ()
+    for name in (HEADING, TURNING):
+        if name in column:
+            column[name], note = the_shorter_way(column[name])
+            notes[name] = (f"{path}: {name}: {note}",) if note else ()
+    return notes
 
-    def read(*names: str) -> Tensor | None:
-        if names[0] not in column:
-            return None
-        values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
-        return torch.from_numpy(values if len(names) > 1 else values[:, 0])
 
-    places = read(*PLACE)
-    seconds = torch.from_numpy(times.astype(np.float32))
-    assert places is not None
-    ways = {
-        mover: Waypoints(
-            seconds, places, read(*LOOKING), read(HEADING), notes=notes.get(HEADING, ())
-        )
-    }
-    shift = read(*SHIFT)
-    if shift is not None or TURNING in column:
-        shift = torch.zeros_like(places) if shift is None else shift
-        ways[THING] = Waypoints(
-            seconds, shift, None, read(TURNING), notes=notes.get(TURNING, ())
-        )
-    return ways
+def _stack_columns(
+    column: Mapping[str, assets.Doubles], names: Sequence[str]
+) -> Tensor | None:
+    """Return columns of a table as a tensor (n, k), or (n,) of one; None without."""
+    if names[0] not in column:
+        return None
+    values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
+    return torch.from_numpy(values if len(names) > 1 else values[:, 0])
