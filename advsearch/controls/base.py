@@ -83,28 +83,27 @@ class Moved:
 
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
-    """Return what is said of the values that had to move: one sentence a control."""
-
-    def instead(value: Moved) -> str:
-        unit = (
-            ""
-            if value.unit in ("1", "name") or isinstance(value.used, str)
-            else f" {value.unit}"
+    """Return one sentence a control about the values that had to be adjusted."""
+    result = []
+    for control, values in groupby(moved, key=lambda value: value.control):
+        adjustments = " and ".join(map(_describe_adjustment, values))
+        result.append(
+            f"The clean scene has {adjustments}, which the control {control} leaves out."
         )
-        short = [
-            end if isinstance(end, str) else rounded(end)
-            for end in (value.used, value.scene)
-        ]
-        used, scene = (
-            short if short[0] != short[1] else (shown(value.used), shown(value.scene))
-        )
-        return f"{value.parameter} {used}{unit} instead of {scene}"
+    return result
 
-    return [
-        f"The clean scene has {' and '.join(map(instead, several))}, which the control "
-        f"{control} leaves out."
-        for control, several in groupby(moved, key=lambda value: value.control)
-    ]
+
+def _describe_adjustment(value: Moved) -> str:
+    """Return a clause such as "pose.yaw 10 degrees instead of 0"."""
+    unit = f" {value.unit}"
+    if value.unit in ("1", "name") or isinstance(value.used, str):
+        unit = ""
+    used = value.used if isinstance(value.used, str) else rounded(value.used)
+    scene = value.scene if isinstance(value.scene, str) else rounded(value.scene)
+    if used == scene:
+        used = shown(value.used)
+        scene = shown(value.scene)
+    return f"{value.parameter} {used}{unit} instead of {scene}"
 
 
 def check_prepared(
@@ -142,26 +141,6 @@ def check_prepared(
         yield Moved(control, name, SETTINGS[name].unit, scene, value)
 
 
-HANDED = (
-    "prepare",
-    "bind",
-    "inputs",
-    "picture",
-    "describe",
-    "artifacts",
-    "printed",
-    "numbers",
-    "files",
-    "scene_inputs",
-    "on_picture",
-    "measured",
-    "kept_pictures",
-    "kept_files",
-)
-"""Methods of controls to which those of another package are handed copies of
-tensors.
-"""
-
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
 
@@ -198,31 +177,34 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is
-        the default. Raises InputError: it cannot be chosen.
+        """Check what was chosen in an instance of a control.
+
+        None is fine where it is the default. Raises InputError: it cannot be chosen.
         """
-        allowed = ""
-        fits = True
+        if given is None and self.default is None:
+            return
+        expected = ""
+        is_valid = True
         if self.options:
-            allowed = f"one of {', '.join(self.options)}"
-            fits = given in self.options
+            expected = f"one of {', '.join(self.options)}"
+            is_valid = given in self.options
         elif self.whole is not None:
             low, high = self.whole
-            allowed = f"a whole number from {low} to {high}"
-            fits = (
+            expected = f"a whole number from {low} to {high}"
+            is_valid = (
                 Parameter.is_number(given)
                 and low <= given <= high
                 and given == int(given)
             )
         elif self.most is not None and self.signed:
-            allowed = f"a number from {-self.most:g} to {self.most:g}"
-            fits = Parameter.is_number(given) and abs(given) <= self.most
+            expected = f"a number from {-self.most:g} to {self.most:g}"
+            is_valid = Parameter.is_number(given) and abs(given) <= self.most
         elif self.most is not None:
-            allowed = f"a number over 0 and up to {self.most:g}"
-            fits = Parameter.is_number(given) and 0.0 < given <= self.most
-        if not fits and not (given is None and self.default is None):
+            expected = f"a number over 0 and up to {self.most:g}"
+            is_valid = Parameter.is_number(given) and 0.0 < given <= self.most
+        if not is_valid:
             raise InputError(
-                f"{control}.{self.name}: expected {allowed}, got {given!r}"
+                f"{control}.{self.name}: expected {expected}, got {given!r}"
             )
 
 
@@ -308,7 +290,8 @@ class Control:
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        hand_copies(cls, **dict.fromkeys(HANDED, slice(None)))
+        names = [method.__name__ for method in METHODS_WITH_COPIES]
+        hand_copies(cls, **dict.fromkeys(names, slice(None)))
         if "summary" not in vars(cls) and cls.__doc__:
             cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
 
@@ -316,9 +299,8 @@ class Control:
         self.name = name or self.kind
         settings = {setting: as_setting(value) for setting, value in settings.items()}
         self.own = self.declared(settings)
-        known = [parameter.name for parameter in self.own] + [
-            choice.name for choice in self.choices
-        ]
+        parameter_names = [parameter.name for parameter in self.own]
+        known = parameter_names + [choice.name for choice in self.choices]
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(
@@ -337,13 +319,13 @@ class Control:
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
-        self.specs = {
-            parameter.name: read(
-                f"{self.name}.{parameter.name}", parameter, given[parameter.name]
-            )
-            for parameter in self.own
-            if parameter.name in given
-        }
+        self.specs: dict[str, Spec] = {}
+        for parameter in self.own:
+            if parameter.name in given:
+                label = f"{self.name}.{parameter.name}"
+                self.specs[parameter.name] = read(
+                    label, parameter, given[parameter.name]
+                )
         self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
 
     @classmethod
@@ -360,14 +342,10 @@ class Control:
         """
 
     def settings(self) -> dict[str, object]:
-        """Return what `make_control` needs to make an equal instance, as JSON
-        values.
-        """
-        return (
-            {"kind": self.kind, **self._given}
-            if self.name != self.kind
-            else dict(self._given)
-        )
+        """Return what `make_control` needs to make an equal instance, as JSON values."""
+        if self.name == self.kind:
+            return dict(self._given)
+        return {"kind": self.kind, **self._given}
 
     @property
     def mesh(self) -> str:
@@ -411,63 +389,62 @@ class Control:
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def chosen_form(self, forms: Sequence[str]) -> str:
-        """Return which form of itself a control takes, where each of its parameters
-        stands for one, and the choice `form` for any.
+        """Return which form of itself a control takes.
+
+        Each of its parameters stands for one form, and the choice `form` for any.
 
         Args:
             forms: the forms, in the order of the parameters; the first is the default.
 
         Raises:
-            InputError: two forms are asked for, or a parameter was given a range of its
-                own.
+            InputError: two forms are requested, or a parameter has a range of its own.
             UnknownNameError: there is no such form.
         """
-        asked = []
+        requested = []
         for parameter, form in zip(self.parameters, forms, strict=True):
-            chosen = self._given.get(parameter.name)
-            if chosen not in (
-                None,
+            value = self._given.get(parameter.name)
+            if value is None:
+                continue
+            if value not in (
                 [parameter.low, parameter.high],
                 (parameter.low, parameter.high),
             ):
                 raise InputError(
                     f"{self.name}.{parameter.name}: expected no value but "
                     f"[{parameter.low:g}, {parameter.high:g}], got "
-                    f"{chosen!r}; set how far it may go with {self.name}.epsilon"
+                    f"{value!r}; set how far it may go with {self.name}.epsilon"
                 )
-            asked += [] if chosen is None else [form]
+            requested.append(form)
         if "form" in self._given:
-            asked.append(str(self._given["form"]))
-            if asked[-1] not in forms:
-                raise UnknownNameError(f"{self.name}.form", asked[-1], forms)
-        if len(set(asked)) > 1:
+            form = str(self._given["form"])
+            requested.append(form)
+            if form not in forms:
+                raise UnknownNameError(f"{self.name}.form", form, forms)
+        if len(set(requested)) > 1:
             raise InputError(
-                f"{self.name}.form: expected one form, got {', '.join(asked)}"
+                f"{self.name}.form: expected one form, got {', '.join(requested)}"
             )
-        return asked[0] if asked else forms[0]
+        return requested[0] if requested else forms[0]
 
     def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
-        """Return the values, one by one, that a parameter was set to; others where
-        nothing was said of it.
+        """Return the values that a parameter was set to, one by one.
+
+        Args:
+            parameter: its name.
+            *otherwise: what is returned where it was not set, or has a range.
         """
         spec = self.specs.get(parameter)
-        return (
-            spec.values
-            if isinstance(spec, OneOf)
-            else (spec.value,)
-            if isinstance(spec, Fixed)
-            else otherwise
-        )
+        if isinstance(spec, OneOf):
+            return spec.values
+        if isinstance(spec, Fixed):
+            return (spec.value,)
+        return otherwise
 
     def searches(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is
-        searched.
-        """
-        return (
-            not isinstance(self.specs[parameter], Fixed)
-            if parameter in self.specs
-            else not self.asked
-        )
+        """Return whether a parameter with a range of its own is among what is searched."""
+        if parameter in self.specs:
+            return not isinstance(self.specs[parameter], Fixed)
+        return not self.asked
 
     # ---- in a scene
 
@@ -479,9 +456,9 @@ class Control:
 
     def within(self, scene: SceneDescription) -> Self:
         """Return a copy that has a scene, without a slice of u yet."""
-        there = copy.copy(self)
-        there.scene = scene if is_ours(type(self)) else copied(scene)
-        return there
+        in_scene = copy.copy(self)
+        in_scene.scene = scene if is_ours(type(self)) else copied(scene)
+        return in_scene
 
     def bind(self, scene: SceneDescription) -> Self:
         """Return a copy that is fit to a scene that all controls of the space have
@@ -493,9 +470,9 @@ class Control:
         return bound
 
     def fit(self) -> None:
-        """Set `start` and `groups`, and `moved` where there is something to say, for
-        `self.scene`. Raises InputError: a setting of the control is impossible in this
-        scene.
+        """Set `start`, `groups` and `moved` for `self.scene`.
+
+        Raises InputError: a setting of the control is impossible in this scene.
         """
         slots = list[Slot]()
         begin = 0
@@ -504,20 +481,21 @@ class Control:
             slots.append(slot)
             begin += slot.width
         self.slots = tuple(slots)
-        self.moved = tuple(self._list_moved())
+        self.moved = tuple(self._list_adjusted_defaults())
         self.start = torch.tensor(
-            [share for slot in slots for share in slot.start()], dtype=torch.float32
+            [coordinate for slot in slots for coordinate in slot.start()],
+            dtype=torch.float32,
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
         ]
-        ends = torch.tensor(
+        low_and_span = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         widths = torch.tensor([slot.width for slot in slots], dtype=torch.long)
-        self._low, self._span = ends.T.repeat_interleave(widths, dim=1)
+        self._low, self._span = low_and_span.T.repeat_interleave(widths, dim=1)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it: with its value in the unchanged
@@ -547,9 +525,9 @@ class Control:
             return self.specs[parameter.name]
         if self.asked or parameter.search is None:
             return Fixed(parameter.default)
-        return (
-            OneOf(parameter.options) if parameter.options else Range(*parameter.search)
-        )
+        if parameter.options:
+            return OneOf(parameter.options)
+        return Range(*parameter.search)
 
     def budget_of(self, parameter: Parameter) -> Budget:
         """Return how far a searched parameter may go: by default its whole range."""
@@ -577,64 +555,66 @@ class Control:
             ),
         )
 
-    def _list_moved(self) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not. Raises
-        InputError: one of them was asked for.
+    def _list_adjusted_defaults(self) -> Iterator[Moved]:
+        """Yield the values of the clean scene that the start does not have.
+
+        Raises InputError: one of them was requested.
         """
         for slot in self.slots:
-            if not self.is_compared(slot.parameter, slot.spec):
-                continue
             parameter = slot.parameter
-            wanted = self.unchanged(slot.parameter)
+            if not self.is_compared(parameter, slot.spec):
+                continue
+            scene_value = self.unchanged(parameter)
             used = slot.start_value()
-            if self.amount not in (None, parameter.name) or same(
-                used, wanted, turns=slot.turns
-            ):
+            hides_others = self.amount not in (None, parameter.name)
+            if hides_others or same(used, scene_value, turns=slot.turns):
                 continue
             setting = self.setting(parameter)
-            where = f"{self.name}.{parameter.name}"
+            label = f"{self.name}.{parameter.name}"
             if setting in self.scene.given:
-                asked = f"`environment={self.scene.environment_spec}`"
-                if setting != ENVIRONMENT:
-                    asked = f"`set` {setting}={shown(self.scene.number(setting))}"
                 raise InputError(
-                    f"{asked} and `controls` {self.name} contradict each other: "
-                    f"{where} is {slot.spec}, "
-                    f"which leaves {shown(wanted)} out; change one of the two, or "
+                    f"{self._quote_setting(setting)} and `controls` {self.name} contradict "
+                    f"each other: {label} is {slot.spec}, "
+                    f"which leaves {shown(scene_value)} out; change one of the two, or "
                     "leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
-                unit = "name" if parameter.options else parameter.unit
                 yield Moved(
                     self.name,
-                    setting if setting == ENVIRONMENT else where,
-                    unit,
-                    wanted,
+                    setting if setting == ENVIRONMENT else label,
+                    "name" if parameter.options else parameter.unit,
+                    scene_value,
                     used,
                 )
 
+    def _quote_setting(self, setting: str) -> str:
+        """Return how a setting of the scene is written, with its value."""
+        if setting == ENVIRONMENT:
+            return f"`environment={self.scene.environment_spec}`"
+        return f"`set` {setting}={shown(self.scene.number(setting))}"
+
     def _group(self, slot: Slot) -> Group:
+        """Return the group of coordinates of a searched parameter."""
         parameter = slot.parameter
+        name = parameter.name
         spec = slot.spec
-        setting = self.setting(slot.parameter)
+        setting = self.setting(parameter)
         if isinstance(spec, OneOf):
             return Group(
-                parameter.name,
-                slot.width,
-                (),
-                options=len(spec.values),
-                setting=setting,
+                name, slot.width, (), options=len(spec.values), setting=setting
             )
         budget = self.budget_of(parameter)
         if type(spec) is not Range and budget != WHOLE_RANGE:
             raise InputError(
-                f"{self.name}.{parameter.name}: it has a ball and no "
-                "distribution; give it a range"
+                f"{self.name}.{name}: it has a ball and no distribution; give it a range"
             )
-        name = parameter.name
-        valid = parameter.estimators
         return Group(
-            name, slot.width, valid, budget, periodic=slot.periodic, setting=setting
+            name,
+            slot.width,
+            parameter.estimators,
+            budget,
+            periodic=slot.periodic,
+            setting=setting,
         )
 
     @property
@@ -671,33 +651,29 @@ class Control:
     # ---- at a configuration
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        """Return every parameter's value at a slice of u: float32 of the parameter's
-        shape, or the number of an option. Fixed ones are there too.
+        """Return every parameter's value at a slice of u, fixed ones too.
+
+        Returns:
+            By name, float32 of the parameter's shape; of a choice the index of its option.
         """
         values: dict[str, Tensor] = {}
         if not self.slots:
             return values
         # at once, but for what is searched on a logarithmic scale
-        every = self._low.to(u) + self._span.to(u) * u
+        linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.slots:
             parameter = slot.parameter
             spec = slot.spec
-            place = slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
-                mapped = parameter.log or type(spec) is not Range
-                value = spec.at(u[place], log=parameter.log) if mapped else every[place]
+                coordinates = slice(slot.begin, slot.begin + slot.size)
+                if parameter.log or type(spec) is not Range:
+                    value = spec.at(u[coordinates], log=parameter.log)
+                else:
+                    value = linear[coordinates]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
-            chosen = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
-            shape = (
-                (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
-            )
-            number = (
-                parameter.options.index(chosen) if isinstance(chosen, str) else chosen
-            )
-            values[parameter.name] = torch.full(
-                shape, float(number), dtype=torch.float32, device=u.device
-            )
+            constant = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
+            values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
 
     def scene_inputs(
@@ -726,15 +702,14 @@ class Control:
         return image
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1];
-        differentiable in both arguments.
+        """Change the finished image, (H, W, 3) display-referred sRGB in [0, 1].
+
+        Differentiable in both arguments.
         """
-        # many do nothing to the picture: their values are not worked out again
-        return (
-            image
-            if type(self).on_picture is Control.on_picture
-            else self.on_picture(self.values(u), image)
-        )
+        # many do nothing to the image: their values are not worked out again
+        if type(self).on_picture is Control.on_picture:
+            return image
+        return self.on_picture(self.values(u), image)
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
@@ -747,35 +722,30 @@ class Control:
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
-        """Say a configuration in a few named values with units, small enough for one
-        row of a table.
+        """Describe a configuration by a few named values with units.
 
-        It is a function of its arguments alone; arguments as for `inputs`.
+        Small enough for one row of a table; a function of its arguments alone, which are
+        those of `inputs`.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}
         for slot in self.slots:
             parameter = slot.parameter
-            value = values[slot.parameter.name]
-            name = f"{self.name}.{slot.parameter.name}"
             if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
                 continue
+            value = values[parameter.name]
+            name = f"{self.name}.{parameter.name}"
             if parameter.options:
-                described[name] = {
-                    "value": parameter.options[int(value)],
-                    "unit": "name",
-                }
+                option = parameter.options[int(value)]
+                described[name] = {"value": option, "unit": "name"}
             elif value.ndim == 0:
                 described[name] = measure(value, parameter.unit)
             else:
-                described |= {
-                    f"{name}.{k}": measure(number, parameter.unit)
-                    for k, number in enumerate(value)
-                }
-        return described | {
-            f"{self.name}.{name}": value
-            for name, value in self.measured(values, so_far).items()
-        }
+                for k, number in enumerate(value):
+                    described[f"{name}.{k}"] = measure(number, parameter.unit)
+        for name, measurement in self.measured(values, so_far).items():
+            described[f"{self.name}.{name}"] = measurement
+        return described
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         """Return the numbers of the configuration by parameter, in its unit, (k,) or
@@ -827,6 +797,38 @@ class Control:
 
 
 NumberControl = Control  # its name in packages that add controls
+
+
+def _to_tensor(constant: Number, slot: Slot, device: torch.device) -> Tensor:
+    """Return one number, or the index of a name, in the shape of a parameter."""
+    if isinstance(constant, str):
+        return torch.full(
+            (),
+            float(slot.parameter.options.index(constant)),
+            dtype=torch.float32,
+            device=device,
+        )
+    shape = (slot.size,) if slot.parameter.shape else ()
+    return torch.full(shape, float(constant), dtype=torch.float32, device=device)
+
+
+METHODS_WITH_COPIES = (
+    Control.prepare,
+    Control.bind,
+    Control.inputs,
+    Control.picture,
+    Control.describe,
+    Control.artifacts,
+    Control.printed,
+    Control.numbers,
+    Control.files,
+    Control.scene_inputs,
+    Control.on_picture,
+    Control.measured,
+    Control.kept_pictures,
+    Control.kept_files,
+)
+"""Methods of controls that get copies of tensors in controls of another package."""
 
 
 def measure(value: Tensor | float, unit: str) -> Value:

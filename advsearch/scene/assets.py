@@ -252,11 +252,10 @@ def face_vectors(corners: Doubles) -> Doubles:
 
 
 def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place
-    (3,).
-    """
+    """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift (3,)."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = linear, place
+    pose[:3, :3] = linear
+    pose[:3, 3] = place
     return pose
 
 
@@ -300,48 +299,63 @@ TEXTURE_CELLS = 32
 
 
 def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
-    """Return what leaves at most `most` faces of a mesh, or of one that stands
-    elsewhere, or the fewest of a coarse grid; None: it has no more. After Rossignac and
-    Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"):
-    vertices are clustered by a grid, and a face of which two corners meet is left out.
-    Both sides of a seam of the texture move together, so that no gap opens.
+    """Return a function that simplifies a mesh, also once its vertices are elsewhere.
+
+    After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
+    complex scenes"): vertices are clustered by a grid, and a face of which two corners
+    meet is left out. Both sides of a seam of the texture move together, so that no gap
+    opens.
+
+    Args:
+        mesh: the full mesh.
+        most: faces that are left at most, or the fewest of a coarse grid.
+
+    Returns:
+        None if the mesh has no more faces.
     """
     if len(mesh.faces) <= most:
         return None
-    low = mesh.vertices.min(axis=0)
-    extent = max(float((mesh.vertices.max(axis=0) - low).max()), 1e-12)
     chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
     for grid in GRIDS:
-        cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(
-            np.int64
+        cluster_of = _cluster_vertices(mesh, grid)
+        # vertices of a cluster in different parts of the texture stay apart
+        cluster_and_chart = _key(np.column_stack([cluster_of, chart]))
+        _, representative, new_vertex = np.unique(
+            cluster_and_chart, return_index=True, return_inverse=True
         )
-        places = np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
-        together = _key(np.column_stack([places, chart]))
-        _, kept, left = np.unique(together, return_index=True, return_inverse=True)
-        faces = left.reshape(-1)[mesh.faces]
-        first, second, third = places[kept][faces].T
+        faces = new_vertex.reshape(-1)[mesh.faces]
+        first, second, third = cluster_of[representative][faces].T
         faces = faces[(first != second) & (second != third) & (third != first)]
         if len(faces) <= most:
             break
-    rest = np.unique(faces, axis=0).astype(np.uint32)
-    counts = np.bincount(places)
+    distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
+    cluster_size = np.bincount(cluster_of)
 
-    def fewer(whole: Mesh) -> Mesh:
-        mean = np.stack(
-            [
-                np.bincount(places, whole.vertices[:, axis]) / counts
-                for axis in range(3)
-            ],
-            axis=1,
-        )
+    def simplify(full: Mesh) -> Mesh:
+        sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
+        mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
-            mean[places[kept]].astype(np.float32),
-            rest,
-            whole.normals[kept],
-            whole.uvs[kept],
+            mean[cluster_of[representative]].astype(np.float32),
+            distinct_faces,
+            full.normals[representative],
+            full.uvs[representative],
         )
 
-    return fewer
+    return simplify
+
+
+def _cluster_vertices(mesh: Mesh, grid: int) -> Ints:
+    """Return the cluster (V,) of each vertex: the cell of a grid that it is in.
+
+    Args:
+        mesh: with V vertices.
+        grid: cells along its largest extent.
+    """
+    lower = mesh.vertices.min(axis=0)
+    extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
+    scaled = (mesh.vertices - lower) / extent * (grid - 1)
+    cells = np.floor(scaled + 0.5).astype(np.int64)
+    return np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
 
 
 def _key(rows: Ints) -> Ints:

@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -63,33 +64,35 @@ class Photograph:
     def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
         self._rows = radiance.shape[0]
         self._first = (self._rows - 1) // 2
-        # rings around the point below the camera, with the map's own coordinates as
-        # texture coordinates
+        self.mesh = self._make_mesh(height, rotation)
+        self.base = self.reflectance(
+            torch.from_numpy(np.asarray(radiance, dtype=np.float32))
+        )
+
+    def _make_mesh(self, height: float, rotation: float) -> Mesh:
+        """Make rings of faces around the point below the camera.
+
+        Their texture coordinates are those of the lower half of the map.
+        """
         radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
         turns = np.linspace(0.0, 1.0, SECTORS + 1)
         radius, turn = np.meshgrid(radii, turns, indexing="ij")
         azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
-        polar = math.pi - np.arctan(radius)
         vertices = height * np.stack(
             [radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1
         )
-        texels = self._rows - self._first
+        polar = math.pi - np.arctan(radius)
+        n_rows = self._rows - self._first
         row = polar / math.pi * (self._rows - 1) - self._first
-        uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
-        inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
-        outer = inner + SECTORS + 1
-        further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
-        faces = np.concatenate(
-            [np.stack([outer, inner, outer + 1], axis=1), further]
-        ).astype(np.uint32)
+        uvs = np.stack([turn, 1.0 - (row + 0.5) / n_rows], axis=-1)
         normals = np.tile(
             np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
         )
-        places = vertices.reshape(-1, 3).astype(np.float32)
-        texture = uvs.reshape(-1, 2).astype(np.float32)
-        self.mesh = Mesh(places, faces, normals, texture)
-        self.base = self.reflectance(
-            torch.from_numpy(np.asarray(radiance, dtype=np.float32))
+        return Mesh(
+            vertices.reshape(-1, 3).astype(np.float32),
+            _make_ring_faces(),
+            normals,
+            uvs.reshape(-1, 2).astype(np.float32),
         )
 
     def reflectance(self, radiance: Tensor) -> Tensor:
@@ -108,6 +111,16 @@ class Photograph:
         return torch.where(
             arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
         )
+
+
+def _make_ring_faces() -> npt.NDArray[np.uint32]:
+    """Return the faces (F, 3) of the rings; the innermost are single triangles."""
+    ring_starts = np.arange(RINGS)[:, None] * (SECTORS + 1)
+    inner = (ring_starts + np.arange(SECTORS)).ravel()
+    outer = inner + SECTORS + 1
+    first = np.stack([outer, inner, outer + 1], axis=1)
+    second = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
+    return np.concatenate([first, second]).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
@@ -231,25 +244,26 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
 
 
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the road or the place that its environment and its settings
-    ask for, and no other.
+    """Return the scene with the road or the place that its settings ask for.
+
+    Another one that it had is left out.
     """
     others = tuple(
         part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid)
     )
     place = load_requested_place(scene)
-    if place is not None:
-        light = scene.environment
-        unit = None if light is None else light.candelas
-        is_dark = False
-        if light is not None and unit is not None and place.file.lamps:
-            arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-            is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-        return replace(
-            scene,
-            parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)),
-        )
-    return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
+    if place is None:
+        if len(others) == len(scene.parts):
+            return scene
+        return replace(scene, parts=others)
+    light = scene.environment
+    unit = None if light is None else light.candelas
+    is_dark = False
+    if light is not None and unit is not None and place.file.lamps:
+        arriving = irradiance(torch.from_numpy(light.radiance.copy()))
+        is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
+    place_parts = lay_place(place, scene.metres, unit, is_dark=is_dark)
+    return replace(scene, parts=(*others, *place_parts))
 
 
 DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
@@ -420,72 +434,89 @@ def place_of(view: CameraView) -> Doubles:
 def past(
     scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False
 ) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, go past what its
-    environment's picture is valid for; `turns`: that is turned from view to view.
+    """Return remarks where views go past what an environment's picture is valid for.
+
+    Args:
+        scene: that is looked at.
+        views: at least one.
+        turns: whether the map is rotated from view to view.
     """
-    around = surroundings_of(scene)
+    surroundings = surroundings_of(scene)
     place = find_place(scene)
     outside = () if place is None else remark_outside(scene, place, views)
-    if outside or around is None:
+    if outside or surroundings is None:
         return outside
     name = scene.environment_name
-    unit = "m" if scene.object.metres is not None else "object sizes"
-    if valid(around, views[0]) == (0.0, 0.0) or (
-        turns and isinstance(around.stands, tuple)
-    ):
+    is_against_road = valid(surroundings, views[0]) == (0.0, 0.0)
+    if is_against_road or (turns and isinstance(surroundings.stands, tuple)):
         return (
             f"{name}: its houses are a picture, which `environment.rotation` turns "
             "against the road: they then stand "
             "across it; leave the rotation out",
         )
-    limits = [valid(around, view) for view in views]
-    each = zip(views, limits, strict=True)
+    limits = [valid(surroundings, view) for view in views]
     beyond = [
-        view for view, (far, high) in each if view.distance > far or view.height > high
+        view
+        for view, (distance, height) in zip(views, limits, strict=True)
+        if view.distance > distance or view.height > height
     ]
     if not beyond:
         return ()
-    near = min(limits)[0]
-    far = max(limits)[0]
-    which = (
-        f"{near:.3g} {unit}"
-        if far < 1.05 * near
-        else (f"{near:.3g} to {far:.3g} {unit} (by where it looks)")
-    )
-    high = f" and {limits[0][1]:.3g} {unit} high" if math.isfinite(limits[0][1]) else ""
-    reach = max(view.distance for view in beyond)
-    top = max(view.height for view in beyond)
-    share = len(beyond) / len(views)
-    there = (
-        "the camera is"
-        if len(views) == 1
-        else (f"{100.0 * share:.0f} % of the views are past that, up to")
-    )
+    unit = "m" if scene.object.metres is not None else "object sizes"
+    who = "the camera is"
+    if len(views) > 1:
+        percentage = 100.0 * (len(beyond) / len(views))
+        who = f"{percentage:.0f} % of the views are past that, up to"
+    farthest = max(view.distance for view in beyond)
+    highest = max(view.height for view in beyond)
     return (
         f"{name}: the place around the object is a picture, which fits a camera up to "
-        f"{which} away{high}; {there} "
-        f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around "
-        "is more than twice too large or "
+        f"{_describe_limits(limits, unit)}; {who} "
+        f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
+        "around is more than twice too large or "
         "too high, or the ground ends in sight: predictions from there are about the "
         "picture, not about a real place",
     )
 
 
+def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
+    """Return up to where an environment's picture fits a camera, for a message.
+
+    Args:
+        limits: distance and height of each view, see `valid`.
+        unit: of these.
+    """
+    smallest = min(limits)[0]
+    largest = max(limits)[0]
+    distance = f"{smallest:.3g} {unit}"
+    if largest >= 1.05 * smallest:
+        distance = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    max_height = limits[0][1]
+    height = f" and {max_height:.3g} {unit} high" if math.isfinite(max_height) else ""
+    return f"{distance} away{height}"
+
+
 def remark_outside(
     scene: SceneDescription, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, are outside of what its
-    place holds for.
+    """Return a remark where views are outside of what the place is valid for.
+
+    Args:
+        scene: that is looked at.
+        place: of the scene.
+        views: at least one.
     """
     bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
     positions = np.array([place_of(view) for view in views])
     is_outside = np.zeros(len(views), bool)
-    for axis, (low, high) in bounds:
-        along = positions[:, "xyz".index(axis)]
-        is_outside |= (along < low) | (along > high)
+    for axis, (lower, upper) in bounds:
+        coordinate = positions[:, "xyz".index(axis)]
+        is_outside |= (coordinate < lower) | (coordinate > upper)
     if not is_outside.any():
         return ()
-    box = " and ".join(f"{axis} {low:g} to {high:g} m" for axis, (low, high) in bounds)
+    box = " and ".join(
+        f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in bounds
+    )
     x, y, z = positions[int(is_outside.argmax())]
     first = f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
     which = f"the camera is outside, at {first}"

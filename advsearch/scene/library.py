@@ -8,8 +8,8 @@ read through `importlib.resources`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
 from pathlib import Path
@@ -111,46 +111,27 @@ def _environments() -> dict[str, dict[str, Any]]:
 
 
 def load_object(name: str) -> ObjectAsset:
-    """Return a bundled object, its largest extent 1, standing on z = 0. Raises
-    UnknownNameError: there is no such object. Raises FileFormatError: the installation
-    is damaged.
+    """Return a bundled object, its largest extent 1, standing on z = 0.
+
+    Raises:
+        FileFormatError: the installation is damaged.
+        UnknownNameError: there is no such object.
     """
     import imageio.v3 as iio  # most scenes need no such file
 
     known = list_objects()
     if name not in known:
         raise UnknownNameError("object", name, known, OBJECT_HINT)
-    folder = _data() / "objects" / name
+    directory = _data() / "objects" / name
     try:
-        facts = json.loads((folder / "object.json").read_text("utf-8"))
-        runs = facts.get("faces", ())  # how many faces in a row have which material
-        names = np.repeat([name for name, _ in runs], [count for _, count in runs])
-        materials = {
-            str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)
-        }
-        elements, _ = read_elements((folder / "mesh.ply").read_bytes(), Notes(name))
-        vertex = elements["vertex"].scalars
-        faces = elements["face"].listed["vertex_indices"].values
-        places, normals, uvs = (
-            np.stack([vertex[number] for number in numbers], axis=1).astype(np.float32)
-            for numbers in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
-        )
-        mesh = Mesh(
-            places,
-            faces.reshape(-1, 3).astype(np.uint32),
-            normals,
-            uvs,
-            materials=materials,
-        )
-        if (folder / "body.npz").is_file():
-            mesh = replace(mesh, rig=make_person())
-        levels = np.asarray(
-            iio.imread((folder / "base_color.png").read_bytes(), extension=".png")
-        )[..., :3]
+        facts = json.loads((directory / "object.json").read_text("utf-8"))
+        mesh = _read_mesh(name, directory, facts.get("faces", ()))
+        content = (directory / "base_color.png").read_bytes()
+        levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
         material = Material(**facts["material"])
         finishes = {
-            finish: Material(**numbers)
-            for finish, numbers in facts.get("finishes", {}).items()
+            finish: Material(**values)
+            for finish, values in facts.get("finishes", {}).items()
         }
         return ObjectAsset(
             name=name,
@@ -168,6 +149,42 @@ def load_object(name: str) -> ObjectAsset:
         raise FileFormatError(
             f"bundled object {name!r} cannot be read ({error}); reinstall advsearch"
         ) from error
+
+
+def _read_mesh(
+    name: str, directory: Traversable, material_runs: Sequence[tuple[str, int]]
+) -> Mesh:
+    """Read the mesh of a bundled object.
+
+    Args:
+        name: of the object, for messages.
+        directory: of its files.
+        material_runs: names of materials, each with how many faces in a row have it.
+    """
+    material_of_face = np.repeat(
+        [material for material, _ in material_runs],
+        [count for _, count in material_runs],
+    )
+    materials = {
+        str(material): np.nonzero(material_of_face == material)[0]
+        for material in dict.fromkeys(material_of_face)
+    }
+    elements, _ = read_elements((directory / "mesh.ply").read_bytes(), Notes(name))
+    columns = elements["vertex"].scalars
+    faces = elements["face"].listed["vertex_indices"].values
+    positions, normals, uvs = (
+        np.stack([columns[axis] for axis in axes], axis=1).astype(np.float32)
+        for axes in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
+    )
+    has_body = (directory / "body.npz").is_file()
+    return Mesh(
+        positions,
+        faces.reshape(-1, 3).astype(np.uint32),
+        normals,
+        uvs,
+        materials=materials,
+        rig=make_person() if has_body else None,
+    )
 
 
 def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:

@@ -835,6 +835,7 @@ def read_waypoints(
         FileFormatError: it is no table of numbers with the columns that a path needs,
             or its times do not ascend.
     """
+    optional: tuple[str, ...]
     if mover == THING:
         optional = (HEADING,)
     elif alone:

@@ -12,12 +12,24 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch.controls.projector.projector import LUMENS, TIMES, ProjectorControl
-from advsearch.extend import Choice, Control, Parameter, Value, Values, color
+from advsearch.extend import (
+    Choice,
+    Control,
+    Fixed,
+    OneOf,
+    Parameter,
+    Range,
+    Value,
+    Values,
+    color,
+)
 
 OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
 WIDTH = 0.3  # object sizes
@@ -25,6 +37,7 @@ WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Diameter in which half of a round Gaussian of standard deviation 1 lies."""
 
 
+NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})
 _lit = partial(Parameter.number, Parameter.LIT)
 
 
@@ -94,12 +107,27 @@ class SpotControl(ProjectorControl):
         ),
     )
 
-    # its numbers are a handful, and there is no picture among them
-    spec = Control.spec
-    budget_of = Control.budget_of
-    values = Control.values
-    describe = Control.describe
-    kept_pictures = Control.kept_pictures
+    # Its parameters are a few numbers, and there is no image among them: as of any
+    # control.
+
+    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+        return Control.spec(self, parameter)
+
+    def budget_of(self, parameter: Parameter) -> Any:
+        return Control.budget_of(self, parameter)
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        return Control.values(self, u)
+
+    def describe(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+    ) -> dict[str, Value]:
+        return Control.describe(self, u, so_far)
+
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        return Control.kept_pictures(self, values, so_far)
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
