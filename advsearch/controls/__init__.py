@@ -82,8 +82,9 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
 def unknown_control(
     kind: str, hint: str = "", instances: Iterable[str] = ()
 ) -> UnknownNameError:
-    """Return the error for a control that there is not; it says of which it is a
-    parameter, or else the hint.
+    """Return the error for a control that does not exist.
+
+    It says of which control the name is a parameter, or else the hint.
     """
     usable = CONTROLS.list_usable().items()
     owners = [
@@ -100,15 +101,14 @@ def unknown_control(
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
-    """Return the kind and the name of the instance that `make_control` makes of a name
-    and settings.
-    """
+    """Return the kind and the instance name that `make_control` would use."""
     return _read_name(asked, dict(given))[:2]
 
 
 def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
-    """Return kind, instance name and single parameter; takes "kind" out of the
-    settings.
+    """Return kind, instance name and single parameter.
+
+    Takes "kind" out of the settings.
     """
     kind, colon, name = asked.partition(":")
     kind, dot, parameter = kind.partition(".")
@@ -122,8 +122,10 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
 
 
 def instance_of(kind: str, name: str) -> str:
-    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where
-    the name is that of a mesh; the name is empty where there is no colon.
+    """Return the name of an instance.
+
+    It is "key" for ``light:key``, but "pose:chair" where the name is that of a mesh,
+    and the kind where there is no colon (an empty name).
     """
     of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
     if not name or (of_a_mesh and name == OBJECT):
@@ -132,8 +134,10 @@ def instance_of(kind: str, name: str) -> str:
 
 
 def check_instance(where: str, name: str, colon: str = ":") -> None:
-    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where
-    it has other characters than letters, digits, dashes and underscores, or is empty.
+    """Check what stands behind the colon of `KIND:NAME`.
+
+    Raises InputError: it has other characters than letters, digits, dashes and
+    underscores, or is empty.
     """
     if colon and not re.fullmatch(r"[\w-]+", name):
         raise InputError(
@@ -143,6 +147,7 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
+    """Return the range, or the choices, of a parameter that is searched by name alone."""
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
@@ -163,6 +168,7 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
     """Return the settings of each control, with ranges of Mitsuba's names under one.
+
     Raises InputError: one has something else than settings.
     """
     by_name: dict[str, Mapping[str, object]] = {}
@@ -198,9 +204,10 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something
-    that can be searched. Raises InputError: no control, two of one name, one that the
-    scene cannot take, or nothing that varies.
+    """Compose controls and a scene into a space that can be searched.
+
+    Raises InputError: no control, two of one name, one that the scene cannot take, or
+    nothing that varies.
     """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
@@ -224,9 +231,11 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them; none, or only
-    fixed ones, will do. Raises InputError: two controls of one name, one that the scene
-    cannot take, or one that leaves out what the scene was asked to have.
+    """Let controls prepare a scene, bind them to it and compose them.
+
+    There may be none, or only fixed ones. Raises InputError: two controls of one name,
+    one that the scene cannot take, or one that leaves out what was requested of the
+    scene.
     """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
@@ -271,9 +280,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the class of a control when it is asked for by name: TextureControl, or
-    Texture for short.
-    """
+    """Import the class of a control by name: TextureControl, or Texture for short."""
     return get_class("control", name if name.endswith("Control") else f"{name}Control")
 
 

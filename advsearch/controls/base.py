@@ -70,9 +70,15 @@ LARGEST_EPSILON = 1e6
 
 @dataclass(frozen=True)
 class Moved:
-    """A value of the clean scene that a control leaves out, although nobody asked for
-    it: that of a parameter (``pose.yaw``, ``ground.size``, ``environment``), in a unit
-    ("name" of names), as the scene described it, and the one that is used instead.
+    """A value of the clean scene that a control had to adjust, unrequested.
+
+    Attributes:
+        control: name of the control.
+        parameter: that was adjusted (``pose.yaw``, ``ground.size``,
+            ``environment``).
+        unit: of the values; "name" of names.
+        scene: the value that the scene was described with.
+        used: the value that is used instead.
     """
 
     control: str
@@ -109,8 +115,9 @@ def _describe_adjustment(value: Moved) -> str:
 def check_prepared(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> Iterator[Moved]:
-    """Yield what a control has replaced in a scene by what it needs there, and nobody
-    has described. Raises InputError where it was asked for.
+    """Yield what a control has replaced in a scene and nobody has described.
+
+    Raises InputError: it was requested.
     """
     if after.environment is not None and after.environment is not before.environment:
         check_one_environment(after.parts, f"`controls` {control}")
@@ -215,8 +222,9 @@ discrete choice, its number.
 
 
 class Control:
-    """A family of scene parameters. `bind` returns a copy with a scene, which has a
-    slice of u and maps it to inputs.
+    """A family of scene parameters.
+
+    `bind` returns a copy with a scene, which has a slice of u and maps it to inputs.
 
     It is made of named numbers and choices. Once one parameter is given a range or a
     list, only those given so are searched; otherwise each parameter is searched over
@@ -296,6 +304,7 @@ class Control:
             cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Read the settings; see the class."""
         self.name = name or self.kind
         settings = {setting: as_setting(value) for setting, value in settings.items()}
         self.own = self.declared(settings)
@@ -330,15 +339,17 @@ class Control:
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings, by name,
-        perhaps with the values: those of the class, unless the scene or the settings
-        name them.
+        """Return the parameters of an instance with some settings, by name.
+
+        Those of the class, unless the scene or the settings name them. A mapping has
+        the values too.
         """
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by
-        default nothing. Raises InputError: a choice is out of range.
+        """Check what the choices' own declarations do not say of `self.chosen`.
+
+        By default nothing. Raises InputError: a choice is out of range.
         """
 
     def settings(self) -> dict[str, object]:
@@ -349,8 +360,9 @@ class Control:
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh that it is about: the one behind the colon of its name, or
-        else the object.
+        """Name of the mesh that it is about.
+
+        It stands behind the colon of the control's name; by default it is the object.
         """
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
@@ -360,8 +372,9 @@ class Control:
         return file_name(self.name)
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene. Raises UnknownNameError: there is none of that
-        name.
+        """Return that mesh in a scene.
+
+        Raises UnknownNameError: there is none of that name.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -383,8 +396,9 @@ class Control:
         )
 
     def setting(self, parameter: Parameter) -> str:
-        """Return the name of the scene's setting that says the same as a parameter,
-        whether or not there is one.
+        """Return the name of a parameter among the scene's settings.
+
+        Whether or not the scene has it.
         """
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
@@ -449,8 +463,9 @@ class Control:
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Return the scene with whatever this control needs to be in it (a light, a
-        medium); by default unchanged. Raises InputError: the scene cannot take it.
+        """Return the scene with the parts that this control needs (a light, a medium).
+
+        By default it is unchanged. Raises InputError: the scene cannot take them.
         """
         return scene
 
@@ -461,9 +476,9 @@ class Control:
         return in_scene
 
     def bind(self, scene: SceneDescription) -> Self:
-        """Return a copy that is fit to a scene that all controls of the space have
-        prepared. Raises InputError: a setting of the control is impossible in this
-        scene.
+        """Return a copy that is bound to a scene, which all controls have prepared.
+
+        Raises InputError: a setting of the control is impossible in this scene.
         """
         bound = self.within(scene)
         bound.fit()
@@ -498,9 +513,10 @@ class Control:
         self._low, self._span = low_and_span.T.repeat_interleave(widths, dim=1)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as this scene has it: with its value in the unchanged
-        scene as the default, the range that is searched when nothing is said about it,
-        and the unit, the shape and the estimators that it has there.
+        """Return a parameter as this scene has it.
+
+        Its default is its value in the unchanged scene; its search range, unit, shape
+        and estimators are those that it has there.
         """
         value = self.scene.values.get(self.setting(parameter))
         return parameter if value is None else replace(parameter, default=value)
@@ -514,8 +530,10 @@ class Control:
         )
 
     def unchanged(self, parameter: Parameter) -> Number:
-        """Return what a parameter, as `in_scene` has it, is in the scene as it was
-        described: its default, unless that changes the scene.
+        """Return the value of a parameter in the scene as it was described.
+
+        That is its default, unless that changes the scene. The parameter is as
+        `in_scene` has it.
         """
         return parameter.default
 
@@ -534,15 +552,14 @@ class Control:
         return WHOLE_RANGE
 
     def laid_out(self) -> Iterator[tuple[Parameter, Spec]]:
-        """Yield the parameters in the order of their coordinates, each with what it is
-        set to.
-        """
+        """Yield the parameters in the order of their coordinates, with their specs."""
         for parameter in map(self.in_scene, self.own):
             yield parameter, self.spec(parameter)
 
     def is_compared(self, parameter: Parameter, spec: Spec) -> bool:
-        """Return whether the start has to have the clean scene's value of a parameter;
-        by default always.
+        """Return whether the start has to have the clean scene's value of a parameter.
+
+        By default always.
         """
         return True
 
@@ -619,19 +636,18 @@ class Control:
 
     @property
     def ambient(self) -> float | None:
-        """Lux of ambient light beside the light that it throws; None where there is
-        none or where that is searched.
+        """Lux of ambient light beside the light that it throws.
+
+        None where there is none, or where it is searched.
         """
         return None
 
     def in_light(self, times: float) -> Self:
-        """Return the bound control in so many times the ambient light."""
+        """Return the bound control with its ambient light scaled by a factor."""
         return self
 
     def later(self, seconds: float) -> Control:
-        """Return the bound control as it is so many seconds later, where it knows a
-        time; else itself.
-        """
+        """Return the control at a later time; itself if it does not depend on time."""
         return self
 
     @property
@@ -679,21 +695,23 @@ class Control:
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return what the values do to the scene, by differentiable torch operations;
-        see `inputs`.
+        """Return what the values do to the scene, by differentiable torch operations.
+
+        See `inputs`.
         """
         return {}
 
     def inputs(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        """Map a slice (d,) of u to named scene inputs, by differentiable torch
-        operations, on the device of u.
+        """Map a slice of u to scene inputs by name.
+
+        By differentiable torch operations, on the device of u.
 
         Args:
             u: (d,) in [0, 1].
-            so_far: inputs of the controls before this one; only names in `refines` may
-                be returned again.
+            so_far: inputs of the controls before this one; only names in `refines`
+                may be returned again.
         """
         return self.scene_inputs(self.values(u), so_far)
 
@@ -714,9 +732,7 @@ class Control:
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return further values worth storing with a configuration, by name without the
-        instance's.
-        """
+        """Return further values to store, by name without the instance's."""
         return {}
 
     def describe(
@@ -748,8 +764,9 @@ class Control:
         return described
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the numbers of the configuration by parameter, in its unit, (k,) or
-        without dimensions, as differentiable functions of u; names have none.
+        """Return the numbers of a configuration by parameter; names are left out.
+
+        Each is (k,) or (), in the parameter's unit, and differentiable in u.
         """
         values = self.values(u)
         declared = [slot.parameter for slot in self.slots]
@@ -761,37 +778,41 @@ class Control:
         return {name: values[name] for name in named}
 
     def printed(self, u: Tensor) -> Tensor | None:
-        """Return the searched colours that a printer would print, (h, w, 3)
-        display-referred sRGB in [0, 1], as a differentiable function of u; where only
-        some are searched (h, w, 4), with 1 for these and 0 for others; None without.
+        """Return the searched colors that a printer would print; None without any.
+
+        Returns:
+            (h, w, 3) display-referred sRGB in [0, 1], differentiable in u. Where
+                only some are searched (h, w, 4), with 1 for these and 0 for others.
         """
         return None
 
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return pictures worth keeping; see `artifacts`."""
+        """Return images worth storing; see `artifacts`."""
         return {}
 
     def artifacts(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB
-        in [0, 1]; see `describe`.
+        """Return images worth storing, by file stem.
+
+        Each is (h, w, 3), display-referred sRGB in [0, 1]. Arguments as for `describe`.
         """
         return self.kept_pictures(self.values(u.detach()), so_far)
 
     def kept_files(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files worth keeping; see `files`."""
+        """Return other files worth storing; see `files`."""
         return {}
 
     def files(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, bytes]:
-        """Return other files worth keeping, by name with ending: a mesh as PLY, say;
-        see `describe`.
+        """Return other files worth storing, by name with suffix, such as a mesh as PLY.
+
+        Arguments as for `describe`.
         """
         return self.kept_files(self.values(u.detach()), so_far)
 
@@ -837,8 +858,11 @@ def measure(value: Tensor | float, unit: str) -> Value:
 
 
 def changed(name: str, change: Tensor) -> dict[str, Value]:
-    """Say a change of searched colours, display-referred: the largest, and the root of
-    the mean square.
+    """Describe a change of searched colors: the largest, and the root mean square.
+
+    Args:
+        name: of the control.
+        change: any shape, display-referred.
     """
     root_mean_square = change.square().mean().sqrt()
     return {
@@ -848,7 +872,5 @@ def changed(name: str, change: Tensor) -> dict[str, Value]:
 
 
 def file_name(name: str) -> str:
-    """Return a control's name as it stands in names of files: texture@chair of
-    texture:chair.
-    """
+    """Return a control's name as file names have it: texture@chair of texture:chair."""
     return name.replace(":", "@")

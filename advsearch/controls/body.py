@@ -79,6 +79,12 @@ class BodyControl(Control):
         return str(asked) if asked in clips else clips[number]
 
     def fit(self) -> None:
+        """Check the parameters and the clip against the rig of the mesh.
+
+        Raises:
+            InputError: there is nothing to search.
+            UnknownNameError: the rig has no such parameter.
+        """
         known = [parameter.name for parameter in self.rig.parameters]
         for name in self.specs:
             if name not in known:
@@ -100,6 +106,7 @@ class BodyControl(Control):
         super().fit()
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with the value of the rig; not searched if the rig lacks it."""
         default = self.rig.defaults.get(parameter.name)
         if default is None:
             return replace(super().in_scene(parameter), search=None)

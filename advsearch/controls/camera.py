@@ -128,6 +128,11 @@ class CameraControl(Control):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Check the settings against the scene, and add the lens that they need.
+
+        Raises InputError: the scene has another camera, two settings are the same
+        thing, or its lens does not support one.
+        """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
                 f"`controls` {self.name}: moves along an orbit around the object, and "
@@ -180,8 +185,9 @@ class CameraControl(Control):
         return scene
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
-        """Whether the camera does so at the begin, the middle and the end of all its
-        ranges.
+        """Return whether the camera always drives against the traffic.
+
+        That is at the lower end, the center and the upper end of all its ranges.
         """
         control = self.bind(scene)
         configurations = (
@@ -198,6 +204,7 @@ class CameraControl(Control):
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with the default and the range of the scene's own camera."""
         parameter = measured_in(
             super().in_scene(parameter), self.scene.object.metres is not None
         )
@@ -245,6 +252,7 @@ class CameraControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the camera's pose, lens, focus, shift and exposure."""
         scene = self.scene
         fov = values["fov"]
         if "focal_length" in self.specs:
@@ -279,7 +287,7 @@ class CameraControl(Control):
         return inputs
 
     def _numbers(self, model: CameraModel, values: Values, fov: Tensor) -> Tensor:
-        """The numbers (17,) of the camera's model."""
+        """Return the numbers (17,) of the camera's model."""
         numbers = {name: torch.tensor(value) for name, value in model.values.items()}
         if not model.name:
             aspect = self.scene.aspect
@@ -296,8 +304,9 @@ class CameraControl(Control):
         return torch.stack([numbers[name].to(fov) for name in NUMBERS])
 
     def _described(self) -> SceneDescription:
-        """The scene with a fixed lens, for which the distance is worked out as for the
-        same setting.
+        """Return the scene with the field of view that was set.
+
+        The distance is worked out as for the same setting.
         """
         fov = self.specs.get("fov")
         focal_length = self.specs.get("focal_length")
@@ -310,6 +319,7 @@ class CameraControl(Control):
         return self.scene
 
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
+        """Return the pose (4, 4) on the orbit, at a distance () in object sizes."""
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
         elevation = torch.deg2rad(values["elevation"])
         roll = torch.deg2rad(values["roll"])
@@ -344,8 +354,9 @@ class CameraControl(Control):
 
 
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
-    """Return a parameter of the camera as it is around an object that has a size in
-    metres, or has none.
+    """Return a parameter in the unit of lengths that a scene has.
+
+    That is object sizes around an object without a size in metres.
     """
     return (
         replace(parameter, unit="object sizes")
@@ -355,5 +366,5 @@ def measured_in(parameter: Parameter, metres: bool) -> Parameter:
 
 
 def _fov_of(focal_length: Tensor) -> Tensor:
-    """The field of view, degrees, of a lens of a focal length in millimetres."""
+    """Return the field of view, degrees, of a lens of a focal length in millimetres."""
     return torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / focal_length))

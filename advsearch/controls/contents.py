@@ -6,7 +6,8 @@ and Mulla 2014, arXiv 1511.04463, section 2) marks the inside; rays from its axi
 the wall. Colours are in linear light (Kubelka and Munk 1931):
 
     K / S = sum(p_i K_i) / sum(p_i S_i),   milky coffee = 1 + K/S - sqrt((K/S)^2 + 2 K/S)
-    color = opacity * milky coffee + (1 - opacity) * vessel * tint of water,   opacity = 1 - exp(-DENSITY (1 - water))
+    color = opacity * milky coffee + (1 - opacity) * vessel * tint of water
+    opacity = 1 - exp(-DENSITY (1 - water))
 
 Proportions add up to one: the two that are free are cut off a stick of length one in
 turn, each from what is left.
@@ -305,6 +306,10 @@ class ContentsControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Find the bounds of each proportion.
+
+        Raises InputError: they cannot add up to 1.
+        """
         super().__init__(name, **settings)
         # of every ingredient: as set; free if not set and searched; or what the others
         # leave

@@ -4,7 +4,8 @@ it is, and its colour.
 Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the
 map is resampled by torch:
 
-    map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
+    map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1]
+    rotation / 360 * columns = k + f
 
 `harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
 2001, section 3), 9 coefficients for each colour channel as multiples of the map's mean
@@ -87,7 +88,7 @@ class EnvironmentControl(Control):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """The parameters, with the files that `which` names among its options."""
+        """Return the parameters, with the files that `which` names among its options."""
         which, *others = cls.parameters
         given = settings.get("which") if isinstance(settings, Mapping) else None
         given = given.get("choices") if isinstance(given, Mapping) else given
@@ -117,8 +118,10 @@ class EnvironmentControl(Control):
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """An environment that is fixed is the scene's; so is the first of several where
-        these are files, and the scene's own is none of them.
+        """Take a fixed environment for the scene's own.
+
+        So is the first of several where these are files, and the scene's own is none of
+        them.
         """
         spec = self.specs.get("which")
         allowed = self.allowed("which", OWN_MAP)
@@ -148,8 +151,9 @@ class EnvironmentControl(Control):
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Of `which`, the scene's own environment, by its name where only that is
-        allowed.
+        """Return a parameter; the default of `which` is the scene's own environment.
+
+        It has its name where only that is allowed.
         """
         if parameter.name != "which":
             return super().in_scene(parameter)
@@ -169,7 +173,8 @@ class EnvironmentControl(Control):
         return self._own_name(self.scene) or self.scene.environment_spec
 
     def _own_name(self, scene: SceneDescription) -> str | None:
-        """What the scene's own environment is called among those that can be chosen;
+        """Return the name of the scene's own environment among the options.
+
         None if it is none of them.
         """
         return next(
@@ -187,6 +192,7 @@ class EnvironmentControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the map (H, W, 3) of linear radiance."""
         name = self.own[0].options[int(values["which"])]
         device = values["rotation"].device
         own = name == OWN_MAP or _is_own(name, self.scene)
@@ -209,7 +215,7 @@ def _is_file(name: Number) -> bool:
 
 
 def _is_own(name: Number, scene: SceneDescription) -> bool:
-    """Whether an environment is the scene's own."""
+    """Return whether an environment is the scene's own."""
     own = scene.environment
     if own is None or not _is_file(name):
         return (
@@ -223,8 +229,9 @@ def _is_own(name: Number, scene: SceneDescription) -> bool:
 
 
 def _loaded(name: str) -> EnvironmentAsset:
-    """An environment by its name, or from a file, which is read again when it has
-    changed.
+    """Return an environment by its name or from a file.
+
+    A file is read again when it has changed.
     """
     if not _is_file(name):
         return library.load_environment(name)
@@ -242,8 +249,10 @@ def _read(place: str, name: str, *version: int) -> EnvironmentAsset:
 
 @lru_cache(maxsize=64)
 def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """The scene's own map, or another in its own size, as bright as keeps the picture's
-    exposure; the ground stays of the same kind.
+    """Return the scene's own map, or another one, (H, W, 3) linear radiance.
+
+    Another one is as bright as keeps the exposure of the image; the ground stays of the
+    same kind.
     """
     own = scene.environment_for("the environment")
     if asset is None:
@@ -254,8 +263,9 @@ def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
 
 
 def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Turn a map (H, W, 3) about the vertical as `environment.rotation` does, by linear
-    resampling of its columns.
+    """Rotate a map (H, W, 3) about the vertical by linear resampling of its columns.
+
+    As `environment.rotation` does.
 
     Periodic and differentiable in both arguments; exact at whole columns.
     """
@@ -271,8 +281,11 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
 
 
 def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
-    """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the
-    map `like` (H, W, 3).
+    """Return light (H, W, 3) from 9 spherical-harmonic coefficients a channel.
+
+    Args:
+        coefficients: (27,), multiples of the map's mean.
+        like: the map (H, W, 3).
     """
     height, width = like.shape[:2]
     basis = real_harmonics(height, width).to(coefficients.device)

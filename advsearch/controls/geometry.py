@@ -1,8 +1,12 @@
 """The `geometry` control: a smooth change of the object's shape, at most so far.
 
-    modes          d = sum_k a_k m_k,  a = 2 u - 1             m_k: the smoothest displacement fields of the mesh
-    large-steps    d = g R (I + lambda L)^-2 (2 u - 1)         a push for each vertex, spread out over its surroundings
-    offsets        epsilon s(d) d                              s: one factor that keeps the mesh whole
+    modes          d = sum_k a_k m_k,  a = 2 u - 1
+    large-steps    d = g R (I + lambda L)^-2 (2 u - 1)
+    offsets        epsilon s(d) d
+
+The m_k are the smoothest displacement fields of the mesh. In the form large-steps each
+vertex has a push, which is spread out over its surroundings. s is one factor that keeps
+the mesh whole.
 
 No vertex moves by more than epsilon, no face turns over and no wall meets the other,
 for any u. A mode varies slowly over SPACE, so that close walls move together: diffusion
@@ -70,6 +74,7 @@ class Body:
     """A mesh whose seams are welded: what a displacement acts on."""
 
     def __init__(self, mesh: Mesh) -> None:
+        """Weld the seams of a mesh, and find its walls."""
         self.index, count = welded(mesh)  # (V,) the position of each vertex
         self.places = np.zeros((count, 3))  # distinct vertex positions
         self.places[self.index] = mesh.vertices
@@ -244,11 +249,13 @@ def _without_rotation(
 
 
 class Preconditioner:
-    """Spreads pushes over the neighbourhood of a welded mesh and takes rigid motions
-    out: `d = R (I + lambda L)^-2 p`.
+    """Spreads pushes over the neighborhood of a welded mesh: `R (I + lambda L)^-2 p`.
+
+    Rigid motions are taken out.
     """
 
     def __init__(self, solid: Body) -> None:
+        """Factorise the system, and compute the rigid motions."""
         count = len(solid.places)
         laplacian, mean_length = _wall_laplacian(solid)
         strength = (SMOOTHING_LENGTH * solid.extent / mean_length) ** 2
@@ -330,6 +337,7 @@ class Limits:
     """
 
     def __init__(self, solid: Body, epsilon: float) -> None:
+        """Compute what each bound needs of the mesh."""
         self.epsilon = epsilon
         corners = solid.places[solid.faces]
         first = corners[:, 1] - corners[:, 0]
@@ -507,6 +515,7 @@ class GeometryControl(Control):
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
+        """Return how far vertices move, and how much the thinnest wall has lost."""
         offsets = self.offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {

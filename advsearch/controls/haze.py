@@ -56,6 +56,7 @@ class HazeControl(Control):
     )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with the value of the scene's own haze, if it has one."""
         own = _haze_of(self.scene)
         default = parameter.default
         if parameter.name != "density":
@@ -82,6 +83,7 @@ class HazeControl(Control):
         return 0.0 if _haze_of(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add a ball of haze, or take over the scene's own."""
         if (own := _haze_of(scene)) is not None:
             renamed = replace(own, name=self.name)
             return replace(
@@ -104,7 +106,7 @@ class HazeControl(Control):
 
 
 def _haze_of(scene: SceneDescription) -> parts.HazePart | None:
-    """The haze that a scene comes with."""
+    """Return the haze that a scene comes with."""
     return next(
         (
             part

@@ -39,6 +39,7 @@ def _per_dot(
     *,
     log: bool = False,
 ) -> Parameter:
+    """Return a parameter with one number for each dot."""
     return Parameter(
         name,
         (None,),

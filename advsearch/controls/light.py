@@ -5,7 +5,8 @@ Power is in multiples of the irradiance `E` with which a white surface (reflecta
 gets the display value `LIT_WHITE`. A lamp of power p and linear colour c puts `p c E /
 d^2` on a surface that faces it at distance d:
 
-    point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
+    point              intensity I = p c E
+    ball of radius r   radiance L = p c E / (pi r^2)
 
 The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity
 and Realistic Image Synthesis, section 2.4), so that size changes how soft the shadows
@@ -40,8 +41,9 @@ about as bright as the environment.
 
 
 def metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's
-    metered gain, in scene units.
+    """Return the irradiance that gives a white surface `LIT_WHITE`, in scene units.
+
+    At the scene's metered gain.
     """
     return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
 
@@ -49,6 +51,7 @@ def metered_irradiance(scene: SceneDescription) -> float:
 def _place(
     name: str, low: float, high: float, default: float, description: str
 ) -> Parameter:
+    """Return a parameter for a coordinate of the lamp."""
     return Parameter.moving(
         ("differences",),
         name,
@@ -135,6 +138,7 @@ class LightControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return where the lamp is, and how bright."""
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
             color.combine_channels(values)

@@ -51,9 +51,11 @@ BLEND = 20.0
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material: the side of a tile in object sizes, the surface beside its
-    colour, and what draws the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred
-    sRGB, any overshoot clipped later.
+    """A named material.
+
+    The side of a tile in object sizes, the surface beside its colour, and what draws
+    the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot
+    clipped later.
     """
 
     name: str
@@ -82,8 +84,9 @@ def pattern(
 
 
 def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
-    """Gradient noise with a whole number of lattice cells across the tile; about -1 to
-    1, mean 0.
+    """Return gradient noise with whole lattice cells across the tile.
+
+    About -1 to 1, mean 0.
     """
     across, down = cells
     angle = np.random.Generator(np.random.PCG64(seed)).uniform(
@@ -109,7 +112,7 @@ def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
 
 
 def _clouds(at: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
-    """Octaves of noise, each twice as fine and half as strong; about -1 to 1."""
+    """Return octaves of noise, each twice as fine and half as strong; about -1 to 1."""
     total = np.zeros_like(at[0])
     for octave in range(octaves):
         total += 0.5**octave * _noise(
@@ -126,9 +129,10 @@ def _warped(at: Grid, cells: int, amount: float, seed: int) -> Grid:
 
 
 def _scattered(count: int, seed: int) -> Doubles:
-    """Points of a torus about as far from each other as they can be, irregular: (count,
-    2) in [0, 1). Best candidate sampling (Mitchell 1991): each point is the farthest
-    from those before it of a few random ones.
+    """Return irregular points of a torus, far from each other: (count, 2) in [0, 1).
+
+    Best candidate sampling (Mitchell 1991): each point is the farthest from those
+    before it of a few random ones.
     """
     generator = np.random.Generator(np.random.PCG64(seed))
     points = generator.random((1, 2))
@@ -145,8 +149,10 @@ def _scattered(count: int, seed: int) -> Doubles:
 def _cells(
     at: Grid, points: Doubles, count: int = 2
 ) -> tuple[Doubles, npt.NDArray[np.int64]]:
-    """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first,
-    and which points they are.
+    """Return the nearest points on the torus, nearest first.
+
+    Returns:
+        Distances (SIDE, SIDE, count), and indices of the points.
     """
     place = np.stack([at[0] % 1.0, at[1] % 1.0], axis=-1)
     distance, index = cKDTree(points, boxsize=1.0).query(
@@ -158,10 +164,18 @@ def _cells(
 def _turing(
     wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
 ) -> Doubles:
-    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and
-    again; after about ten rounds the pattern has settled. Wavelengths are in tiles,
-    along x and along y; unequal ones make stripes across the shorter. The bias is added
-    before saturation: stripes break up into spots away from 0.
+    """Return animal stripes or spots in [-1, 1].
+
+    Noise, band-passed and saturated again and again; after about ten rounds the pattern
+    has settled.
+
+    Args:
+        wavelength: along x and along y, in tiles; unequal ones make stripes across
+            the shorter.
+        bias: that is added before saturation: away from 0 stripes break up into
+            spots.
+        seed: of the noise.
+        rounds: number of steps.
     """
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
     radius = np.hypot(
@@ -176,7 +190,7 @@ def _turing(
 
 
 def _step(value: Doubles, edge: float, soft: float) -> Doubles:
-    """0 below the edge, 1 above it, with a smooth ramp `soft` wide."""
+    """Return 0 below the edge and 1 above it, with a smooth ramp `soft` wide."""
     share = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
@@ -186,14 +200,15 @@ def _color(code: str) -> Doubles:
 
 
 def _mix(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """From the first colour to the second; colours (3,) or (SIDE, SIDE, 3), shares
-    (SIDE, SIDE).
+    """Interpolate from the first color to the second.
+
+    Colors are (3,) or (SIDE, SIDE, 3), fractions (SIDE, SIDE).
     """
     return np.asarray(first + (second - first) * share[..., None])
 
 
 def _ramp(value: Doubles, *codes: str) -> Doubles:
-    """Colours evenly spaced over values from 0 to 1."""
+    """Interpolate colors that are evenly spaced over values from 0 to 1."""
     colors = np.stack([_color(code) for code in codes])
     stops = np.linspace(0.0, 1.0, len(codes))
     return np.stack(
@@ -211,6 +226,7 @@ def plain(at: Grid) -> Doubles:
 
 @pattern(0.6, roughness=0.45)
 def wood(at: Grid) -> Doubles:
+    """Paint year rings with fibres and pores."""
     x, y = at
     bend = 0.16 * _clouds(at, (2, 1), 2, 11) + 0.012 * _noise(at, (8, 3), 12)
     rings = 9.0 * (x + bend) + 0.25 * _noise(at, (5, 2), 17)
@@ -231,6 +247,7 @@ def wood(at: Grid) -> Doubles:
 
 @pattern(0.9, roughness=0.15)
 def marble(at: Grid) -> Doubles:
+    """Paint clouds with dark veins."""
     near = _warped(at, 2, 0.22, 21)
     far = _warped(near, 6, 0.03, 22)
     x, y = far
@@ -258,6 +275,7 @@ def marble(at: Grid) -> Doubles:
 
 @pattern(0.6, roughness=0.9, specular=0.2)
 def brick(at: Grid) -> Doubles:
+    """Paint a wall of bricks with mortar."""
     x, y = _warped(at, 12, 0.0035, 31)
     rows = 8
     columns = 4
@@ -285,6 +303,7 @@ def brick(at: Grid) -> Doubles:
 
 @pattern(0.45, roughness=0.95, specular=0.1)
 def fabric(at: Grid) -> Doubles:
+    """Paint a plain weave of two threads."""
     x, y = _warped(at, 6, 0.004, 41)
     count = 16
     across = x * count
@@ -315,6 +334,7 @@ def fabric(at: Grid) -> Doubles:
 
 @pattern(0.7, roughness=0.8, specular=0.2)
 def leopard(at: Grid) -> Doubles:
+    """Paint rosettes with dots between them."""
     place = _warped(_warped(at, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
     distance, index = _cells(place, points)
@@ -361,6 +381,7 @@ def checker(at: Grid) -> Doubles:
 
 @pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
 def rust(at: Grid) -> Doubles:
+    """Paint rust under flakes of paint."""
     place = _warped(at, 4, 0.06, 71)
     broad = 0.5 + 0.5 * _clouds(place, (3, 3), 5, 72)
     grain = _clouds(at, (48, 48), 3, 73)
@@ -381,8 +402,9 @@ def rust(at: Grid) -> Doubles:
 
 @pattern(0.5, roughness=0.9, specular=0.1)
 def grass(at: Grid) -> Doubles:
-    """Blades drawn one over the other, bent and lighter towards the tip; later ones lie
-    on top.
+    """Paint blades over each other, bent and lighter towards the tip.
+
+    Later ones lie on top.
     """
     generator = np.random.Generator(np.random.PCG64(81))
     count = 2600
@@ -424,6 +446,7 @@ def grass(at: Grid) -> Doubles:
 
 @pattern(0.5, roughness=0.85, specular=0.2)
 def elephant(at: Grid) -> Doubles:
+    """Paint skin with folds."""
     place = _warped(_warped(at, 3, 0.05, 91), 14, 0.012, 92)
     folds = np.zeros((SIDE, SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
@@ -454,8 +477,9 @@ def steel(at: Grid) -> Doubles:
 
 @cache
 def tile(name: str) -> Floats:
-    """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in
-    [0, 1]; do not change it.
+    """Return one tile of a pattern.
+
+    (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it.
     """
     line = (np.arange(SIDE) + 0.5) / SIDE
     across, down = np.meshgrid(line, line)
@@ -468,8 +492,7 @@ def tile(name: str) -> Floats:
 
 
 def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
-    """Return the texture that covers a mesh with a pattern at one scale all over,
-    whatever its texture coordinates.
+    """Return the texture that covers a mesh with a pattern at one scale.
 
     Every texel of the texture looks up the tile at its place on the object, seen along
     the three axes, weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3,
@@ -529,6 +552,7 @@ class MaterialControl(Control):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Check that the mesh has a principled surface. Raises InputError."""
         numbers = [name for name in NUMBERS if self._varies(name)]
         if self.mesh_in(scene).surface is not None and (
             numbers or self._names != (OWN,)
@@ -563,6 +587,7 @@ class MaterialControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the numbers of the surface, and its tinted base color."""
         which = (OWN, *PATTERNS)[int(values["which"])]
         material = self._own(which)
         inputs: dict[str, Tensor] = {}
@@ -588,6 +613,7 @@ class MaterialControl(Control):
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the texture, where the control changes it."""
         if not self._colours():
             return {}
         return {
@@ -605,8 +631,9 @@ class MaterialControl(Control):
         return self.allowed("which", OWN)
 
     def _varies(self, name: str) -> bool:
-        """Whether a parameter was set or is searched; otherwise it is the named
-        material's own.
+        """Return whether a parameter was set or is searched.
+
+        Otherwise it is the named material's own.
         """
         return name in self.specs or not self.asked
 

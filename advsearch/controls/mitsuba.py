@@ -56,6 +56,10 @@ class MitsubaControl(Control):
         )
 
     def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
+        """Yield one parameter for each number of what was set, with its spec.
+
+        Raises InputError: a color has a list of values.
+        """
         for number in self._numbers():
             whole = self.specs.get(number.key)
             if isinstance(whole, OneOf) and len(number.values) > 1:
@@ -91,6 +95,7 @@ class MitsubaControl(Control):
 
 
 def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
+    """Return the parameter of a number by Mitsuba's name for it."""
     return Parameter(
         key,
         (),
@@ -104,7 +109,7 @@ def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter
 
 
 def _channels(one: parts.PluginNumber) -> list[Parameter]:
-    """A parameter for each number."""
+    """Return a parameter for each number."""
     names = (
         [f"{one.key}.{channel}" for channel in color.CHANNELS]
         if len(one.values) > 1

@@ -6,7 +6,8 @@ are free, and what is around them stays. There the patch is pasted into pictures
 it lies on the surface, under the scene's light, and bends with it. It is part of the
 base colour, so that no outline moves and the adjoint is right.
 
-    base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
+    base color = (1 - m) base color + m linear(pixels at (a, b))
+    m = soft square in (a, b), on the front of the surface
 
 A place is where a ray from outside towards the middle of the object meets the surface;
 (a, b) are those in the tangent plane, unrolled along the direction in which the surface
@@ -153,6 +154,7 @@ class PatchControl(PictureControl):
     on_top = True
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Check that the settings of the pixels go together. Raises InputError."""
         super().__init__(name, **settings)
         pixels = self.specs.get("pixels")
         picture = self.chosen["picture"]
@@ -209,6 +211,10 @@ class PatchControl(PictureControl):
         )
 
     def fit(self) -> None:
+        """Prepare the painter, and start from the texture underneath.
+
+        Raises InputError: nothing is searched.
+        """
         super().fit()
         if not self.groups:
             raise InputError(
@@ -268,8 +274,11 @@ class PatchControl(PictureControl):
 
 
 def towards_camera(scene: SceneDescription) -> tuple[float, float]:
-    """Return azimuth (degrees) and height (0 to 1) of the place in the middle of the
-    object as the camera sees it.
+    """Return the side of the object that faces the camera.
+
+    Returns:
+        Azimuth in degrees, and height from 0 to 1, as the parameters of the
+            control.
     """
     middle, radius, half = _shape(scene.object.mesh)
     camera = geometry.camera_to_world(scene)[:3, 3]
@@ -301,9 +310,7 @@ def _shape(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A place for a patch: the texels that it may cover and their coordinates around
-    it.
-    """
+    """The texels that a patch may cover, and their coordinates around its middle."""
 
     texels: Tensor  # (N,) their numbers, row by row
     flat: Tensor  # (N, 2) their coordinates to the right and upwards, object sizes
@@ -312,13 +319,21 @@ class Spot:
 
 
 class Sticker:
-    """Paints a patch of `side` pixels into the object's base-colour map; the resting
-    numbers are those at the start.
+    """Paints a patch into the object's base-color map.
+
+    Args:
+        scene: with the object.
+        resting: azimuth, height, size and rotation at the start.
+        side: of the patch, pixels.
     """
 
     def __init__(
         self, scene: SceneDescription, resting: Mapping[str, float], side: int
     ) -> None:
+        """Prepare the object's map and its surface.
+
+        Raises InputError: its texture repeats.
+        """
         mesh = scene.object.mesh
         if mesh.repeats:
             raise InputError(
@@ -506,13 +521,20 @@ def _frame(normal: assets.Doubles, upwards: assets.Doubles) -> assets.Doubles:
 def unrolled(
     offsets: assets.Doubles, normals: assets.Doubles, frame: assets.Doubles
 ) -> tuple[assets.Doubles, assets.Doubles]:
-    """Return coordinates (N, 2) of points along a surface, to the right and upwards,
-    and normals' cosines (N,).
+    """Return the coordinates of points along a surface, and their normals' cosines.
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its
     arc is `R phi`, phi being the angle that the normal has turned. So the component
-    along the direction of turning is stretched by `phi / sin(phi)`. Offsets are (N, 3)
-    from the middle; the rows of `frame` are right, up and normal there.
+    along the direction of turning is stretched by `phi / sin(phi)`.
+
+    Args:
+        offsets: (N, 3) from the middle.
+        normals: (N, 3) at the points.
+        frame: rows right, up and normal in the middle.
+
+    Returns:
+        Coordinates (N, 2) to the right and upwards, and cosines (N,) with the
+            normal of the frame.
     """
     plane = offsets @ frame[:2].T
     tilt = normals @ frame[:2].T

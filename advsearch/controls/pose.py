@@ -63,6 +63,7 @@ class PoseControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the pose of the mesh, scaled and turned about its middle."""
         mesh = self.mesh_in(self.scene)
         base, vertices, floor = _standing(mesh, self.scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
@@ -84,9 +85,16 @@ class PoseControl(Control):
 
 @lru_cache(maxsize=16)
 def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
-    """Where a mesh stands before it is posed: from its own coordinates (4, 4), its
-    vertices (V, 3) there, their floor. `placed` is a mesh around the object as it came;
-    the object's own coordinates are those of the scene.
+    """Return where a mesh stands before it is posed.
+
+    Args:
+        mesh: that is posed.
+        placed: a mesh around the object as it came; None for the object, whose own
+            coordinates are those of the scene.
+
+    Returns:
+        The pose (4, 4) from its own coordinates, its vertices (V, 3) there, and
+            their lowest height.
     """
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0

@@ -88,8 +88,9 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Range:
-    """Every value from `low` to `high`; as its methods are told, the unit interval runs
-    over their logarithms.
+    """Every value from `low` to `high`.
+
+    As its methods are told, the unit interval runs over their logarithms.
     """
 
     low: float
@@ -119,8 +120,9 @@ class Range:
 
 @dataclass(frozen=True)
 class DrawnRange(Range):
-    """Values from `low` to `high`, the shares `least` to `most` of a distribution: its
-    quantiles, and what it is.
+    """Values from `low` to `high`, the shares `least` to `most` of a distribution.
+
+    Its quantiles, and what it is.
     """
 
     quantiles: Quantiles
@@ -165,8 +167,9 @@ Spec = Fixed | Range | OneOf
 
 
 def plain(given: object) -> object:
-    """Return numbers and arrays of numpy and torch, also in a list, as Python's, and
-    distributions as settings.
+    """Return numbers and arrays of numpy and torch, also in a list, as Python's.
+
+    Distributions are returned as settings.
     """
     given = as_setting(given)
     if isinstance(given, (list, tuple)):
@@ -349,6 +352,7 @@ def _is_list(given: object) -> TypeGuard[Sequence[Any]]:
 
 
 def _check_value(where: str, parameter: Parameter, given: object) -> Number:
+    """Return a value of a parameter. Raises InputError: it cannot have it."""
     if parameter.options:
         if not isinstance(given, str):
             raise InputError(
@@ -378,8 +382,9 @@ CLOSE = 1e-6  # relative difference up to which two values are the same
 
 
 def same(one: Number, other: Number, *, turns: bool = False) -> bool:
-    """Whether two values are the same, up to a rounding error and, of an angle that
-    turns, up to whole turns.
+    """Return whether two values are the same, up to a rounding error.
+
+    Angles that turn are the same up to whole turns.
     """
     if isinstance(one, str) or isinstance(other, str):
         return one == other
@@ -387,15 +392,17 @@ def same(one: Number, other: Number, *, turns: bool = False) -> bool:
 
 
 def apart(one: float, other: float, *, turns: bool = False) -> float:
-    """How far two numbers are from each other; angles that turn, the nearer way
-    around.
+    """Return how far two numbers are from each other.
+
+    Angles that turn, the nearer way around.
     """
     return abs(math.remainder(one - other, TURN) if turns else one - other)
 
 
 def nearest(value: float, low: float, high: float, *, turns: bool = False) -> float:
-    """Return the value in a range that is nearest to one, of an angle that turns the
-    nearest way around.
+    """Return the value in a range that is nearest to a value.
+
+    Of an angle that turns it is the nearest way around.
     """
     if turns:
         value = low + (value - low) % TURN
@@ -405,7 +412,7 @@ def nearest(value: float, low: float, high: float, *, turns: bool = False) -> fl
 
 
 def shown(value: Number) -> str:
-    """A value as it is written."""
+    """Return a value as it is written."""
     if isinstance(value, int) and not Parameter.is_number(value):
         return f"a whole number of {value.bit_length()} bits"
     return value if isinstance(value, str) else f"{value:g}"
@@ -413,8 +420,9 @@ def shown(value: Number) -> str:
 
 @dataclass(frozen=True)
 class Slot:
-    """One parameter in a bound control: as the scene has it, what it is set to, and
-    where its coordinates begin.
+    """One parameter in a bound control.
+
+    As the scene has it, what it is set to, and where its coordinates begin.
     """
 
     parameter: Parameter

@@ -1,12 +1,16 @@
 """The `sensor` control: what a camera's sensor and its processing do to the finished
 picture.
 
-    vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
-    light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
-    noise      light + sqrt(shot^2 light + read^2) n,    n standard normal, one draw for each pixel and channel
-    mosaic     of each pixel one channel is kept, in the pattern RGGB, the others are interpolated between neighbours
-    balance    red and blue times 2^red, 2^blue
-    file       the tone curve, then JPEG
+    vignetting  light / (1 + a r^2)^2, with r from the middle of the image, 1 in its
+                corners: cos^4 of the angle there
+    aberration  the red and the blue image are a little larger or smaller than the green
+                one (lateral)
+    noise       light + sqrt(shot^2 light + read^2) n, with n standard normal, one draw
+                for each pixel and channel
+    mosaic      of each pixel one channel is stored, in the pattern RGGB; the others are
+                interpolated between neighbors
+    balance     red and blue times 2^red, 2^blue
+    file        the tone curve, then JPEG
 
 Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise
 modeling and fitting for single-image raw-data, section II. Pattern: Bayer 1976, US
@@ -161,8 +165,9 @@ def through_sensor(
 
 
 def vignette(height: int, width: int, amount: Tensor) -> Tensor:
-    """Return the share of the light (H, W, 1) that comes through a lens, with `amount`
-    () missing in the corners.
+    """Return the fraction of the light (H, W, 1) that comes through a lens.
+
+    `amount` () is missing in the corners.
     """
     down, across = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
     corner = (height**2 + width**2) / 4.0
@@ -171,8 +176,9 @@ def vignette(height: int, width: int, amount: Tensor) -> Tensor:
 
 
 def aberrated(image: Tensor, amount: Tensor) -> Tensor:
-    """Return (H, W, 3) whose red is larger by a factor 1 + amount about the middle, and
-    whose blue is smaller.
+    """Return an image (H, W, 3) with lateral chromatic aberration.
+
+    Red is larger by a factor 1 + amount about the middle, blue is smaller.
     """
     height, width = image.shape[:2]
     down, across = torch.meshgrid(
@@ -191,8 +197,9 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
 
 
 def demosaiced(light: Tensor) -> Tensor:
-    """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others
-    from neighbours, bilinearly.
+    """Return an image (H, W, 3) after a Bayer mosaic (RGGB).
+
+    Each pixel keeps one channel, and gets the others from neighbors, bilinearly.
     """
     height, width = light.shape[:2]
     rows = torch.arange(height)[:, None] % 2

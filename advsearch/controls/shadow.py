@@ -1,9 +1,10 @@
 """The `shadow` control: a dark card between the strongest light and the object, out of
 the camera's sight.
 
-The card is a polygon around a place in the plane across the way to the light:
+The card is a polygon around a center, in the plane at a right angle to the light:
 
-    place = middle of the object + distance towards the light + size (x, y),     corner k = size radius_k at k / n turns
+    center = middle of the object + distance towards the light + size (x, y)
+    corner k = size radius_k at k / n turns
 
 It is a real card: how soft its shadow is follows from the light's size and its own
 distance. Where the camera would see it, it goes farther from the object, up to
@@ -134,6 +135,7 @@ class ShadowControl(Control):
     choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add the card, out of sight."""
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
         away = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
@@ -146,6 +148,7 @@ class ShadowControl(Control):
         )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter, with the direction of the strongest light as the default."""
         x, y, z = strongest_light(self.scene)[0]
         match parameter.name:
             case "radii":

@@ -52,16 +52,18 @@ NEARLY_NOTHING = 1e-12
 
 @cache
 def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the two models interpolate, see `sunsky_tables`; read once per
-    process and device.
+    """Return the tables that the two models interpolate, see `sunsky_tables`.
+
+    They are read once per process and device.
     """
     radiance, level, sun = mitsuba_data.sunsky_tables()
     return radiance.to(device), level.to(device), sun.to(device)
 
 
 def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
-    """Return the unit vector (3,) towards an azimuth and an elevation () in degrees; z
-    is up, azimuth 0 is +x.
+    """Return the unit vector (3,) towards an azimuth and an elevation, () in degrees.
+
+    z is up; azimuth 0 is +x.
     """
     phi = torch.deg2rad(azimuth)
     theta = torch.deg2rad(elevation)
@@ -75,10 +77,12 @@ def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) between whole turbidities by cubics with a
-    continuous derivative. The slope at a whole turbidity is that between its neighbours
-    (Catmull and Rom 1974), one-sided at the ends. The authors interpolate linearly, so
-    that the derivative jumps at whole turbidities, the default of 3 among them.
+    """Interpolate a table (10, ...) between whole turbidities.
+
+    By cubics with a continuous derivative: the slope at a whole turbidity is that
+    between its neighbors (Catmull and Rom 1974), one-sided at the ends. The authors
+    interpolate linearly, so that the derivative jumps at whole turbidities, the default
+    of 3 among them.
     """
     below = min(8, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below
@@ -95,8 +99,9 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 
 
 def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
-    """Return the sun's irradiance (3,) on a surface that faces it, in the unit of the
-    sky's radiance times steradian.
+    """Return the sun's irradiance (3,) on a surface that faces it.
+
+    In the unit of the sky's radiance times steradian.
 
     A piece of the model is a cubic in the elevation above the piece's beginning. A term
     `cos(psi)^j` of the limb's darkening has the mean `2 / (j + 2)` over the disk.
@@ -117,11 +122,13 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is
-    the maps'.
+    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1].
+
+    Its device is the maps'.
     """
 
     def __init__(self, ground: Tensor) -> None:
+        """Compute the directions and solid angles of the texels above the horizon."""
         self.ground = ground
         upper = ROWS // 2
         elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
@@ -139,9 +146,15 @@ class Sky:
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
     def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon
-        without the sun's disk. The sun is a unit vector (3,) towards it, its elevation
-        () in degrees, over 0, and the turbidity () in `TURBIDITIES`.
+        """Return the radiance of the sky above the horizon, without the sun's disk.
+
+        Args:
+            sun: unit vector (3,) towards the sun.
+            elevation: () of the sun in degrees, over 0.
+            turbidity: () in `TURBIDITIES`.
+
+        Returns:
+            (ROWS / 2, COLUMNS, 3).
         """
         a, b, c, d, e, f, g, i, h = self._interpolated(
             tables(sun.device)[0], elevation, turbidity
@@ -165,8 +178,9 @@ class Sky:
     def _interpolated(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...): quintic Bezier in the elevation's
-        cube root, linear in the others.
+        """Interpolate a table (10, 2, 6, 3, ...).
+
+        Quintic Bezier in the elevation's cube root, linear in the others.
         """
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
         weights = torch.stack(
@@ -179,8 +193,9 @@ class Sky:
         return torch.lerp(curves[0], curves[1], albedo)
 
     def disk(self, sun: Tensor) -> Tensor:
-        """Return the sun's shape (ROWS / 2, COLUMNS, 1): a smooth bump whose integral
-        over solid angle is 1.
+        """Return the sun's shape (ROWS / 2, COLUMNS, 1).
+
+        A smooth bump whose integral over solid angle is 1.
 
         `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that
         an adjoint that samples by radiance sees its whole motion.
@@ -194,9 +209,16 @@ class Sky:
     def __call__(
         self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel ()
-        of the irradiance on a surface that faces the sun, which stands at an azimuth ()
-        and an elevation (), over 0 and at most 90 degrees.
+        """Return the map of a sky, and the irradiance towards its sun.
+
+        Args:
+            azimuth: () of the sun, degrees.
+            elevation: () of the sun, over 0 and at most 90 degrees.
+            turbidity: () in `TURBIDITIES`.
+
+        Returns:
+            Linear radiance (ROWS, COLUMNS, 3); the mean channel () of the
+                irradiance on a surface that faces the sun.
         """
         sun = direction(azimuth, elevation)
         upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(
@@ -210,8 +232,9 @@ class Sky:
 
 
 def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
-    """Return the angle (...) in radians between unit vectors (..., 3) and (3,);
-    differentiable at 0 and 180 degrees.
+    """Return the angle (...) in radians between unit vectors (..., 3) and (3,).
+
+    Differentiable at 0 and 180 degrees.
     """
     half_sine = ((directions - towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
     half_cosine = (
@@ -295,8 +318,9 @@ class SkyControl(Control):
         return {"environment.data": self.radiance(values)}
 
     def radiance(self, values: Values) -> Tensor:
-        """Return the map (H, W, 3) of linear radiance at some values;
-        differentiable.
+        """Return the map (H, W, 3) of linear radiance at some values.
+
+        Differentiable.
         """
         numbers = values["azimuth"], values["elevation"], values["turbidity"]
         radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(
@@ -311,7 +335,8 @@ class SkyControl(Control):
 
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
-    """Return the sky over a ground of an sRGB colour: far away it is made of the same
-    as the ground plane.
+    """Return the sky over a ground of an sRGB colour.
+
+    Far away it is made of the same as the ground plane.
     """
     return Sky(color.srgb_to_linear(torch.tensor(ground)).to(device))

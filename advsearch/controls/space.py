@@ -26,8 +26,9 @@ VIEWS = 256
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Bound controls in the order of their slices. InputError: two instances have one
-    name.
+    """Bound controls in the order of their slices.
+
+    InputError: two instances have one name.
     """
 
     # at least none; an empty space renders the scene as it is
@@ -166,8 +167,9 @@ class Space:
         ]
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Apply what controls do to the finished picture (H, W, 3) sRGB, in their
-        order; differentiable in both.
+        """Apply what controls do to the finished image (H, W, 3) sRGB, in their order.
+
+        Differentiable in both.
         """
         for control, part in zip(self.controls, u.split(self.sizes), strict=True):
             image = control.picture(part, image)
@@ -189,8 +191,9 @@ class Space:
         return described
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the searched colours that a printer would print, by control; see
-        `Control.printed`.
+        """Return the searched colours that a printer would print, by control.
+
+        See `Control.printed`.
         """
         printed = (
             (control.name, control.printed(part)) for control, part in self.slices(u)
@@ -198,8 +201,9 @@ class Space:
         return {name: colors for name, colors in printed if colors is not None}
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the numbers of a configuration by parameter ("pose.yaw"); see
-        `Control.numbers`.
+        """Return the numbers of a configuration by parameter ("pose.yaw").
+
+        See `Control.numbers`.
         """
         return {
             f"{control.name}.{parameter}": value
@@ -209,8 +213,9 @@ class Space:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Seconds that the shutter is open, and that rows are read in, below 0 from the
-        bottom.
+        """Seconds that the shutter is open, and in which rows are read.
+
+        The latter are below 0 where rows are read from the bottom.
         """
         exposures = (control.exposure for control in self.controls)
         return max(
@@ -256,8 +261,9 @@ class Space:
         )
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a configuration, by the values that describe it, in the
-        place of the scene's environment; None if nothing does.
+        """Return the environment that lights a configuration in place of the scene's.
+
+        None if none does. `values` are those that describe the configuration.
         """
         for group in self.groups:
             if group.setting == ENVIRONMENT:

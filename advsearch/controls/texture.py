@@ -2,8 +2,10 @@
 ball around the original.
 
     texels     u = texel values, display-referred sRGB in [0, 1];   ||u - original||_p <= epsilon
-    palette    u = k colours in a ball around those of the original;   texel = original + sum_i w_i(texel) (u_i - c_i)
-    waves      u = (a + 1) / 2 per wave and channel;   texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
+    palette    u = k colors in a ball around those of the original
+               texel = original + sum_i w_i(texel) (u_i - c_i)
+    waves      u = (a + 1) / 2 per wave and channel
+               texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
 and reflectance = linear(texel). A bounded change of texture is REVAMP's and Athalye et
 al.'s (2018, arXiv 1707.07397, section 3). L2 is the plain Euclidean norm over all texel
@@ -336,8 +338,9 @@ class TextureControl(Control):
 
 
 class Painter(NamedTuple):
-    """One form of the control: a map from its slice of u to the n texels that it
-    paints, row by row.
+    """One form of the control.
+
+    A map from its slice of u to the n texels that it paints, row by row.
     """
 
     start: Tensor  # (d,) float32, the slice that gives the original

@@ -48,8 +48,9 @@ class MeshRig(Protocol):
         """Names of its animations."""
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex goes from the mesh's own, (V, 3) in its units;
-        differentiable.
+        """Return how far each vertex goes from the mesh's own, (V, 3) in its units.
+
+        Differentiable.
         """
 
     def measured(
@@ -60,9 +61,10 @@ class MeshRig(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh with one UV chart set: v = 0 is the BOTTOM row of the texture
-    image (the OBJ convention). UVs are in [0, 1], but for meshes of Mitsuba scenes,
-    whose textures may go on beyond their edges.
+    """A triangle mesh with one UV chart set.
+
+    V = 0 is the BOTTOM row of the texture image (the OBJ convention). UVs are in [0,
+    1], but for meshes of Mitsuba scenes, whose textures may go on beyond their edges.
     """
 
     vertices: Floats  # (V, 3) positions, z up, in the author's units
@@ -81,12 +83,11 @@ class Mesh:
 
     @property
     def repeats(self) -> bool:
-        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond
-        its edges.
-        """
+        """Whether its texture coordinates leave [0, 1], so that a texture repeats."""
         return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
 
     def __post_init__(self) -> None:
+        """Check shapes and values. Raises InputError."""
         count = len(self.vertices)
         for name, array, width in (
             ("vertices", self.vertices, 3),
@@ -115,8 +116,9 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Material:
-    """Parameters of the principled BSDF other than base colour; all in [0, 1] (Burley
-    2012, Disney principled).
+    """Parameters of the principled BSDF other than base colour.
+
+    All in [0, 1] (Burley 2012, Disney principled).
     """
 
     roughness: float = 0.5
@@ -125,8 +127,9 @@ class Material:
     clearcoat: float = 0.0
 
     def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
-        """Return the material with the settings over it whose names are `prefix` and
-        the attribute's.
+        """Return the material with some settings over it.
+
+        Their names are `prefix` and the attribute's.
         """
         given = {
             name: value
@@ -152,9 +155,11 @@ FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and
-    normal map are of the principled surface; a normal map is `(n + 1) / 2` of unit
-    normals along tangent (along u), normal x tangent and normal.
+    """A mesh and what it looks like.
+
+    Pictures have row 0 on top, at v = 1. Opacity and normal map are of the principled
+    surface; a normal map is `(n + 1) / 2` of unit normals along tangent (along u),
+    normal x tangent and normal.
     """
 
     name: str  # short, used in paths
@@ -177,8 +182,9 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAsset(Shape):
-    """The object a model should recognise. A None is what is not known, or does not
-    come from a file.
+    """The object a model should recognise.
+
+    A None is what is not known, or does not come from a file.
     """
 
     source: str = ""  # where it came from, for messages and logs
@@ -199,8 +205,9 @@ class ObjectAsset(Shape):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how it was read: the up axis where that was
-        guessed, and the warnings.
+        """What a user should know of how it was read.
+
+        The up axis where that was guessed, and the warnings.
         """
         guessed = (self.up.reason,) if self.up is not None and self.up.reason else ()
         return (*guessed, *self.warnings)
@@ -208,9 +215,10 @@ class ObjectAsset(Shape):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentAsset:
-    """A light from everywhere: an equirectangular map. Row 0 looks straight up, and
-    columns run as in a photograph (a file's own order). Raises InputError: a texel is
-    negative, NaN or infinite.
+    """A light from everywhere: an equirectangular map.
+
+    Row 0 looks straight up, and columns run as in a photograph (a file's own order).
+    Raises InputError: a texel is negative, NaN or infinite.
     """
 
     name: str  # short, used in paths
@@ -230,6 +238,7 @@ class EnvironmentAsset:
     place: Any = None
 
     def __post_init__(self) -> None:
+        """Check the radiance. Raises InputError: a texel is negative, NaN or infinite."""
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
         if bad.any():
             row, column = np.unravel_index(int(bad.argmax()), bad.shape)
@@ -245,8 +254,9 @@ class EnvironmentAsset:
 
 
 def face_vectors(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3), twice as long as their areas, out of triangles (F, 3, 3),
-    counter-clockwise.
+    """Return the outward vectors (F, 3) of triangles (F, 3, 3), counter-clockwise.
+
+    They are twice as long as the areas.
     """
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -260,27 +270,23 @@ def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
 
 
 def footing(points: Doubles) -> tuple[Doubles, float]:
-    """Return the place (3,) in the middle below some points (N, 3), and their largest
-    extent.
-    """
+    """Return the point (3,) in the middle below points (N, 3), and their extent."""
     low = points.min(axis=0)
     high = points.max(axis=0)
     return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
 
 
 def grouped(numbers: Ints) -> list[Ints]:
-    """Return, for each number from 0 to the largest of some (N,), the places at which
-    it stands, rising.
-    """
+    """Return the rising indices (n,) of each group, from 0 to the largest one."""
     return np.split(
         np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1]
     )
 
 
 def normalised(mesh: Mesh) -> Mesh:
-    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and
-    centred in x and y. Raises InputError: all vertices coincide, so there is no size to
-    normalise.
+    """Return the mesh with its largest extent 1, standing on z = 0 and centered.
+
+    Raises InputError: all vertices coincide, so there is no size to normalise.
     """
     vertices = mesh.vertices.astype(np.float64)
     origin, size = footing(vertices)
@@ -451,10 +457,16 @@ def on_roads(asset: ObjectAsset) -> bool:
 
 
 def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with its size in metres, where it is told: by `size`, of its
-    longest side in metres, by `unit`, one of `UNITS`, of its file, or by itself. Raises
-    InputError: both are given, `size` is out of range, or the object comes from no file
-    that could have a unit.
+    """Return an object with its size in metres, if it is known.
+
+    Args:
+        asset: the object.
+        size: its longest side in metres.
+        unit: of its file, one of `UNITS`.
+
+    Raises:
+        InputError: both are given, the size is out of range, or the object comes
+            from no file that could have a unit.
     """
     if size is None and unit is None:
         return asset
@@ -487,9 +499,12 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
 
 
 def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
-    """Return what is said where an object's size is unlike that of a thing of its name,
-    or is not known: `asked` tells that its user gave its size, `laid` that something in
-    the scene has one in metres, such as the road.
+    """Return a remark where an object's size is unusual for its name, or unknown.
+
+    Args:
+        asset: the object.
+        asked: whether its user gave its size.
+        laid: whether something in the scene is in metres, such as the road.
     """
     kind = next(
         (

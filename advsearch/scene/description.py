@@ -151,8 +151,9 @@ class SceneDescription:
         return replace(self, parts=(*self.parts, part))
 
     def with_values(self, **given: float | None) -> SceneDescription:
-        """Return the scene with some settings replaced; dots in their names are written
-        as two underscores.
+        """Return the scene with some settings replaced.
+
+        Dots in their names are written as two underscores.
         """
         return replace(
             self,
@@ -168,8 +169,9 @@ class SceneDescription:
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
-        """Return a bundled object or one from a mesh file. Raises InputError: there is
-        none, or it can't be used.
+        """Return a bundled object or one from a mesh file.
+
+        Raises InputError: there is none, or it can't be used.
         """
         return _load_object(spec, None, None)
 
@@ -275,9 +277,7 @@ class SceneDescription:
 
     @property
     def azimuth_zero(self) -> float:
-        """The direction from the object, in degrees from +x, in which the camera of
-        azimuth 0 stands.
-        """
+        """Direction from the object to the camera of azimuth 0, degrees from +x."""
         return 180.0 if self.is_in_lane and self.object.drives else 0.0
 
     @property
@@ -287,8 +287,9 @@ class SceneDescription:
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name, as the settings have it; the one under test is
-        `OBJECT`.
+        """Every mesh by name, as the settings have it.
+
+        The one under test is `OBJECT`.
         """
         around = {
             name: geometry.moved_part(part, self.values)
@@ -329,6 +330,7 @@ class SceneDescription:
         ) or self._has("normalmap", "bumpmap")
 
     def _has(self, *kinds: str) -> bool:
+        """Return whether a Mitsuba plugin of one of these kinds is in the scene."""
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
         ]
@@ -374,9 +376,7 @@ class SceneDescription:
 
     @property
     def metres(self) -> float:
-        """What lengths in metres are to be divided by to be in object sizes: the
-        object's size in metres, or 1.
-        """
+        """Metres of one object size, or 1 where they are not known."""
         return self.object.metres or 1.0
 
     @property
@@ -386,8 +386,9 @@ class SceneDescription:
 
     @property
     def environment_name(self) -> str:
-        """How the environment was asked for, or else its own name; `NO_MAP` where there
-        is none.
+        """How the environment was asked for, or else its own name.
+
+        `NO_MAP` where there is none.
         """
         return self.environment_spec or (
             NO_MAP if self.environment is None else self.environment.name
@@ -395,9 +396,7 @@ class SceneDescription:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how object and environment were read, and what
-        controls name.
-        """
+        """What a user should know of how the scene was read, and remarks of controls."""
         lit = () if self.environment is None else self.environment.warnings
         seen = () if self.camera_model is None else self.camera_model.notes
         size = doubts(self.object, asked=self.size is not None, laid=paved(self))
@@ -418,8 +417,9 @@ class SceneDescription:
         )
 
     def environment_for(self, who: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map. Raises InputError:
-        the scene has none.
+        """Return the environment for what cannot do without a map.
+
+        Raises InputError: the scene has none.
         """
         if self.environment is None:
             check_one_environment(self.parts, who)
@@ -436,20 +436,22 @@ class SceneDescription:
 
     @property
     def metered_irradiance(self) -> float:
-        """Irradiance for which the exposure of its images is metered, in scene
-        units.
-        """
+        """Irradiance that the exposure of images is metered for, in scene units."""
         return METERED_WHITE * math.pi / (WHITE * metered_gain(self))
 
     def list_environment_light(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Return unit directions (N, 3) to the environment's light, solid angles (N,),
-        and radiance times these.
+        """Return the light of the environment as directional lights.
+
+        Returns:
+            Unit directions (N, 3) to the light, solid angles (N,), and radiance
+                times these.
         """
         return arriving(self)
 
     def ground_height(self, place: Doubles) -> float:
-        """Return how high the ground lies at a place (2,), object sizes: road,
-        pavement, table or floor; or 0.
+        """Return how high the ground lies at a place (2,), object sizes.
+
+        Road, pavement, table or floor; or 0.
         """
         return ground_height(self, place)
 
@@ -459,8 +461,9 @@ class SceneDescription:
         return geometry.standing(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
-        """Return a setting that always has a value; of the field of view, that of the
-        camera in use.
+        """Return a setting that always has a value.
+
+        Of the field of view, that of the camera in use.
         """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
             return self.cameras[self.camera].larger_fov(self.aspect)
@@ -471,9 +474,7 @@ class SceneDescription:
 
     @property
     def given_values(self) -> dict[str, float | str]:
-        """The settings that were asked for, as they are written: a choice by its
-        name.
-        """
+        """The settings that were requested, as users write them: a choice by its name."""
         asked: dict[str, float | str] = {}
         for name in self.given & self.values.keys():
             value = self.values[name]
@@ -488,10 +489,11 @@ class SceneDescription:
 
     @property
     def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table,
-        or nothing. Where `ground.kind` is not given, it does so for a photographed
-        environment, unless a table is described or the environment may be hidden behind
-        a colour, which would hide everything above the horizon alone.
+        """The ground that shows the environment's photograph; None where it is a table.
+
+        Where `ground.kind` is not set, a photographed environment has such a ground,
+        unless a table is described or the environment may be hidden behind a color,
+        which would hide everything above the horizon alone.
         """
         own = self.environment
         kind = self.values.get("ground.kind")
@@ -513,9 +515,7 @@ class SceneDescription:
 
     @property
     def capture_height(self) -> float:
-        """Height above the floor from which the environment's photograph was taken,
-        object sizes.
-        """
+        """Height above the floor of the photograph's camera, object sizes."""
         height = self.values.get("ground.height")
         if height is None and self.object.metres is None:
             return settings.PHOTOGRAPHED_FROM
@@ -533,8 +533,9 @@ class SceneDescription:
 
     @property
     def gain(self) -> float:
-        """Factor from scene radiance to display-linear values: the metered exposure
-        times `camera.exposure`.
+        """Factor from scene radiance to display-linear values.
+
+        The metered exposure times `camera.exposure`.
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas
@@ -713,8 +714,9 @@ def _check_material_settings(asset: ObjectAsset, given: settings.Given) -> None:
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named. Raises
-    UnknownNameError: it has not.
+    """Check that a scene has the meshes whose settings are named.
+
+    Raises UnknownNameError: it has not.
     """
     for name in names:
         mesh = settings.mesh_of(name)
@@ -728,9 +730,13 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
 
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
-    """Refuse an environment, or what needs one that is a map of ours, asked for by
-    `who`, as it is written, beside one that a Mitsuba scene has of its own among its
-    parts. Raises InputError: there are two.
+    """Check that a Mitsuba scene has no environment of its own among its parts.
+
+    Raises InputError: it has, and another is requested.
+
+    Args:
+        parts: of the scene.
+        who: the setting that needs a map of ours, as users write it.
     """
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
@@ -743,8 +749,9 @@ def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
-    """Refuse what contradicts a ground that shows the environment's photograph. Raises
-    InputError: there is no photograph, or a table is described beside it.
+    """Check the settings of a ground that is no table.
+
+    Raises InputError: there is no photograph to show, or a table is described as well.
     """
     kind = given.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
@@ -799,8 +806,9 @@ def _load_object(
 
 
 def is_path(spec: str | Path) -> bool:
-    """A spec with a folder or a file ending is a path; a bare word is a bundled
-    name.
+    """Return whether a spec is a path: it has a directory or a suffix.
+
+    A bare word is the name of something bundled.
     """
     return (
         isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""

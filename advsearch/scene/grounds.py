@@ -36,15 +36,17 @@ Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
 
 
 class Photograph:
-    """The ground that shows an equirectangular map's photograph and catches what the
-    scene does to its light.
+    """The ground that shows the photograph of an equirectangular map.
+
+    It catches what the scene does to the light of the map.
 
     A photographed environment shows the floor that its camera stood on. That part of
     the map is projected from the height of the camera onto the plane z = 0, and the
     plane gets the reflectance that shows the photograph where
     nothing is in the way of the light:
 
-        reflectance(p) = pi map(from (0, 0, height) to p) / E,   E = irradiance of the map's upper half on the plane
+        reflectance(p) = pi map(from (0, 0, height) to p) / E
+        E = irradiance of the map's upper half on the plane
 
     A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' /
     E`: the photograph times what the scene leaves of the light, and adds to it. That is
@@ -96,9 +98,10 @@ class Photograph:
         )
 
     def reflectance(self, radiance: Tensor) -> Tensor:
-        """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light
-        comes from above. Differentiable; row 0 is the horizon, the last one is straight
-        down, and columns are those of the map.
+        """Return the plane's texture (h, W, 3) for a map of any size.
+
+        0 where no light comes from above. Differentiable; row 0 is the horizon, the
+        last one is straight down, and columns are those of the map.
         """
         rows = radiance.shape[0]
         at = torch.arange(self._first, self._rows, device=radiance.device) * (
@@ -131,8 +134,9 @@ def photograph_of(
 
 
 def irradiance(radiance: Tensor) -> Tensor:
-    """Return the irradiance (3,) of a map (H, W, 3) on an unshadowed horizontal
-    surface; differentiable.
+    """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
+
+    Differentiable.
     """
     rows, columns = radiance.shape[:2]
     edges = (
@@ -145,12 +149,12 @@ def irradiance(radiance: Tensor) -> Tensor:
 
 
 def paved(scene: SceneDescription) -> bool:
-    """Tell whether the object stands on a road, or on the ground of a place."""
+    """Return whether the object stands on a road, or on the ground of a place."""
     return any(part.is_ground for part in scene.around.values())
 
 
 def has_lanes(scene: SceneDescription) -> bool:
-    """Tell whether the object stands in a lane, where what faces +x drives along it."""
+    """Return whether the object stands in a lane, where what faces +x drives along it."""
     place = find_place(scene)
     return place is not None and place.file.lane_width is not None
 
@@ -161,9 +165,7 @@ CAR_CAMERA = 2.5
 
 
 def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
-    """Tell whether a camera of a pose (4, 4) drives in the object's lane towards its
-    front.
-    """
+    """Return whether a camera (4, 4) drives in the object's lane towards its front."""
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
     ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
@@ -188,9 +190,7 @@ def traffic_remark(scene: SceneDescription) -> str:
 
 
 def enclosed(scene: SceneDescription) -> bool:
-    """Tell whether so much stands around the object that light paths seldom leave the
-    scene.
-    """
+    """Return whether much stands around the object: light paths seldom leave the scene."""
     return any(part.laid and not part.is_ground for part in scene.around.values())
 
 
@@ -209,7 +209,8 @@ PLACES: Mapping[str, tuple[str, str | None]] = {
 
 
 def find_ground_kind(scene: SceneDescription) -> str | None:
-    """Return the kind of ground that a scene's environment and its settings ask for;
+    """Return the kind of ground that a scene's environment and its settings ask for.
+
     None where they name none.
     """
     requested = scene.values.get("ground.kind")
@@ -230,8 +231,9 @@ def find_place(scene: SceneDescription) -> Place | None:
 
 
 def load_requested_place(scene: SceneDescription) -> Place | None:
-    """Return the place that a scene's environment and its settings ask for; None where
-    they ask for none.
+    """Return the place that a scene's environment and its settings ask for.
+
+    None where they ask for none.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
@@ -304,8 +306,9 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of the place in an environment's picture, in the lengths of the
-    camera's distance.
+    """What is known of the place in an environment's picture.
+
+    In the lengths of the camera's distance.
     """
 
     # above the ground from which it was taken; infinite where nothing near is shown
@@ -316,9 +319,11 @@ class Surroundings:
 
 
 class CameraView(NamedTuple):
-    """How a camera looks: its place around the object and where it looks to, degrees of
-    azimuth; its horizontal distance and its height above the ground; and how far below
-    the horizon its picture ends, degrees.
+    """How a camera looks.
+
+    Its place around the object and where it looks to, degrees of azimuth; its
+    horizontal distance and its height above the ground; and how far below the horizon
+    its picture ends, degrees.
     """
 
     azimuth: float
@@ -329,10 +334,10 @@ class CameraView(NamedTuple):
 
 
 def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
-    """Return up to which horizontal distance from the object, and up to which height
-    above the ground, an environment's picture fits a camera that looks as this one does
-    (its own distance does not count): in the lengths of `environment`, infinite without
-    a bound, 0 where it fits nowhere. See above.
+    """Return up to which distance and height a picture fits a camera.
+
+    In the lengths of `environment`, infinite without a bound, 0 where it fits nowhere;
+    see above. The camera's own distance does not count.
     """
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
@@ -357,8 +362,9 @@ def _reach(area: Box | float, azimuth: float) -> float:
 
 
 def surroundings_of(scene: SceneDescription) -> Surroundings | None:
-    """Return what is known of the place in a scene's environment; None where nothing of
-    it has to fit a ground.
+    """Return what is known of the place in a scene's environment.
+
+    None where nothing of it has to fit a ground.
     """
     lit = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -384,9 +390,7 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
 
 
 def bound_ground(place: Place) -> Box:
-    """Return from where to where the ground of a place reaches in x and in y,
-    metres.
-    """
+    """Return the bounds of the ground of a place in x and in y, metres."""
     vertices = np.concatenate(
         [part.mesh.vertices for part in place.parts if part.is_ground]
     )
@@ -398,8 +402,9 @@ def bound_ground(place: Place) -> Box:
 def view_of(
     scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None
 ) -> CameraView:
-    """Return how a scene is looked at: by its own camera, or by one with another pose
-    (4, 4) or field of view.
+    """Return how a scene is looked at.
+
+    By its own camera, or by one with another pose (4, 4) or field of view.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres

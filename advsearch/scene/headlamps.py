@@ -5,13 +5,15 @@ A headlamp is a point that shines by a table of luminous intensity over angles, 
 glass that glows. Of one lamp, at h degrees aside and v above the horizon, with d =
 -0.57 - v, the angle below the cut-off:
 
-    low:  (14,500 exp(-(h/5)^2/2) exp(-d/1.5) + 4,000 exp(-(h/16)^2/2) exp(-d/5)) / (1 + exp(-d/0.08))      candela
+    low:  (14,500 exp(-(h/5)^2/2) exp(-d/1.5) + 4,000 exp(-(h/16)^2/2) exp(-d/5))
+          / (1 + exp(-d/0.08)) candela
     high: low + 45,000 exp(-(h/3.5)^2/2 - (v/1.5)^2/2)
 
 The cut-off is level, 1 % below the horizon; a real one rises on the side of the kerb.
 These numbers fulfil what a lamp of class B has to (UN Regulation 112, section 6.2 and
 6.3): at 0.86 degrees down at least 5,100 cd ahead and 10,100 at
-1.72 aside, at 1.72 down at least 1,700 at 9 aside, above the horizon at most 350 to 625, of the high beam 40,500. The
+1.72 aside, at 1.72 down at least 1,700 at 9 aside, above the horizon at most 350 to
+625, of the high beam 40,500. The
 glass of a headlamp shines 250 cd ahead, which is what is left above the cut-off, and
 that of a tail lamp 10 cd in red (UN Regulation 7: from 4).
 `tests/scene/test_headlamps.py` holds them to these.
@@ -82,8 +84,9 @@ OUT = 0.004  # how far glass stands out from what it lies on, metres
 
 
 def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
-    """Return the luminous intensity of one headlamp, "low" or "high", at degrees aside
-    and up; see above.
+    """Return the luminous intensity of one headlamp, "low" or "high"; see above.
+
+    `h` and `v` are degrees aside and up.
     """
     below = CUT_OFF - v
     spot = 14500.0 * np.exp(-((h / 5.0) ** 2) / 2.0 - below.clip(0.0) / 1.5)
@@ -99,8 +102,9 @@ def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
 
 @lru_cache(maxsize=2)
 def table(kind: str) -> Floats:
-    """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it,
-    candela; row 0 on top.
+    """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
+
+    In candela; row 0 on top.
     """
     up = SIDES * ROWS / COLUMNS
     aside, above = np.meshgrid(
@@ -247,11 +251,18 @@ def _find_beam_positions(vertices: Floats, step: float) -> list[Doubles]:
 def _glass(
     part: MeshPart, where: str, ahead: float, step: float, power: Doubles
 ) -> LampGlass:
-    """The glass of a car's two headlamps or tail lamps (`where`, of `NAMED`), which
-    shine along its x axis by `ahead`: the faces of a material that is called so, or
-    else two disks before what is foremost there; `step` is a metre in the car's
-    coordinates, `power` (3,) the radiance times square metres that each of the two
-    sends there.
+    """Return the glass of a car's two headlamps or tail lamps.
+
+    It is the faces of a material with such a name, or else two disks before what is
+    foremost there.
+
+    Args:
+        part: the car.
+        where: of `NAMED`.
+        ahead: 1 for lamps that shine along +x, -1 along -x.
+        step: a metre in the car's coordinates.
+        power: (3,) the radiance times square metres that each of the two sends
+            there.
     """
     mesh = part.mesh
     named = [

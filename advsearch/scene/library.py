@@ -41,8 +41,9 @@ SIDE = 256  # texels along the maps of roughness, metal and clear coat
 def finished(
     mesh: Mesh, finishes: Mapping[str, Material], main: Material
 ) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it:
-    some materials of the mesh as `finishes` say, and all other faces like `main`, whose
+    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
+
+    Some materials of the mesh as `finishes` say, and all other faces like `main`, whose
     `specular` holds for all.
     """
     faces = np.tile(
@@ -95,8 +96,9 @@ def list_objects() -> tuple[str, ...]:
 
 
 def list_environments(split: str | None = None) -> tuple[str, ...]:
-    """Return the names of bundled environments, sorted; of the half "train" or
-    "heldout", "street" or "place".
+    """Return the sorted names of bundled environments.
+
+    `split` selects those of "train", "heldout", "street" or "place".
     """
     facts = _environments().items()
     return tuple(
@@ -188,8 +190,9 @@ def _read_mesh(
 
 
 def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
-    """Return the bundled body, with other defaults of the control `body` such as
-    ``{"height": 1.8}``.
+    """Return the bundled body, with other defaults such as ``{"height": 1.8}``.
+
+    See the control `body`.
     """
     # torch takes seconds, and most objects have no body
     from advsearch.scene.people import Person, body_data
@@ -198,8 +201,11 @@ def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
 
 
 def load_environment(name: str) -> EnvironmentAsset:
-    """Return a bundled environment. Raises UnknownNameError; FileFormatError: the
-    installation is damaged.
+    """Return a bundled environment.
+
+    Raises:
+        FileFormatError: the installation is damaged.
+        UnknownNameError: there is no such environment.
     """
     known = list_environments()
     if name not in known:
@@ -237,9 +243,13 @@ SMALLEST = (4, 8)
 
 @dataclass(frozen=True, eq=False)
 class LightPicture:
-    """A picture in linear radiance: its size in rows and columns; `band`, which returns
-    the rows from its first argument to before its second, (n, W, 3) float32; and
-    clauses about what is left out.
+    """An image in linear radiance.
+
+    Attributes:
+        size: rows and columns.
+        band: returns the rows from its first argument to before its second, (n, W,
+            3) float32.
+        notes: clauses about what is left out.
     """
 
     size: tuple[int, int]
@@ -248,8 +258,9 @@ class LightPicture:
 
 
 def read_light(path: Path, what: str = "environment") -> LightPicture:
-    """Read an ``.hdr`` or ``.exr`` picture of any shape; errors as for
-    `import_environment`.
+    """Read an ``.hdr`` or ``.exr`` image of any shape.
+
+    Errors are those of `import_environment`.
     """
     data = read_bytes(path, what, SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -287,9 +298,13 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
-    """Read an equirectangular environment map: a Radiance ``.hdr`` (RGBE), or an
-    ``.exr`` with channels R, G and B, or Y alone (grey), in half or float; see
+    """Read an equirectangular environment map from an ``.hdr`` or ``.exr`` file.
+
+    An ``.exr`` has channels R, G and B, or Y alone (grey), in half or float; see
     `advsearch.scene.importing.hdr`.
+
+    A Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone
+    (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
     Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle
     that it covers, so that the light from each direction stays the same in the mean.
@@ -322,8 +337,9 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, and repeat its texels up to at least
-    `SMALLEST`; see `LightPicture`.
+    """Average a map down to at most `LARGEST`, or repeat texels up to `SMALLEST`.
+
+    See `LightPicture`.
     """
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)

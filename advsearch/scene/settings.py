@@ -19,9 +19,10 @@ CHANNELS = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One coordinate of a search: a named, bounded number, tensor or choice. Settings
-    of a scene and parameters of controls are both this, so that what `--set` fixes
-    today a control can search tomorrow under the same name.
+    """One coordinate of a search: a named, bounded number, tensor or choice.
+
+    Settings of a scene and parameters of controls are both this, so that what `--set`
+    fixes today a control can search tomorrow under the same name.
     """
 
     name: str  # short; `control.name` addresses it everywhere
@@ -61,8 +62,9 @@ class Parameter:
 
     @staticmethod
     def is_number(value: object) -> TypeGuard[float]:
-        """Return whether a value is a number that float32 has: no truth value, not NaN,
-        and at most `LARGEST`.
+        """Return whether a value is a number that float32 has.
+
+        No truth value, not NaN, and at most `LARGEST`.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.LARGEST  # type: ignore[arg-type]
@@ -165,8 +167,9 @@ class Parameter:
         defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
         estimators: tuple[str, ...] = LIT,
     ) -> tuple[Parameter, ...]:
-        """Make the three numbers of a color, display-referred sRGB; the text goes on
-        behind "Red", "Green", "Blue".
+        """Make the three parameters of a color, display-referred sRGB.
+
+        The text goes on behind "Red", "Green", "Blue".
         """
         texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
@@ -186,6 +189,7 @@ class Parameter:
 
 
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
+    """Return a parameter of the principled surface."""
     return Parameter(
         name,
         (),
@@ -391,6 +395,7 @@ LAMPS = ("off", "low", "high")
 
 
 def _lamps(whose: str) -> Parameter:
+    """Return the parameter for the lamps of a car."""
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
         "beam; in the avenue."
@@ -548,8 +553,9 @@ Given = Mapping[str, float | str | Sequence[float]]
 
 
 def parameter_of(name: str) -> Parameter | None:
-    """Return the parameter that a setting's name means, also of a mesh around the
-    object; None if there is none.
+    """Return the parameter that a setting's name means; None if there is none.
+
+    Also for settings of a mesh around the object.
     """
     family, _, rest = name.partition(":")
     if rest and family in OF_A_MESH:
@@ -558,18 +564,23 @@ def parameter_of(name: str) -> Parameter | None:
 
 
 def mesh_of(name: str) -> str | None:
-    """Return the mesh around the object whose setting it is: ``chair`` of
-    ``pose:chair.yaw``; None for the scene's.
+    """Return the mesh whose setting a name is: ``chair`` of ``pose:chair.yaw``.
+
+    None for settings of the scene.
     """
     mesh, dot, _ = name.partition(":")[2].rpartition(".")
     return mesh if dot else None
 
 
 def resolve(given: Given) -> dict[str, float | None]:
-    """Return every setting's value: what was given, checked, over the defaults; None
-    where the scene works it out. Settings of meshes around the object are there where
-    they were given. Raises UnknownNameError: a name is not a setting. Raises
-    InputError: a value is not a finite number inside its range.
+    """Return every setting's value: the defaults, and over them what was given.
+
+    None where the scene works a value out. Settings of meshes around the object are
+    there where they were given.
+
+    Raises:
+        InputError: a value is not a finite number inside its range.
+        UnknownNameError: a name is not a setting.
     """
     if "camera.elevation" in given and "camera.height" in given:
         raise InputError(

@@ -75,9 +75,7 @@ class ThingPart(MeshPart):
 
 
 def asked_things(text: str | None) -> tuple[AskedThing, ...]:
-    """Read things that are asked for in one text, see above. Raises InputError: it says
-    something else.
-    """
+    """Read the things of a setting, see above. Raises InputError: it is invalid."""
     things: list[AskedThing] = []
     for part in filter(None, map(str.strip, (text or "").split(";"))):
         thing = _asked(part)
@@ -100,6 +98,10 @@ def asked_things(text: str | None) -> tuple[AskedThing, ...]:
 
 
 def _asked(part: str) -> AskedThing:
+    """Read one thing.
+
+    Raises InputError, UnknownNameError: it is not as described above.
+    """
     what, at, rest = part.rpartition("@")
     words = [word.strip() for word in rest.split(",")]
     options = dict(word.partition("=")[::2] for word in words[2:])
@@ -148,6 +150,7 @@ def _asked(part: str) -> AskedThing:
 
 
 def _number(part: str, name: str, text: str, low: float, high: float) -> float:
+    """Read one number of a thing. Raises InputError: it is none, or out of range."""
     try:
         value = float(text)
     except ValueError:
@@ -165,11 +168,18 @@ def with_things(
     text: str | None,
     load: Callable[[str, str | None], ObjectAsset],
 ) -> SceneDescription:
-    """Return the scene with the things beside its object that a text asks for, each
-    loaded by its name or file and the axis that its front faces; what stands in another
-    one is said in its remarks. Raises UnknownNameError: there is no such object. Raises
-    InputError: the text says something else, a name is taken, or sizes in metres are
-    not known.
+    """Return the scene with the things beside its object that a setting names.
+
+    Args:
+        scene: with the object.
+        text: the setting; None for no things.
+        load: loads an object by its name or file, and the axis that its front
+            faces.
+
+    Raises:
+        InputError: the text is invalid, a name is taken, or sizes in metres are not
+            known.
+        UnknownNameError: there is no such object.
     """
     asked = asked_things(text)
     if not asked:
@@ -234,8 +244,9 @@ def _pose(
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: road, pavement,
-    table or floor; or 0.
+    """Return how high the ground lies at a position (2,), object sizes.
+
+    That is the height of the road, the pavement, the table or the floor; or 0.
     """
     ground = (part for part in scene.around.values() if part.is_ground)
     triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in ground)
@@ -246,9 +257,7 @@ def ground_height(scene: SceneDescription, place: Doubles) -> float:
 
 
 def heights_over(corners: Doubles, place: Doubles) -> list[float]:
-    """Return how high the triangles (F, 3 corners, 3) lie that are above or below a
-    place (2,).
-    """
+    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     sides = [
         (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1])
@@ -265,8 +274,9 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
 
 
 def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
-    """Return which solid of the scene's place something overlaps with, such as "a
-    house"; None where it stands free.
+    """Return the solid of the scene that a footprint overlaps, such as "a house".
+
+    None where it stands free.
     """
     for part in scene.around.values():
         for solid in part.solids:
@@ -276,9 +286,7 @@ def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
 
 
 def with_solids_checked(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with a remark on its object and each thing that stands in a
-    house, a post or the like.
-    """
+    """Return the scene with a remark on its object and each thing inside a solid."""
     if not any(part.solids for part in scene.around.values()):
         return scene
     taken = {"the object": footprint(scene.base_vertices)}
@@ -295,9 +303,7 @@ def with_solids_checked(scene: SceneDescription) -> SceneDescription:
 
 
 def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[str, ...]:
-    """Return what is said where cameras, at places (3,) in metres, are inside a solid
-    of the scene's place.
-    """
+    """Return a remark where cameras, at positions (3,) in metres, are inside a solid."""
     inside = list[str]()
     for eye in eyes:
         x, y, z = eye / scene.metres

@@ -1,8 +1,10 @@
 """The `corruption` control: one of the common image corruptions, by name and severity,
 on the finished picture.
 
-    severity 0: the picture as it is;  0 to 1: mixed with that of severity 1;  1 to 5: the published severities, and
-    between two of them their parameters interpolated
+    severity 0   the image as it is
+    0 to 1       mixed with that of severity 1
+    1 to 5       the published severities; between two of them their parameters are
+                 interpolated
 
 They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4
 and appendix A) as functions of the picture in torch; those by noise, blur, shifted
@@ -170,6 +172,7 @@ class CorruptionControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the severity that is applied: a whole one for stepped corruptions."""
         severity = values["severity"]
         applied = (
             nearest(severity)

@@ -34,8 +34,9 @@ def scale(image: Tensor) -> float:
 
 
 def reference_size(height: int, width: int) -> tuple[int, int]:
-    """Return the size of a picture of the same shape whose smaller side has `REFERENCE`
-    pixels.
+    """Return the rows and columns of a reference image of the same shape.
+
+    Its smaller side has `REFERENCE` pixels.
     """
     side = min(height, width)
     return round(height * REFERENCE / side), round(width * REFERENCE / side)
@@ -47,8 +48,9 @@ def generator(seed: int, name: str) -> torch.Generator:
 
 
 def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
-    """Interpolate the five rows of n numbers of a table linearly at a severity () in
-    [1, 5]; returns n differentiable tensors ().
+    """Interpolate the five rows of a table linearly at a severity () in [1, 5].
+
+    Returns one tensor () a column; differentiable.
     """
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
     return between(level, lambda whole: rows[whole - 1]).unbind()
@@ -71,8 +73,9 @@ def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
 
 
 def blurred(image: Tensor, sigma: Tensor) -> Tensor:
-    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels;
-    edges are continued.
+    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels.
+
+    Edges are continued.
     """
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
@@ -244,9 +247,7 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Blur along a line, within 45 degrees of the horizontal, as of a camera that
-    moves.
-    """
+    """Blur along a line within 45 degrees of the horizontal, like a moving camera."""
     radius, sigma = at_level(MOTION, level)
     turn = float(torch.rand((), generator=generator(seed, "motion blur")))
     return streaked(
@@ -255,9 +256,7 @@ def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Average the picture with magnified ones, as of a camera that moves towards the
-    object.
-    """
+    """Average the image with magnified ones, like a camera that moves ahead."""
     (largest,) = at_level(ZOOM, level)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=level.device
@@ -274,9 +273,7 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur
-    again.
-    """
+    """Blur, show at each pixel what a neighbor shows, and blur again."""
     sigma = at_level(GLASS, level)[0] * scale(image)
     shift = between(
         level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole)
@@ -417,7 +414,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
-    """(H, W, 1) fog in [0, 1]."""
+    """Make fog (H, W, 1) in [0, 1]."""
     tall, wide = reference_size(height, width)
     return images.resized(
         fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None],
@@ -427,8 +424,9 @@ def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
 
 
 def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
-    """Return fractal noise in [0, 1], at least side x side, made by midpoint
-    displacement on a torus.
+    """Make fractal noise in [0, 1] by midpoint displacement on a torus.
+
+    It is at least side x side.
 
     Each step doubles the grid: new points are the mean of their four neighbours plus
     noise, whose height falls by `decay` squared from step to step (Fournier, Fussell,
@@ -462,9 +460,7 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _crystals(height: int, width: int, seed: int) -> Tensor:
-    """(H, W, 3) ice in [0, 1]: feathers of crystals over a film that is thicker in
-    places, a little blue.
-    """
+    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
     tall, wide = reference_size(height, width)
     source = generator(seed, "frost")
     film = fractal(max(tall, wide), 1.4, source)[:tall, :wide, None]
@@ -513,7 +509,7 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _snowfall(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 1) falling snow in [0, 1] at a whole severity."""
+    """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
     tall, wide = reference_size(height, width)
     mean, spread, flake, over, radius, sigma = SNOW[whole - 1]
     source = generator(seed, "snow")

@@ -52,9 +52,13 @@ CLEARANCE = 0.05
 
 @cache
 def loaded(spec: str) -> assets.ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on
-    the origin. Raises InputError where there is no such object, or the file cannot be
-    used.
+    """Return an object, its largest extent 1, centered on the origin.
+
+    Args:
+        spec: name of a bundled object, or the path of a mesh file.
+
+    Raises:
+        InputError: there is no such object, or the file cannot be used.
     """
     asset = SceneDescription.load_object(spec)
     mesh = assets.normalised(asset.mesh)
@@ -97,8 +101,9 @@ def _make_card() -> assets.ObjectAsset:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an occluder goes, in the camera's coordinates; lengths are in object
-    sizes.
+    """Where an occluder goes, in the camera's coordinates.
+
+    Lengths are in object sizes.
     """
 
     # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is
@@ -190,6 +195,7 @@ class OcclusionControl(Control):
     )
 
     def check_choices(self) -> None:
+        """Check the occluder that was chosen in place of `which`. Raises InputError."""
         occluder = self.chosen["object"]
         if occluder is None:
             return
@@ -206,6 +212,7 @@ class OcclusionControl(Control):
         self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add every occluder that can be chosen, out of sight."""
         away = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
@@ -245,7 +252,7 @@ class OcclusionControl(Control):
         return measurements
 
     def _candidates(self) -> tuple[str, ...]:
-        """Every occluder that can be chosen; each is a part of the scene."""
+        """Return every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
         return tuple(map(str, self.allowed("which", MADE[0])))
@@ -258,8 +265,9 @@ class OcclusionControl(Control):
         )
 
     def _part(self, option: str) -> str:
-        """The name of an occluder's part: the instance's, with the option where there
-        are several.
+        """Return the name of an occluder's part of the scene.
+
+        The instance's name, with the option where there are several.
         """
         return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
 

@@ -29,8 +29,9 @@ GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row
-    0 at its low end.
+    """Which directions a thing is seen in.
+
+    A mask (h, w) over a window of tangents, row 0 at its low end.
     """
 
     mask: NDArray[np.bool_]
@@ -188,8 +189,9 @@ def spread_directions(frame: geometry.Frame) -> assets.Doubles:
 
 
 def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
-    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows
-    right, up, forward.
+    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette.
+
+    Rows right, up, forward.
     """
     forward = hidden.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)

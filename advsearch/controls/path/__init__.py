@@ -91,8 +91,9 @@ FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """A way from a file; lengths are in metres where the object's size is known, in
-    object sizes elsewhere.
+    """A path from a file.
+
+    Lengths are in metres where the object's size is known, in object sizes elsewhere.
     """
 
     times: Tensor  # (n,) ascending, seconds from the first
@@ -129,8 +130,9 @@ class Waypoints:
         return torch.lerp(of[index - 1], of[index], fraction)
 
     def rotation_at(self, time: Tensor) -> Tensor:
-        """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's
-        right, down and ahead.
+        """Return the rotation (..., 3, 3) at times (...,).
+
+        Its columns are the camera's right, down and ahead.
         """
         assert self.rotations is not None
         quaternion = self.at(time, self.rotations)
@@ -142,9 +144,7 @@ class Waypoints:
 
 
 class Start(NamedTuple):
-    """A scene as it is described: poses (4, 4) of its camera and its object, and the
-    middle (3,) of that; float32.
-    """
+    """A scene as it is described: poses (4, 4), and the object's middle (3,), float32."""
 
     camera: Tensor
     middle: Tensor
@@ -317,7 +317,7 @@ class PathControl(Control):
         return ways
 
     def _check_needless(self) -> None:
-        """Refuse what is about trajectories where there is none."""
+        """Check that choices about trajectories have one. Raises InputError."""
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
@@ -329,6 +329,7 @@ class PathControl(Control):
             )
 
     def _check_object_at(self) -> None:
+        """Check the position of the object in a file's world. Raises InputError."""
         given = self.chosen["object_at"]
         if given is None:
             return
@@ -342,6 +343,7 @@ class PathControl(Control):
             )
 
     def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
+        """Read the file of a path: a trajectory, or a table of waypoints."""
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
         if trajectory is None:
@@ -454,8 +456,9 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and that rows are read in, below 0 from the
-        bottom.
+        """Seconds that the shutter is open, and in which rows are read.
+
+        The latter are below 0 where rows are read from the bottom.
         """
         return float(self.chosen["shutter"] or 0.0), float(
             self.chosen["rolling"] or 0.0
@@ -530,6 +533,7 @@ class PathControl(Control):
             )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return the time, with the path's range, and the clean time as its default."""
         if parameter.name == Control.WAY:
             return parameter
         first, *last = self._paths[0].values()
@@ -572,8 +576,13 @@ class PathControl(Control):
         return {"distance": Value(value=float(distance), unit=unit)}
 
     def distances(self, times: Tensor) -> Tensor:
-        """Return the distances (ways, n) of the camera from the object on each of the
-        paths at times (n,), in the unit of `measured`.
+        """Return the distances of the camera from the object on each of the paths.
+
+        Args:
+            times: (n,) seconds.
+
+        Returns:
+            (paths, n) in the unit of `measured`.
         """
         return torch.stack(
             [self._distance(ways, times).expand(times.shape) for ways in self._paths]
@@ -667,7 +676,7 @@ class PathControl(Control):
 
 @lru_cache(maxsize=4)
 def start_of(scene: SceneDescription, device: torch.device) -> Start:
-    """Return how a scene stands; kept in memory, as it takes a look at every vertex."""
+    """Return the poses of a scene; cached, as it looks at every vertex."""
     poses = (
         geometry.camera_to_world(scene),
         geometry.middle(scene),
@@ -694,8 +703,12 @@ def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) that looks at a target (3,),
-    rolled by degrees.
+    """Return the pose (4, 4) of a camera that looks at a target.
+
+    Args:
+        place: (3,) of the camera.
+        target: (3,).
+        roll: degrees.
     """
     ahead = (target - place) / (target - place).norm().clamp_min(1e-9)
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
@@ -706,8 +719,12 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
 
 
 def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) whose right, down and ahead
-    are the columns of a rotation, rolled by degrees.
+    """Return the pose (4, 4) of a camera with a rotation.
+
+    Args:
+        place: (3,) of the camera.
+        rotation: (3, 3), columns right, down and ahead.
+        roll: degrees.
     """
     right, down, ahead = rotation.unbind(dim=-1)
     return _rolled(place, -right, -down, ahead, roll)
@@ -724,16 +741,15 @@ def _rolled(
 
 
 def measure_tilt(rotations: Rotation) -> float:
-    """Return how far the top of a camera's pictures is from up, degrees, on average
-    over its rotations.
-    """
+    """Return how far the top of a camera's images is from up, mean, degrees."""
     upwards = -rotations.as_matrix()[:, 2, 1]
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
 def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
-    """Return quaternions (n, 4) with signs such that each is nearer to the one before
-    than its opposite is.
+    """Return quaternions (n, 4) whose signs do not change from one to the next.
+
+    Each is nearer to the one before than its opposite is.
     """
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
@@ -741,8 +757,9 @@ def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
 
 
 def check_times(path: Path, times: assets.Doubles) -> None:
-    """Raise FileFormatError: times (n,) from the first on are too few or many, or do
-    not ascend within limits.
+    """Check times (n,) in seconds from the first on.
+
+    Raises FileFormatError: they are too few or many, or do not ascend within limits.
     """
     if not 2 <= len(times) <= MOST_WAYPOINTS:
         raise errors.FileFormatError(
@@ -760,8 +777,12 @@ def check_times(path: Path, times: assets.Doubles) -> None:
 
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
-    """Return what turns the object about the vertical through its middle, in degrees,
-    and shifts it: (4, 4).
+    """Return the pose (4, 4) of an object that is turned and shifted.
+
+    Args:
+        start: the scene as it is described.
+        shift: (3,) object sizes.
+        heading: () degrees about the vertical through its middle.
     """
     about = geometry.euler(heading, *heading.new_zeros(2))
     center = start.middle

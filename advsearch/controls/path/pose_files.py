@@ -99,9 +99,17 @@ class Trajectory:
     def orient(
         self, axes: str, up: str, origin: Sequence[float]
     ) -> tuple[assets.Doubles, Rotation | None]:
-        """Return positions (n, 3) from an origin, and rotations from a camera's axes (x
-        right, y down, z ahead), both in a world whose z is up; no rotations where the
-        axes are `UNUSED` or the file has none.
+        """Return positions and rotations in a world whose z is up.
+
+        Args:
+            axes: of the sensor, a key of `SENSOR_AXES`, or `UNUSED`.
+            up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
+            origin: (3,) in the file's world.
+
+        Returns:
+            Positions (n, 3) from the origin; rotations from a camera's axes (x
+                right, y down, z ahead), None where the axes are `UNUSED` or the
+                file has none.
         """
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
         positions = world.apply(self.positions - np.asarray(origin, np.float64))
@@ -113,8 +121,7 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
-    """Return the poses in the text of a file, or None where it is in none of the
-    formats.
+    """Read the poses in the text of a file; None if it is in none of the formats.
 
     Raises FileFormatError: rows of different lengths, numbers that are not finite,
     quaternions that are not of length 1, matrices that are no rotations, or a table of
@@ -174,8 +181,10 @@ def _is_row(line: str) -> bool:
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the columns by our names for them, or nothing unless there are a time, a
-    position and either a quaternion or a name that only these formats have.
+    """Return the columns by our names for them; nothing if it is no such table.
+
+    It needs a time, a position, and either a quaternion or a name that only these
+    formats have.
     """
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
@@ -205,6 +214,7 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
 def _read_table(
     path: Path, rows: Sequence[Sequence[str]], count: int
 ) -> assets.Doubles:
+    """Return a table of numbers (rows, count). Raises FileFormatError: it is none."""
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(

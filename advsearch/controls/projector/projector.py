@@ -8,7 +8,8 @@ it: `ambient` lux are the irradiance that the camera's exposure is metered for. 
 ambient light is a darker projector in an equally bright picture, as a camera that
 meters would show it.
 
-    pattern = linear(texels) (1 - black) + black,        E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
+    pattern = linear(texels) (1 - black) + black
+    E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
 """
 
 from __future__ import annotations
@@ -210,6 +211,7 @@ class ProjectorControl(PictureControl):
     )
 
     def check_choices(self) -> None:
+        """Check that pattern, picture and ball go together. Raises InputError."""
         pattern = self._given.get("pattern")
         picture = self.chosen["picture"]
         if (
@@ -243,6 +245,7 @@ class ProjectorControl(PictureControl):
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add the projector, with an angle that covers the object."""
         picture = self.read_picture()
         rows = int(self.chosen["resolution"]) if picture is None else len(picture)
         columns = (
@@ -277,6 +280,7 @@ class ProjectorControl(PictureControl):
         return scene.with_part(part)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with its default beside the scene's camera, in its light."""
         parameter = super().in_scene(parameter)
         scene = self.scene
         away = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
@@ -326,13 +330,14 @@ class ProjectorControl(PictureControl):
         return self.part.sides
 
     def _far(self) -> float:
-        """How far away it stands at the start."""
+        """Return how far away it stands at the start."""
         spec = self.specs.get("distance")
         return float(
             spec.value if isinstance(spec, Fixed) else self.resting("distance")
         )
 
     def fit(self) -> None:
+        """Find the projector in the scene, and how often it flashes."""
         (self.part,) = (
             part
             for part in self.scene.parts
@@ -388,6 +393,7 @@ class ProjectorControl(PictureControl):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the projector's pose and its light."""
         place = (
             float(values[name].detach())
             for name in ("azimuth", "elevation", "distance")
@@ -414,9 +420,7 @@ class ProjectorControl(PictureControl):
         return out_of_focus(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
-        """Illuminance () of a white picture where it meets the object's middle
-        head-on.
-        """
+        """Return the illuminance () of a white image at the object's middle."""
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
     def _beside(self, values: Values) -> Tensor:
@@ -425,6 +429,7 @@ class ProjectorControl(PictureControl):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return how bright white is, and the mean of the pattern."""
         return {
             "white": Value(value=float(self._lux(values)), unit="lux"),
             "beside_ambient": Value(
@@ -439,6 +444,7 @@ class ProjectorControl(PictureControl):
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the pattern, and the pattern enlarged for printing."""
         pattern = values["pattern"]
         return {
             self.name: pattern,
@@ -449,8 +455,9 @@ class ProjectorControl(PictureControl):
 
 
 def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
-    """Return a picture (h, w, 3) after a Gaussian blur of so many texels (); outside it
-    there is no light.
+    """Return a picture (h, w, 3) after a Gaussian blur of so many texels ().
+
+    Outside it there is no light.
     """
     sigma = float(blur.detach())
     if not sigma and not blur.requires_grad:
@@ -470,9 +477,15 @@ def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
 def looking_from(
     scene: SceneDescription, azimuth: float, elevation: float, distance: float
 ) -> Tensor:
-    """The pose (4, 4) of what looks at the object's middle along its own +z from
-    somewhere around it; degrees, and the distance as `ProjectorControl` has it. It is
-    not to be written into.
+    """Return a pose (4, 4) that looks at the object's middle along its own +z.
+
+    Do not write into it.
+
+    Args:
+        scene: with the object.
+        azimuth: degrees.
+        elevation: degrees.
+        distance: as `ProjectorControl` has it.
     """
     left, up, outwards = torch.from_numpy(
         geometry.camera_axes(azimuth, elevation, 0.0)

@@ -1,9 +1,11 @@
 """The `spot` control: a torch or a laser from somewhere around the object. It only adds
 light.
 
-It is a projector whose picture is a round spot, so that no outline moves and its numbers have an adjoint:
+It is a projector of an image with a round spot, so that no outline moves and its
+parameters have an adjoint:
 
-    picture = colour exp(-r^2 / (2 s^2)) picture's area / (2 pi s^2),        width = 2 s sqrt(2 ln 2)
+    image = color exp(-r^2 / (2 s^2)) image's area / (2 pi s^2)
+    width = 2 s sqrt(2 ln 2)
 """
 
 from __future__ import annotations
@@ -133,6 +135,7 @@ class SpotControl(ProjectorControl):
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter; of the lumens, up to what is bright in the scene."""
         if parameter.name != "lumens":
             return super().in_scene(parameter)
         area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
@@ -148,6 +151,7 @@ class SpotControl(ProjectorControl):
         return 0.0  # of the lumens; see `amount`
 
     def thrown(self, values: Values) -> Tensor:
+        """Return the round spot (h, w, 3) as it is thrown, linear."""
         half = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
@@ -170,6 +174,7 @@ class SpotControl(ProjectorControl):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return how bright the brightest point of the spot is."""
         brightest = float(self.thrown(values).detach().max())
         return {
             "lux": Value(

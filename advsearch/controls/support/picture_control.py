@@ -89,6 +89,7 @@ class PictureControl(Control):
 
     def read_picture(self) -> Tensor | None:
         """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
+
         Raises FileFormatError: it cannot be read.
         """
         if self.chosen["picture"] is None:
@@ -101,6 +102,7 @@ class PictureControl(Control):
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
+        """Return how much a searched image changes, and the other values."""
         described = super().describe(u, so_far)
         if not self.free:
             return described

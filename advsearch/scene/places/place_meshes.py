@@ -122,6 +122,7 @@ class _Mappings(_Extension):
 
 
 def _read_extension(path: Path, model: type[M], content: object) -> M:
+    """Return an extension, checked; the default for None. Raises FileFormatError."""
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
@@ -203,7 +204,7 @@ def _without_supported_extensions(header: Header) -> Header:
 def _note_left_out(
     header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
-    """Say what the file has that an object would have, and a place has not."""
+    """Note what an object of the file would have, and a place does not."""
     if any(primitive.part.colors is not None for primitive in primitives):
         notes.say(
             " has colours of vertices, which are left out; paint them into a texture"
@@ -230,7 +231,7 @@ def _find_variant(path: Path, header: Header, variant: str) -> int:
 def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
-    """Return the material that a primitive has in a variant, by its number."""
+    """Return the index of the material that a primitive has in a variant."""
     extension = _extension_of(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material
@@ -287,8 +288,9 @@ def _read_primitives(
 def _read_pieces(
     file: GltfFile, meshes: Sequence[int], variant: int | None
 ) -> dict[tuple[int, int], Piece]:
-    """Read the primitives of meshes, by the mesh and the index in it; none without
-    faces.
+    """Read the primitives of meshes, by the mesh and the index in it.
+
+    Those without faces are left out.
     """
     header = file.header
     pieces: dict[tuple[int, int], Piece] = {}
@@ -380,6 +382,7 @@ def _name_material(header: Header, number: int | None) -> str:
 def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
+    """Return one mesh of a place from its parts and their surface."""
     color = np.full(3, NEUTRAL, np.float32) if surface.color is None else surface.color
     base = (
         np.broadcast_to(color, (2, 2, len(color)))
