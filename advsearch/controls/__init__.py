@@ -62,12 +62,12 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     options: dict[str, Any] = {
         name: value for name, value in (settings or {}).items() if value is not None
     }
-    kind, name, parameter = _read_name(asked, options)
+    kind, name, parameter = _parse_name(asked, options)
     if kind not in CONTROLS:
         raise unknown_control(kind)
     control = CONTROLS[kind]
     if parameter is not None:
-        options.setdefault(parameter, _default_range(control, parameter))
+        options.setdefault(parameter, _get_default_range(control, parameter))
     known = [choice.name for choice in control.choices] + [
         known.name for known in control.declared(options)
     ]
@@ -90,34 +90,36 @@ def unknown_control(
     owners = [
         name
         for name, control in usable
-        if any(one.name == kind for one in control.parameters)
+        if any(parameter.name == kind for parameter in control.parameters)
     ]
-    of = (
+    explanation = (
         f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}."
         if owners
         else hint
     )
-    return UnknownNameError("control", kind, {*CONTROLS, *instances}, of)
+    return UnknownNameError("control", kind, {*CONTROLS, *instances}, explanation)
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
     """Return the kind and the instance name that `make_control` would use."""
-    return _read_name(asked, dict(given))[:2]
+    return _parse_name(asked, dict(given))[:2]
 
 
-def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
+def _parse_name(
+    control_name: str, settings: dict[str, object]
+) -> tuple[str, str, str | None]:
     """Return kind, instance name and single parameter.
 
     Takes "kind" out of the settings.
     """
-    kind, colon, name = asked.partition(":")
+    kind, colon, name = control_name.partition(":")
     kind, dot, parameter = kind.partition(".")
-    kind_given = given.pop("kind", None)
-    if kind_given is not None:
-        return str(kind_given), asked, None
-    if CONTROLS.names_class(asked):
-        return asked, CONTROLS[asked].kind, None
-    check_instance(f"`controls` {asked}", name, colon)
+    kind_setting = settings.pop("kind", None)
+    if kind_setting is not None:
+        return str(kind_setting), control_name, None
+    if CONTROLS.names_class(control_name):
+        return control_name, CONTROLS[control_name].kind, None
+    check_instance(f"`controls` {control_name}", name, colon)
     return kind, instance_of(kind, name), parameter if dot else None
 
 
@@ -146,23 +148,26 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
         )
 
 
-def _default_range(control: type[Control], parameter: str) -> object:
+def _get_default_range(control: type[Control], parameter: str) -> object:
     """Return the range, or the choices, of a parameter that is searched by name alone."""
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
             f"{control.kind}:{parameter}=[0.2, 0.8]"
         )
-    declared = {one.name: one for one in control.declared((parameter,))}
-    if parameter not in declared:
+    parameter_by_name = {
+        declared_parameter.name: declared_parameter
+        for declared_parameter in control.declared((parameter,))
+    }
+    if parameter not in parameter_by_name:
         raise UnknownNameError(
-            f"parameter of control {control.kind}", parameter, declared
+            f"parameter of control {control.kind}", parameter, parameter_by_name
         )
-    named = declared[parameter]
+    found_parameter = parameter_by_name[parameter]
     return (
-        {"choices": list(named.options)}
-        if named.options
-        else list(named.search or (named.low, named.high))
+        {"choices": list(found_parameter.options)}
+        if found_parameter.options
+        else list(found_parameter.search or (found_parameter.low, found_parameter.high))
     )
 
 
@@ -172,12 +177,12 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
     Raises InputError: one has something else than settings.
     """
     by_name: dict[str, Mapping[str, object]] = {}
-    for name, given in by_key(asked).items():
-        if given is not None and not isinstance(given, Mapping):
+    for name, control_settings in by_key(asked).items():
+        if control_settings is not None and not isinstance(control_settings, Mapping):
             raise InputError(
-                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}"
+                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {control_settings!r}"
             )
-        by_name[name] = given or {}
+        by_name[name] = control_settings or {}
     return by_name
 
 
@@ -191,15 +196,20 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
             "kind:name.parameter".
     """
     by_control: dict[str, dict[str, object]] = {}
-    for name, given in settings_by_name(asked).items():
+    for name, control_settings in settings_by_name(asked).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
-            by_control.setdefault(name, {}).update(given)
+            by_control.setdefault(name, {}).update(control_settings)
             continue
         parameter, colon, instance = rest.partition(":")
-        into = by_control.setdefault(head + colon + instance, {})
-        into.update({parameter: _default_range(CONTROLS[kind], parameter), **given})
+        target = by_control.setdefault(head + colon + instance, {})
+        target.update(
+            {
+                parameter: _get_default_range(CONTROLS[kind], parameter),
+                **control_settings,
+            }
+        )
     return by_control
 
 
@@ -257,26 +267,37 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 f"object; {able} can, as in pose:{control.name}"
             )
     described = scene
-    moved = list[Moved]()
+    adjusted = list[Moved]()
     for control in controls:
         prepared = control.prepare(scene)
-        moved += check_prepared(control.name, scene, prepared)
+        adjusted += check_prepared(control.name, scene, prepared)
         scene = prepared
     for control in controls:
         if control.mesh != OBJECT:
             control.mesh_in(scene)
     bound = tuple(control.bind(scene) for control in controls)
-    moved = sorted(
-        [*moved, *(one for control in bound for one in control.moved)],
-        key=lambda one: names.index(one.control),
+    adjusted = sorted(
+        [
+            *adjusted,
+            *(
+                adjusted_default
+                for control in bound
+                for adjusted_default in control.moved
+            ),
+        ],
+        key=lambda adjusted_default: names.index(adjusted_default.control),
     )
-    lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
+    lit_by = [
+        str(adjusted_default.used)
+        for adjusted_default in adjusted
+        if adjusted_default.parameter == ENVIRONMENT
+    ]
     lit_by += (
         [scene.environment_spec]
         if scene.environment_spec != described.environment_spec
         else []
     )
-    return Space(bound, scene, tuple(moved), lit_by[0] if lit_by else None)
+    return Space(bound, scene, tuple(adjusted), lit_by[0] if lit_by else None)
 
 
 def __getattr__(name: str) -> Any:

@@ -315,14 +315,14 @@ class Control:
                 raise UnknownNameError(
                     f"setting of control {self.kind}", setting, known
                 )
-        given = {
+        settings_by_name = {
             setting: plain(value)
             for setting, value in settings.items()
             if value is not None
         }
-        self._given: dict[str, Any] = given
+        self._given: dict[str, Any] = settings_by_name
         self.chosen: dict[str, Any] = {
-            choice.name: given.get(choice.name, choice.default)
+            choice.name: settings_by_name.get(choice.name, choice.default)
             for choice in self.choices
         }
         for choice in self.choices:
@@ -330,10 +330,10 @@ class Control:
         self.check_choices()
         self.specs: dict[str, Spec] = {}
         for parameter in self.own:
-            if parameter.name in given:
+            if parameter.name in settings_by_name:
                 label = f"{self.name}.{parameter.name}"
                 self.specs[parameter.name] = read(
-                    label, parameter, given[parameter.name]
+                    label, parameter, settings_by_name[parameter.name]
                 )
         self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
 

@@ -409,8 +409,8 @@ class Limits:
         """
         if not len(self._walls):
             return 1.0
-        ends = (self._positions + offsets.cpu())[self._walls]
-        widths = (ends[:, 0] - ends[:, 1]).norm(dim=1)
+        wall_ends = (self._positions + offsets.cpu())[self._walls]
+        widths = (wall_ends[:, 0] - wall_ends[:, 1]).norm(dim=1)
         return float((widths / self._wall_widths).min())
 
 

@@ -57,42 +57,48 @@ class HazeControl(Control):
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         """Return a parameter with the value of the scene's own haze, if it has one."""
-        own = _haze_of(self.scene)
+        scene_haze = _find_haze(self.scene)
         default = parameter.default
         if parameter.name != "density":
-            if own is None:
+            if scene_haze is None:
                 return parameter
-            albedo = color.linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist()
+            albedo = color.linear_to_srgb(
+                np.asarray(scene_haze.albedo, np.float32)
+            ).tolist()
             return replace(
                 parameter, default=albedo[color.CHANNELS.index(parameter.name)]
             )
-        if own is not None:
-            default = own.density
+        if scene_haze is not None:
+            default = scene_haze.density
         elif self.asked and not self.searches("density"):
             default = THIN_HAZE
         spec = self.specs.get("density")
-        adjoint = isinstance(spec, Range) and spec.low > 0.0
+        has_adjoint = isinstance(spec, Range) and spec.low > 0.0
         return replace(
             parameter,
             default=default,
-            estimators=Parameter.LIT if adjoint else ("differences",),
+            estimators=Parameter.LIT if has_adjoint else ("differences",),
         )
 
     def unchanged(self, parameter: Parameter) -> float | str:
         # of the density; see `amount`
-        return 0.0 if _haze_of(self.scene) is None else parameter.default
+        return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add a ball of haze, or take over the scene's own."""
-        if (own := _haze_of(scene)) is not None:
-            renamed = replace(own, name=self.name)
+        if (scene_haze := _find_haze(scene)) is not None:
+            renamed = replace(scene_haze, name=self.name)
             return replace(
                 scene,
-                parts=tuple(renamed if part is own else part for part in scene.parts),
+                parts=tuple(
+                    renamed if part is scene_haze else part for part in scene.parts
+                ),
             )
-        away = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
+        camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
         return scene.with_part(
-            parts.HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away))
+            parts.HazePart(
+                self.name, max(LEAST_RADIUS, BEHIND_CAMERA * camera_distance)
+            )
         )
 
     def scene_inputs(
@@ -105,7 +111,7 @@ class HazeControl(Control):
         }
 
 
-def _haze_of(scene: SceneDescription) -> parts.HazePart | None:
+def _find_haze(scene: SceneDescription) -> parts.HazePart | None:
     """Return the haze that a scene comes with."""
     return next(
         (

@@ -48,7 +48,7 @@ def metered_irradiance(scene: SceneDescription) -> float:
     return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
 
 
-def _place(
+def _make_coordinate(
     name: str, low: float, high: float, default: float, description: str
 ) -> Parameter:
     """Return a parameter for a coordinate of the lamp."""
@@ -70,9 +70,9 @@ class LightControl(Control):
     kind = "light"
     amount = "power"
     parameters = (
-        _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
-        _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
-        _place(
+        _make_coordinate("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
+        _make_coordinate("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
+        _make_coordinate(
             "z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."
         ),
         *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
@@ -139,17 +139,20 @@ class LightControl(Control):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return where the lamp is, and how bright."""
-        place = torch.stack([values[axis] for axis in ("x", "y", "z")])
+        position = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
             color.combine_channels(values)
             * values["power"]
             * metered_irradiance(self.scene)
         )
         if self.chosen["type"] == "point":
-            return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
+            return {
+                f"{self.name}.position": position,
+                f"{self.name}.intensity": intensity,
+            }
         radius = values["size"] / 2.0
         return {
-            f"{self.name}.ball": ball(place, radius),
+            f"{self.name}.ball": ball(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),
         }
 

@@ -178,9 +178,9 @@ class PatchControl(PictureControl):
             )
         ball = next(
             (
-                one
-                for one in ("epsilon", "norm")
-                if self.chosen[one] not in (None, "box")
+                choice
+                for choice in ("epsilon", "norm")
+                if self.chosen[choice] not in (None, "box")
             ),
             None,
         )
@@ -222,22 +222,22 @@ class PatchControl(PictureControl):
                 "search; give another parameter "
                 f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
-        side = self.sides[0]
+        n_pixels = self.sides[0]
         pixels = self.slots[0]
         picture = self.read_picture()
-        self._picture = None if picture is None else images.resampled(picture, side)
-        resting = {
+        self._picture = None if picture is None else images.resampled(picture, n_pixels)
+        start_values = {
             name: float(value)
             for name, value in self.values(self.start).items()
             if name != "pixels"
         }
-        self._sticker = Sticker(self.scene, resting, side)
+        self._sticker = Sticker(self.scene, start_values, n_pixels)
         if isinstance(pixels.spec, Range):
             low = pixels.spec.low
             high = pixels.spec.high
-            wanted = (self._sticker.underneath() - low) / (high - low)
-            self.start[: pixels.width] = wanted.clamp(0.0, 1.0).reshape(-1)
-            if not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5):
+            underneath = (self._sticker.underneath() - low) / (high - low)
+            self.start[: pixels.width] = underneath.clamp(0.0, 1.0).reshape(-1)
+            if not torch.allclose(underneath.clamp(0.0, 1.0), underneath, atol=1e-5):
                 self.note_moved(
                     pixels.parameter,
                     "the texture underneath",
@@ -280,7 +280,7 @@ def towards_camera(scene: SceneDescription) -> tuple[float, float]:
         Azimuth in degrees, and height from 0 to 1, as the parameters of the
             control.
     """
-    middle, radius, half = _shape(scene.object.mesh)
+    middle, radius, half = _half_sizes(scene.object.mesh)
     camera = geometry.camera_to_world(scene)[:3, 3]
     x, y, z = (
         np.linalg.solve(geometry.object_to_world(scene), np.append(camera, 1.0))[:3]
@@ -300,7 +300,7 @@ def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
     return sampled[0, :, 0].T
 
 
-def _shape(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
+def _half_sizes(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
     """Return the middle (3,) of a mesh, its largest half-width and its half-height."""
     low = mesh.vertices.min(axis=0).astype(np.float64)
     high = mesh.vertices.max(axis=0).astype(np.float64)
@@ -341,16 +341,16 @@ class Sticker:
                 "patch that is painted into it; "
                 "leave patch out, or search the whole texture"
             )
-        self._shape = _shape(mesh)
+        self._half_sizes = _half_sizes(mesh)
         self._resting = resting
         self._side = side
         self._surface = images.MeshSurface(mesh)
-        own_color = color.srgb_to_linear(
+        object_color = color.srgb_to_linear(
             torch.from_numpy(scene.object.base_color.copy())
         )
         pixel_size = resting["size"] / side
-        charts = _rasterise_finely(mesh, max(own_color.shape[:2]), pixel_size)
-        self._own_color = _fitted(own_color, len(charts.face))
+        charts = _rasterise_finely(mesh, max(object_color.shape[:2]), pixel_size)
+        self._object_color = _resize_to_square(object_color, len(charts.face))
         mask = charts.touched
         self._texels = np.flatnonzero(mask)
         self._faces = charts.face[mask]
@@ -373,18 +373,18 @@ class Sticker:
         """
         device = pixels.device
         if base is None:
-            base = self._own_color.to(device)
+            base = self._object_color.to(device)
         else:
-            base = _fitted(base, len(self._own_color))
+            base = _resize_to_square(base, len(self._object_color))
         size = numbers["size"]
         spot = self._spot(
             *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
         )
         texels = spot.texels.to(device)
-        on_patch = _turned(spot.flat.to(device), numbers["rotation"]) / size
+        on_patch = _rotate(spot.flat.to(device), numbers["rotation"]) / size
         edge_width = EDGE_TEXELS * spot.spacing
         edge = (0.5 - on_patch.abs().amax(dim=1)) * size / edge_width + 0.5
-        cover = (spot.cover.to(device) * _smooth(edge))[:, None]
+        cover = (spot.cover.to(device) * _smooth_step(edge))[:, None]
         ink = _sample_pixels(pixels, on_patch)
         flat = base.reshape(-1, 3)
         under = flat.index_select(0, texels)
@@ -401,11 +401,11 @@ class Sticker:
         side = self._side
         spot = self._spot(resting["azimuth"], resting["height"], resting["size"])
         rotation = torch.tensor(resting["rotation"])
-        on_patch = _turned(spot.flat, rotation) / resting["size"]
+        on_patch = _rotate(spot.flat, rotation) / resting["size"]
         inside = (on_patch.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
         if not bool(inside.any()):
             return torch.full((side, side, 3), 0.5)
-        texel_colors = self._own_color.reshape(-1, 3)[spot.texels[inside]]
+        texel_colors = self._object_color.reshape(-1, 3)[spot.texels[inside]]
         positions = on_patch[inside] * torch.tensor([1.0, -1.0]) + 0.5
         colors = _average_in_pixels(texel_colors, positions, side)
         return color.linear_to_srgb(colors).reshape(side, side, 3)
@@ -418,7 +418,7 @@ class Sticker:
             height: from 0 (middle of the underside) to 1 (middle of the top).
             size: side of the patch, object sizes.
         """
-        middle, radius, half_height = self._shape
+        middle, radius, half_height = self._half_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
         face, point = self._surface.hit(
             middle + 4.0 * (radius + half_height) * outwards, -outwards
@@ -427,25 +427,25 @@ class Sticker:
         side = 1.0 if faces_outwards else -1.0
         normal = self._mean_normal(face, point)
         frame = _frame(side * normal, _upward_direction(azimuth, outwards))
-        chosen = self._texels_near(face, point, side * frame[2], REACH * size)
+        texel_indices = self._texels_near(face, point, side * frame[2], REACH * size)
 
-        offsets = self._positions[chosen] - point
-        flat, cosine = unrolled(offsets, side * self._normals[chosen], frame)
+        offsets = self._positions[texel_indices] - point
+        flat, cosine = unrolled(offsets, side * self._normals[texel_indices], frame)
         return Spot(
-            torch.from_numpy(self._texels[chosen]),
+            torch.from_numpy(self._texels[texel_indices]),
             torch.from_numpy(flat.astype(np.float32)),
             _fade_in(cosine),
-            self._texel_spacing(chosen),
+            self._texel_spacing(texel_indices),
         )
 
     def _mean_normal(self, face: int, point: assets.Doubles) -> assets.Doubles:
         """Return the mean normal (3,) over half of the patch's side at the start."""
         face_normal = self._surface.normals[face]
         reach = 0.5 * self._resting["size"]
-        near = self._surface.region(face, point, face_normal, reach)[self._faces]
-        squared = ((self._positions[near] - point) ** 2).sum(axis=1)
+        is_near = self._surface.region(face, point, face_normal, reach)[self._faces]
+        squared = ((self._positions[is_near] - point) ** 2).sum(axis=1)
         weight = np.maximum(1.0 - squared / reach**2, 0.0) ** 2
-        total = (self._normals[near] * (weight * self._areas[near])[:, None]).sum(
+        total = (self._normals[is_near] * (weight * self._areas[is_near])[:, None]).sum(
             axis=0
         )
         length = float(np.linalg.norm(total))
@@ -469,7 +469,7 @@ class Sticker:
         areas = self._areas[texels]
         has_area = areas > 0.0
         if not has_area.any():
-            return 1.0 / len(self._own_color)
+            return 1.0 / len(self._object_color)
         return math.sqrt(float(np.median(areas[has_area])))
 
 
@@ -502,7 +502,9 @@ def _upward_direction(azimuth: float, outwards: assets.Doubles) -> assets.Double
 def _fade_in(cosine: assets.Doubles) -> Tensor:
     """Return how much texels are covered by the cosines (N,) of their normals."""
     low, high = FACING
-    return _smooth(torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32)))
+    return _smooth_step(
+        torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))
+    )
 
 
 def _frame(normal: assets.Doubles, upwards: assets.Doubles) -> assets.Doubles:
@@ -543,8 +545,8 @@ def unrolled(
     towards = tilt / np.maximum(sine, 1e-9)[:, None]
     turned = np.arctan2(sine, np.maximum(cosine, 0.1))
     stretch = np.where(sine > 1e-4, turned / np.maximum(np.sin(turned), 1e-9), 1.0)
-    along = (plane * towards).sum(axis=1)
-    return plane + ((stretch - 1.0) * along)[:, None] * towards, cosine
+    along_turn = (plane * towards).sum(axis=1)
+    return plane + ((stretch - 1.0) * along_turn)[:, None] * towards, cosine
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
@@ -565,7 +567,7 @@ def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
     return torch.where(counts[:, None] > 0.0, means, colors[torch.from_numpy(nearest)])
 
 
-def _turned(flat: Tensor, degrees: Tensor) -> Tensor:
+def _rotate(flat: Tensor, degrees: Tensor) -> Tensor:
     """Return coordinates (N, 2) on a patch that is turned counter-clockwise."""
     angle = torch.deg2rad(degrees)
     cosine = torch.cos(angle)
@@ -600,12 +602,12 @@ def _rasterise_finely(
     return charts if map_side == first_side else images.rasterised(mesh, map_side)
 
 
-def _smooth(value: Tensor) -> Tensor:
+def _smooth_step(value: Tensor) -> Tensor:
     """Return the smooth step `3 t^2 - 2 t^3` from 0 at 0 to 1 at 1."""
     clipped = value.clamp(0.0, 1.0)
     return clipped.square() * (3.0 - 2.0 * clipped)
 
 
-def _fitted(base: Tensor, side: int) -> Tensor:
+def _resize_to_square(base: Tensor, side: int) -> Tensor:
     """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
     return images.resized(base, side, side, antialias=max(base.shape[:2]) > side)

@@ -54,10 +54,10 @@ class PoseControl(Control):
     )
 
     def check_choices(self) -> None:
-        given = self.chosen["on_ground"]
-        if given not in ("yes", "no", True, False):
+        choice = self.chosen["on_ground"]
+        if choice not in ("yes", "no", True, False):
             raise InputError(
-                f"{self.name}.on_ground: expected yes or no, got {given!r}"
+                f"{self.name}.on_ground: expected yes or no, got {choice!r}"
             )
 
     def scene_inputs(
@@ -65,7 +65,7 @@ class PoseControl(Control):
     ) -> dict[str, Tensor]:
         """Return the pose of the mesh, scaled and turned about its middle."""
         mesh = self.mesh_in(self.scene)
-        base, vertices, floor = _standing(mesh, self.scene.around.get(mesh.name))
+        base, vertices, floor = _get_base_pose(mesh, self.scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(
@@ -84,7 +84,9 @@ class PoseControl(Control):
 
 
 @lru_cache(maxsize=16)
-def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
+def _get_base_pose(
+    mesh: MeshPart, placed: MeshPart | None
+) -> tuple[Tensor, Tensor, float]:
     """Return where a mesh stands before it is posed.
 
     Args:
@@ -98,9 +100,9 @@ def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, 
     """
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
-    places = standing(placed)
+    positions = standing(placed)
     return (
         torch.from_numpy(placed.to_world).float(),
-        torch.from_numpy(places).float(),
-        float(places[:, 2].min()),
+        torch.from_numpy(positions).float(),
+        float(positions[:, 2].min()),
     )

@@ -144,9 +144,9 @@ class DrawnRange(Range):
         return values
 
     def _values(self, u: Tensor) -> Tensor:
-        shares = self.least + (self.most - self.least) * u.double().cpu().numpy()
+        probabilities = self.least + (self.most - self.least) * u.double().cpu().numpy()
         return torch.from_numpy(
-            np.clip(self.quantiles(np.asarray(shares)), self.low, self.high)
+            np.clip(self.quantiles(np.asarray(probabilities)), self.low, self.high)
         ).to(u)
 
     def coordinate(self, value: float, *, log: bool = False) -> float:
@@ -215,22 +215,22 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
 
 
 def _read_choices(
-    where: str, parameter: Parameter, given: Mapping[str, object]
+    label: str, parameter: Parameter, setting: Mapping[str, object]
 ) -> OneOf:
     """Parse {"choices": [...]}, perhaps with "weights"."""
-    values = given.get(CHOICES)
-    if not set(given) <= {CHOICES, WEIGHTS} or not _is_list(values) or not values:
+    values = setting.get(CHOICES)
+    if not set(setting) <= {CHOICES, WEIGHTS} or not _is_list(values) or not values:
         distribution = "" if parameter.options else " or {distribution: NAME, ...}"
         raise InputError(
-            f"{where}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
+            f"{label}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
             f"{{choices: [value, ...], "
-            f"weights: [number, ...]}}{distribution}, got {dict(given)!r}"
+            f"weights: [number, ...]}}{distribution}, got {dict(setting)!r}"
         )
     choice = _make_choice(
-        where, [_check_value(where, parameter, value) for value in values]
+        label, [_check_value(label, parameter, value) for value in values]
     )
-    if WEIGHTS in given:
-        return _make_weighted_choice(where, choice.values, given[WEIGHTS])
+    if WEIGHTS in setting:
+        return _make_weighted_choice(label, choice.values, setting[WEIGHTS])
     return choice
 
 
@@ -347,34 +347,34 @@ def by_distribution(spec: Spec) -> bool:
     )
 
 
-def _is_list(given: object) -> TypeGuard[Sequence[Any]]:
-    return isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
+    return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
-def _check_value(where: str, parameter: Parameter, given: object) -> Number:
+def _check_value(label: str, parameter: Parameter, value: object) -> Number:
     """Return a value of a parameter. Raises InputError: it cannot have it."""
     if parameter.options:
-        if not isinstance(given, str):
+        if not isinstance(value, str):
             raise InputError(
-                f"{where}: expected one of "
-                f"{', '.join(parameter.options)}, got {given!r}"
+                f"{label}: expected one of "
+                f"{', '.join(parameter.options)}, got {value!r}"
             )
-        if given not in parameter.options:
-            raise UnknownNameError(where, given, parameter.options)
-        return given
-    if parameter.unit == "name" and isinstance(given, str) and given.strip():
-        return given
-    if isinstance(given, bool) or not isinstance(given, (int, float)):
+        if value not in parameter.options:
+            raise UnknownNameError(label, value, parameter.options)
+        return value
+    if parameter.unit == "name" and isinstance(value, str) and value.strip():
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(
-            f"{where}: expected a number in {parameter.unit}, got {given!r}"
+            f"{label}: expected a number in {parameter.unit}, got {value!r}"
         )
-    if not (Parameter.is_number(given) and parameter.low <= given <= parameter.high):
+    if not (Parameter.is_number(value) and parameter.low <= value <= parameter.high):
         raise InputError(
-            f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} "
+            f"{label}: expected a number from {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}), "
-            f"got {shown(given)}"
+            f"got {shown(value)}"
         )
-    return float(given)
+    return float(value)
 
 
 TURN = 360.0
@@ -516,9 +516,9 @@ def read_drawn(
     arguments = {key: value for key, value in given.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(where, name, arguments)
     with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
-        least = float(frozen.cdf(parameter.low))
-        most = float(frozen.cdf(parameter.high))
-        outside = least + float(frozen.sf(parameter.high))
+        lower_probability = float(frozen.cdf(parameter.low))
+        upper_probability = float(frozen.cdf(parameter.high))
+        outside = lower_probability + float(frozen.sf(parameter.high))
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MOST_OUTSIDE:
         raise InputError(
@@ -528,9 +528,9 @@ def read_drawn(
             "choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )
-    least = max(least, 0.0 if has_end[0] else TAIL)
-    most = min(most, 1.0 if has_end[1] else 1.0 - TAIL)
-    return _make_range(where, frozen.ppf, least, most, text)
+    lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL)
+    upper_probability = min(upper_probability, 1.0 if has_end[1] else 1.0 - TAIL)
+    return _make_range(where, frozen.ppf, lower_probability, upper_probability, text)
 
 
 def _freeze_distribution(
@@ -570,25 +570,25 @@ def _freeze_distribution(
 
 
 def _read_python_quantiles(
-    where: str, parameter: Parameter, given: OwnQuantiles
+    label: str, parameter: Parameter, setting: OwnQuantiles
 ) -> DrawnRange:
     """Return the spec of a function from Python, an inverse CDF."""
-    name = str(given["name"])
+    name = str(setting["name"])
 
     def quantiles(probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = [float(given.function(float(p))) for p in probabilities.flat]
+        values = [float(setting.function(float(p))) for p in probabilities.flat]
         return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
-    least = 0.0 if has_end[0] else TAIL
-    most = 1.0 if has_end[1] else 1.0 - TAIL
-    probabilities = np.linspace(least, most, CHECKED)
+    lower_probability = 0.0 if has_end[0] else TAIL
+    upper_probability = 1.0 if has_end[1] else 1.0 - TAIL
+    probabilities = np.linspace(lower_probability, upper_probability, CHECKED)
     values = quantiles(probabilities)
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
         raise InputError(
-            f"{where}: expected values from {parameter.low:g} to {parameter.high:g} "
+            f"{label}: expected values from {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}) of {name}, got "
             f"{values[~is_inside][0]:g}"
         )
@@ -596,22 +596,29 @@ def _read_python_quantiles(
     if falls.any():
         index = int(falls.argmax())
         raise InputError(
-            f"{where}: expected an inverse CDF, whose values rise with the share, got "
+            f"{label}: expected an inverse CDF, whose values rise with the share, got "
             f"{values[index]:g} and then "
             f"{values[index + 1]:g} of {name}"
         )
     return _make_range(
-        where, quantiles, float(probabilities[0]), float(probabilities[-1]), name
+        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
     )
 
 
 def _make_range(
-    where: str, quantiles: Quantiles, least: float, most: float, text: str
+    setting_name: str,
+    quantiles: Quantiles,
+    lower_probability: float,
+    upper_probability: float,
+    label: str,
 ) -> DrawnRange:
     """Return a range between two probabilities of a distribution."""
-    low, high = (float(value) for value in quantiles(np.array([least, most])))
+    low, high = (
+        float(value)
+        for value in quantiles(np.array([lower_probability, upper_probability]))
+    )
     if not low < high:
         raise InputError(
-            f"{where}: {text} has only the value {low:g}; write that to fix it"
+            f"{setting_name}: {label} has only the value {low:g}; write that to fix it"
         )
-    return DrawnRange(low, high, quantiles, least, most, text)
+    return DrawnRange(low, high, quantiles, lower_probability, upper_probability, label)

@@ -157,10 +157,12 @@ def through_sensor(
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
-    seen = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
+    display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     return (
-        images.coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+        images.coded(display, 100 - compression).clamp(0.0, 1.0)
+        if compression
+        else display
     )
 
 
@@ -169,9 +171,9 @@ def vignette(height: int, width: int, amount: Tensor) -> Tensor:
 
     `amount` () is missing in the corners.
     """
-    down, across = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
+    down, right = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
     corner = (height**2 + width**2) / 4.0
-    square = (down[:, None] ** 2 + across[None, :] ** 2) / corner
+    square = (down[:, None] ** 2 + right[None, :] ** 2) / corner
     return ((1.0 + ((1.0 - amount) ** -0.5 - 1.0) * square.to(amount)) ** -2)[..., None]
 
 
@@ -181,12 +183,12 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
     Red is larger by a factor 1 + amount about the middle, blue is smaller.
     """
     height, width = image.shape[:2]
-    down, across = torch.meshgrid(
+    down, right = torch.meshgrid(
         torch.arange(height) + 0.5 - height / 2,
         torch.arange(width) + 0.5 - width / 2,
         indexing="ij",
     )
-    outwards = torch.stack([across, down], dim=-1).to(image)
+    outwards = torch.stack([right, down], dim=-1).to(image)
     red, blue = (
         images.warped(
             image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)
@@ -206,12 +208,12 @@ def demosaiced(light: Tensor) -> Tensor:
     columns = torch.arange(width)[None, :] % 2
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
-    kept = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
+    is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
     kernel = light.new_tensor(
         [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
     ).expand(3, 1, 3, 3)
-    total = F.conv2d(images.planes(light * kept), kernel, padding=1, groups=3)
-    weight = F.conv2d(images.planes(kept), kernel, padding=1, groups=3)
+    total = F.conv2d(images.planes(light * is_measured), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.planes(is_measured), kernel, padding=1, groups=3)
     return torch.where(
-        kept > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
+        is_measured > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
     )

@@ -137,13 +137,17 @@ class ShadowControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add the card, out of sight."""
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        away = geometry.put_away(
+        hidden_pose = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
         card = parts.polygon(int(self.chosen["corners"]))
         return scene.with_part(
             parts.MeshPart(
-                self.name, card, texel, assets.Material(roughness=1.0), to_world=away
+                self.name,
+                card,
+                texel,
+                assets.Material(roughness=1.0),
+                to_world=hidden_pose,
             )
         )
 

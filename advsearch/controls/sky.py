@@ -107,8 +107,8 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     `cos(psi)^j` of the limb's darkening has the mean `2 / (j + 2)` over the disk.
     """
     radians = torch.deg2rad(elevation)
-    share = float(radians.detach()) / (math.pi / 2.0)
-    piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
+    fraction = float(radians.detach()) / (math.pi / 2.0)
+    piece = min(44, int(45.0 * max(0.0, fraction) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
     terms = _at_turbidity(tables(radians.device)[2], turbidity)[piece]
     limb = torch.tensor(
@@ -307,9 +307,9 @@ class SkyControl(Control):
         super().fit()
         start = self.values(self.start)
         # the sun's azimuth does not matter
-        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]
+        arguments = torch.tensor(0.0), start["elevation"], start["turbidity"]
         self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(
-            *numbers
+            *arguments
         )[1]
 
     def scene_inputs(
@@ -322,14 +322,14 @@ class SkyControl(Control):
 
         Differentiable.
         """
-        numbers = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(
-            *numbers
+        arguments = values["azimuth"], values["elevation"], values["turbidity"]
+        radiance, metered = sky_over(self.scene.ground_color, arguments[0].device)(
+            *arguments
         )
-        fixed = self.chosen["exposure"] == "fixed"
+        is_fixed = self.chosen["exposure"] == "fixed"
         return radiance * (
             METERED_IRRADIANCE
-            / (self._metered.to(radiance.device) if fixed else metered)
+            / (self._metered.to(radiance.device) if is_fixed else metered)
         )
 
 

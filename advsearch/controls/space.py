@@ -195,10 +195,12 @@ class Space:
 
         See `Control.printed`.
         """
-        printed = (
+        colors_by_control = (
             (control.name, control.printed(part)) for control, part in self.slices(u)
         )
-        return {name: colors for name, colors in printed if colors is not None}
+        return {
+            name: colors for name, colors in colors_by_control if colors is not None
+        }
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
         """Return the numbers of a configuration by parameter ("pose.yaw").
@@ -267,8 +269,8 @@ class Space:
         """
         for group in self.groups:
             if group.setting == ENVIRONMENT:
-                chosen = str(values[group.name]["value"])
-                return None if chosen == OWN_MAP else chosen
+                name = str(values[group.name]["value"])
+                return None if name == OWN_MAP else name
         return self.environment
 
     def notes(self, scene: SceneDescription) -> tuple[str, ...]:

@@ -409,14 +409,14 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
         radius: largest change of a texel value.
     """
     index = torch.arange(count)
-    down, across = (
+    down, right = (
         torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * index / side)
         for side in where.shape
     )
     frequency = torch.hypot(index[:, None].float(), index[None, :].float())
     reach = (WAVE_REACH / (1.0 + frequency))[..., None]
     start = torch.full((count * count * 3,), 0.5)
-    texels = partial(_paint_waves, original, where, radius, (down, across, reach))
+    texels = partial(_paint_waves, original, where, radius, (down, right, reach))
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
 
 
@@ -428,9 +428,9 @@ def _paint_waves(
     u: Tensor,
 ) -> Tensor:
     """Return the texels (n, 3) with the waves of a slice u; see `waved`."""
-    down, across, reach = (wave.to(u.device) for wave in waves)
+    down, right, reach = (wave.to(u.device) for wave in waves)
     amplitudes = (2.0 * u - 1.0).reshape(*reach.shape[:2], 3) * reach
-    summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)
+    summed = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
     change = radius * torch.tanh(summed[where.to(u.device)])
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 

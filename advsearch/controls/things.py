@@ -187,11 +187,11 @@ class ThingsControl(Control):
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_foot(part)).to(base)
             turn = geometry.euler(values[f"{name}.heading"], *base.new_zeros(2))
-            is_away = values[f"{name}.presence"]
-            if is_away:
+            is_absent = values[f"{name}.presence"]
+            if is_absent:
                 turn = AWAY * turn
             position = base.new_tensor([*stand.position, stand.height])
-            sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * is_away
+            sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * is_absent
             translation = position - sunk - turn @ foot
             inputs[f"{name}.to_world"] = geometry.affine(turn, translation) @ base
         return inputs
@@ -271,7 +271,7 @@ class ThingsControl(Control):
             solids: of the place, which it goes towards the object for.
         """
         scene = self.scene
-        x, y, heading, is_away = (
+        x, y, heading, is_absent = (
             float(values[f"{name}.{parameter.name}"].detach())
             for parameter in self.parameters
         )
@@ -279,15 +279,17 @@ class ThingsControl(Control):
         requested = foot[:2] + np.array([x, y]) / scene.metres
         outline = _rotate_outline(base.outline - foot[:2], heading)
         direction = _unit_direction(requested - object_center)
-        pushed = 0.0
-        if not is_away:
+        push_distance = 0.0
+        if not is_absent:
             footprint = parts.Footprint(outline + requested, base.low, base.high)
             gap = GAP / scene.metres
-            pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
-        position = requested + pushed * direction
+            push_distance = _find_free_shift(
+                footprint, direction, obstacles, solids, gap
+            )
+        position = requested + push_distance * direction
         lift = foot[2] - scene.ground_height(foot[:2])
         height = lift + scene.ground_height(position)
-        return Stand(position, height, pushed), outline + position
+        return Stand(position, height, push_distance), outline + position
 
 
 def _rotate_outline(outline: assets.Doubles, degrees: float) -> assets.Doubles:

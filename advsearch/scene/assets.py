@@ -131,12 +131,12 @@ class Material:
 
         Their names are `prefix` and the attribute's.
         """
-        given = {
+        replaced = {
             name: value
             for name in vars(self)
             if (value := values.get(prefix + name)) is not None
         }
-        return replace(self, **given)
+        return replace(self, **replaced)
 
 
 @dataclass(frozen=True)
@@ -239,16 +239,16 @@ class EnvironmentAsset:
 
     def __post_init__(self) -> None:
         """Check the radiance. Raises InputError: a texel is negative, NaN or infinite."""
-        bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
-        if bad.any():
-            row, column = np.unravel_index(int(bad.argmax()), bad.shape)
-            found = (
-                f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or "
+        is_bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
+        if is_bad.any():
+            row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
+            description = (
+                f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN or "
                 "infinite"
             )
             raise InputError(
                 f"environment {self.name!r}: expected finite radiance of at least 0, "
-                f"got {found} (the first in row "
+                f"got {description} (the first in row "
                 f"{row}, column {column}); clamp them"
             )
 
@@ -325,7 +325,7 @@ def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
     for grid in GRIDS:
         cluster_of = _cluster_vertices(mesh, grid)
         # vertices of a cluster in different parts of the texture stay apart
-        cluster_and_chart = _key(np.column_stack([cluster_of, chart]))
+        cluster_and_chart = _encode_rows(np.column_stack([cluster_of, chart]))
         _, representative, new_vertex = np.unique(
             cluster_and_chart, return_index=True, return_inverse=True
         )
@@ -361,10 +361,10 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> Ints:
     extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
     scaled = (mesh.vertices - lower) / extent * (grid - 1)
     cells = np.floor(scaled + 0.5).astype(np.int64)
-    return np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
+    return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
 
 
-def _key(rows: Ints) -> Ints:
+def _encode_rows(rows: Ints) -> Ints:
     """Return one number for each row of whole numbers, the same for equal rows only."""
     low = rows.min(axis=0)
     sizes = rows.max(axis=0) - low + 1
@@ -485,13 +485,13 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
         float(size) if size is not None else (asset.extent or 0.0) * UNITS[unit or "m"]
     )
     if not SMALLEST <= metres <= LARGEST:
-        said = (
+        statement = (
             f"size={size:g}"
             if size is not None
             else (f"unit={unit} for a mesh of {asset.extent:.4g}")
         )
         raise InputError(
-            f"{said}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
+            f"{statement}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
             f"got {metres:.4g}; give it in "
             "metres, such as size=4.9"
         )
@@ -515,29 +515,31 @@ def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
         None,
     )
     low, high = (0.005, 100.0) if kind is None else USUAL[kind]
-    strange = asset.metres is not None and not low <= asset.metres <= high
-    missing = asset.metres is None and (
+    is_unusual = asset.metres is not None and not low <= asset.metres <= high
+    is_unknown = asset.metres is None and (
         laid or (kind is not None and asset.extent is not None)
     )
-    if asked or not (strange or missing):
+    if asked or not (is_unusual or is_unknown):
         return ()
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
     fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
-    what = [
+    clauses = [
         f"its longest side is {rounded(asset.metres or 0.0)} m"
-        if strange
+        if is_unusual
         else "its size in metres is not known",
-        f"it is {rounded(extent)} in its file" if missing and extent else "",
+        f"it is {rounded(extent)} in its file" if is_unknown and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
-        "it is taken for 1 m, as the road is in metres" if missing and laid else "",
+        "it is taken for 1 m, as the road is in metres" if is_unknown and laid else "",
     ]
-    give = f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
+    remedy = (
+        f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
+    )
     if fits:
-        give += (
+        remedy += (
             f", or `unit={fits[0]}`, which makes it "
             f"{rounded(extent * UNITS[fits[0]])} m"
         )
     return (
-        f"{asset.name}: {'; '.join(filter(None, what))}. "
-        f"{'If that is wrong, g' if strange else 'G'}{give[1:]}",
+        f"{asset.name}: {'; '.join(filter(None, clauses))}. "
+        f"{'If that is wrong, g' if is_unusual else 'G'}{remedy[1:]}",
     )

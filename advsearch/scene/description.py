@@ -135,18 +135,18 @@ class SceneDescription:
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part. Raises InputError: its name is taken."""
-        taken = {own.name: own for own in self.parts}
-        if part.name in (OBJECT, "environment", "ground", "camera", *taken):
-            plugin = isinstance(taken.get(part.name), PluginPart)
-            instead = (
+        part_by_name = {existing.name: existing for existing in self.parts}
+        if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
+            is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
+            alternative = (
                 f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]"
-                if plugin
+                if is_plugin
                 else ""
             )
             raise InputError(
                 f"`controls` {part.name}: the scene has something of that name "
                 "already; choose another name, as in "
-                f"light:{part.name}-2{instead}"
+                f"light:{part.name}-2{alternative}"
             )
         return replace(self, parts=(*self.parts, part))
 
@@ -303,8 +303,8 @@ class SceneDescription:
             name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
         }
         return meshes | {
-            name: replace(one, to_world=meshes[one.carrier].to_world)
-            for name, one in glasses.items()
+            name: replace(glass, to_world=meshes[glass.carrier].to_world)
+            for name, glass in glasses.items()
         }
 
     @cached_property
@@ -321,15 +321,15 @@ class SceneDescription:
     def cut_out(self) -> bool:
         return any(
             mesh.opacity is not None for mesh in self.meshes.values()
-        ) or self._has("mask")
+        ) or self._has_plugin("mask")
 
     @property
     def normal_mapped(self) -> bool:
         return any(
             mesh.normal_map is not None for mesh in self.meshes.values()
-        ) or self._has("normalmap", "bumpmap")
+        ) or self._has_plugin("normalmap", "bumpmap")
 
-    def _has(self, *kinds: str) -> bool:
+    def _has_plugin(self, *kinds: str) -> bool:
         """Return whether a Mitsuba plugin of one of these kinds is in the scene."""
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
@@ -397,21 +397,33 @@ class SceneDescription:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know of how the scene was read, and remarks of controls."""
-        lit = () if self.environment is None else self.environment.warnings
-        seen = () if self.camera_model is None else self.camera_model.notes
-        size = doubts(self.object, asked=self.size is not None, laid=paved(self))
+        light_notes = () if self.environment is None else self.environment.warnings
+        camera_notes = () if self.camera_model is None else self.camera_model.notes
+        size_remarks = doubts(
+            self.object, asked=self.size is not None, laid=paved(self)
+        )
         front = self.object.front
-        faces = (
+        front_remarks = (
             (front.reason,)
             if front is not None and (self.is_in_lane or has_lanes(self))
             else ()
         )
-        drives = (traffic_remark(self),) if self._meets_traffic else ()
-        notes = (*self.object.notes, *faces, *size, *lit, *seen, *drives, *self.remarks)
+        traffic_remarks = (
+            (traffic_remark(self),) if self._drives_against_traffic else ()
+        )
+        notes = (
+            *self.object.notes,
+            *front_remarks,
+            *size_remarks,
+            *light_notes,
+            *camera_notes,
+            *traffic_remarks,
+            *self.remarks,
+        )
         return tuple(dict.fromkeys(note for note in notes if note))
 
     @property
-    def _meets_traffic(self) -> bool:
+    def _drives_against_traffic(self) -> bool:
         return self.is_seen_from_orbit and is_against_traffic(
             self, geometry.camera_to_world(self)
         )
@@ -475,17 +487,17 @@ class SceneDescription:
     @property
     def given_values(self) -> dict[str, float | str]:
         """The settings that were requested, as users write them: a choice by its name."""
-        asked: dict[str, float | str] = {}
+        requested: dict[str, float | str] = {}
         for name in self.given & self.values.keys():
             value = self.values[name]
             setting = settings.parameter_of(name)
             if value is not None:
-                asked[name] = (
+                requested[name] = (
                     setting.options[int(value)]
                     if setting is not None and setting.options
                     else value
                 )
-        return asked
+        return requested
 
     @property
     def photograph(self) -> Photograph | None:
@@ -495,21 +507,23 @@ class SceneDescription:
         unless a table is described or the environment may be hidden behind a color,
         which would hide everything above the horizon alone.
         """
-        own = self.environment
+        environment = self.environment
         kind = self.values.get("ground.kind")
-        if own is None or self.number("ground.size") == 0.0:
+        if environment is None or self.number("ground.size") == 0.0:
             return None
         if kind is not None:
-            shows = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
+            shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
         else:
-            shows = (
-                own.photographed
+            shows_photograph = (
+                environment.photographed
                 and not self.backdrop
                 and self.given.isdisjoint(settings.TABLE_SETTINGS)
             )
         return (
-            photograph_of(own, self.capture_height, self.number("environment.rotation"))
-            if shows
+            photograph_of(
+                environment, self.capture_height, self.number("environment.rotation")
+            )
+            if shows_photograph
             else None
         )
 
@@ -608,7 +622,9 @@ def describe(
     lit_by = environment_spec or (NO_MAP if is_lit else DEFAULT_ENVIRONMENT)
     check_ground(given, lit_by)
     if lit_by != NO_MAP:
-        check_one_environment(imported.surroundings, f"`environment={_spec(lit_by)}`")
+        check_one_environment(
+            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
+        )
     if is_scene_file and not {"ground.size", "ground.kind"} & set(given):
         values["ground.size"] = 0.0
     requested = set(given)
@@ -621,8 +637,8 @@ def describe(
         imported.object,
         _load_environment(lit_by),
         values,
-        _spec(object_spec),
-        _spec(lit_by),
+        _spec_text(object_spec),
+        _spec_text(lit_by),
         up,
         facing,
         size,
@@ -677,10 +693,10 @@ def _has_lights(parts: Iterable[ScenePart]) -> bool:
     )
 
 
-def _describes_orbit(given: settings.Given) -> bool:
+def _describes_orbit(requested: settings.Given) -> bool:
     """Return whether settings say where the camera around the object is."""
     return any(
-        name.startswith("camera.") and name != "camera.exposure" for name in given
+        name.startswith("camera.") and name != "camera.exposure" for name in requested
     )
 
 
@@ -700,9 +716,9 @@ def _load_environment(
     return library.load_environment(str(lit_by))
 
 
-def _check_material_settings(asset: ObjectAsset, given: settings.Given) -> None:
+def _check_material_settings(asset: ObjectAsset, requested: settings.Given) -> None:
     """Check that settings of the material apply. Raises InputError: they do not."""
-    material_settings = [name for name in given if name.startswith("material.")]
+    material_settings = [name for name in requested if name.startswith("material.")]
     if asset.surface is not None and material_settings:
         surface = "a surface of Mitsuba's own"
         if asset.finishes:
@@ -770,7 +786,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         )
 
 
-def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
+def _spec_text(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
     return spec.name if isinstance(spec, (ObjectAsset, EnvironmentAsset)) else str(spec)
 
 

@@ -119,10 +119,12 @@ def framing_distance(
     )
     axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
-    (wide, high) = edge * FRAME_FILL
-    fits = (outwards + torch.maximum(left.abs() / wide, up.abs() / high)).max()
-    whole = _from_all_around(offsets, elevation, edge)
-    return torch.maximum(fits, whole).clamp_min(
+    (half_width, half_height) = edge * FRAME_FILL
+    from_default_view = (
+        outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
+    ).max()
+    from_all_around = _framing_distance_all_around(offsets, elevation, edge)
+    return torch.maximum(from_default_view, from_all_around).clamp_min(
         float(offsets.norm(dim=1).max()) + CLEARANCE
     )
 
@@ -159,7 +161,9 @@ def middle(description: SceneDescription) -> Doubles:
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
-def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
+def _framing_distance_all_around(
+    offsets: Tensor, elevation: float, tangents: Tensor
+) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.
 
     Seen from all around, a vertex runs through a circle of radius rho at height z: what
@@ -170,11 +174,15 @@ def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Ten
     z = offsets[:, 2]
     cosine = math.cos(math.radians(elevation))
     sine = math.sin(math.radians(elevation))
-    across = 1.0 / tangents[0]
-    along = 1.0 / tangents[1]
-    aside = rho * torch.sqrt(across**2 + cosine**2) + z * sine
-    above = rho * (cosine - sine * along).abs() + z * (sine + cosine * along)
-    below = rho * (cosine + sine * along).abs() + z * (sine - cosine * along)
+    inverse_width = 1.0 / tangents[0]
+    inverse_height = 1.0 / tangents[1]
+    aside = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
+    above = rho * (cosine - sine * inverse_height).abs() + z * (
+        sine + cosine * inverse_height
+    )
+    below = rho * (cosine + sine * inverse_height).abs() + z * (
+        sine - cosine * inverse_height
+    )
     return torch.stack([aside.max(), above.max(), below.max()]).max()
 
 
@@ -211,7 +219,7 @@ def object_to_world(description: SceneDescription) -> Doubles:
         parameter.name: description.number(f"pose.{parameter.name}")
         for parameter in POSE
     }
-    return _posed(vertices, 0.0, pose)
+    return _compute_pose(vertices, 0.0, pose)
 
 
 def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
@@ -221,16 +229,20 @@ def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     and so on.
     """
     pose = {
-        own.name: value
-        for own in POSE
-        if (value := values.get(f"pose:{part.name}.{own.name}")) is not None
+        parameter.name: value
+        for parameter in POSE
+        if (value := values.get(f"pose:{part.name}.{parameter.name}")) is not None
     }
     if pose:
-        places = standing(part)
-        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
+        positions = standing(part)
+        pose = {
+            **{parameter.name: float(parameter.default) for parameter in POSE},
+            **pose,
+        }
         part = replace(
             part,
-            to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world,
+            to_world=_compute_pose(positions, float(positions[:, 2].min()), pose)
+            @ part.to_world,
         )
     return replace(
         part, material=part.material.with_values(values, f"material:{part.name}.")
@@ -245,20 +257,22 @@ def standing(part: MeshPart) -> Doubles:
     )
 
 
-def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
+def _compute_pose(
+    positions: Doubles, floor: float, pose: Mapping[str, float]
+) -> Doubles:
     """Return the pose (4, 4) by parameters of `settings.POSE`.
 
     Scale and rotate positions (V, 3) about the middle of their bounding box, put the
     lowest at `floor`, and shift.
     """
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
-    lowest = float(((places - middle) @ linear.T)[:, 2].min())
-    place = (
+    lowest = float(((positions - middle) @ linear.T)[:, 2].min())
+    translation = (
         np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
     )
-    place[:2] += middle[:2]
-    return pose_of(linear, place)
+    translation[:2] += middle[:2]
+    return pose_of(linear, translation)
 
 
 def camera_to_world(
@@ -278,24 +292,28 @@ def camera_to_world(
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
-    number = description.number
-    if (asked := description.values["camera.distance"]) is not None:
-        distance = asked / description.metres
+    get_number = description.number
+    if (requested_distance := description.values["camera.distance"]) is not None:
+        distance = requested_distance / description.metres
     else:
         distance = float(
             framing_distance(
                 description,
-                torch.tensor(number("camera.fov"), dtype=torch.float64),
+                torch.tensor(get_number("camera.fov"), dtype=torch.float64),
                 aspect,
             )
         )
-    elevation = number("camera.elevation")
+    elevation = get_number("camera.elevation")
     height = description.values.get("camera.height")
     if height is not None:
-        above = (height / description.metres - float(middle(description)[2])) / distance
-        elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
-    azimuth = description.azimuth_zero + number("camera.azimuth")
-    axes = camera_axes(azimuth, elevation, number("camera.roll"))
+        height_above_center = (
+            height / description.metres - float(middle(description)[2])
+        ) / distance
+        elevation = math.degrees(
+            math.asin(min(max(height_above_center, -STEEPEST), STEEPEST))
+        )
+    azimuth = description.azimuth_zero + get_number("camera.azimuth")
+    axes = camera_axes(azimuth, elevation, get_number("camera.roll"))
     return pose_of(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),
         middle(description) + distance * axes[2],
@@ -320,7 +338,7 @@ def projected(
         (N, 2) pixels to the right and down from the middle of the image; (N,) bool,
             which are before the camera.
     """
-    sides = torch.tensor(size[::-1], dtype=torch.float64)
+    image_size = torch.tensor(size[::-1], dtype=torch.float64)
     # to the right, down and ahead
     points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)
     if (model := description.camera_model) is not None:
@@ -329,8 +347,8 @@ def projected(
             if "camera.lens" in inputs
             else model
         )
-        places, seen = model.project(points)
-        return (places - 0.5) * sides, seen
+        positions, is_visible = model.project(points)
+        return (positions - 0.5) * image_size, is_visible
     fov = (
         inputs.get("camera.fov", torch.tensor(description.number("camera.fov")))
         .double()
@@ -338,11 +356,11 @@ def projected(
     )
     focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
-    places = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
+    positions = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
-            places[:, axis] -= sides[axis] * inputs[name].double().reshape(())
-    return places, depth > NEAREST
+            positions[:, axis] -= image_size[axis] * inputs[name].double().reshape(())
+    return positions, depth > NEAREST
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
@@ -363,12 +381,12 @@ def driving(camera: Tensor) -> Tensor:
     It is level, with its +x ahead, on the ground below the camera; differentiable.
     """
     ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    none = torch.zeros_like(ahead[0])
-    along = torch.ones_like(ahead[0])
+    zero = torch.zeros_like(ahead[0])
+    one = torch.ones_like(ahead[0])
     axes = torch.stack(
-        [ahead[0], -ahead[1], none, ahead[1], ahead[0], none, none, none, along]
+        [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, one]
     ).reshape(3, 3)
-    return affine(axes, torch.cat([camera[:2, 3], none[None]]))
+    return affine(axes, torch.cat([camera[:2, 3], zero[None]]))
 
 
 @lru_cache(maxsize=4)
@@ -493,17 +511,17 @@ def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, floa
             for points in (one.outline, other.outline)
         ]
     )
-    across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    first = one.outline @ across.T
-    second = other.outline @ across.T
-    speed = across @ way
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    moving_range = one.outline @ normals.T
+    fixed_range = other.outline @ normals.T
+    speed = normals @ way
     reach = np.stack(
-        [second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)]
+        [fixed_range.min(axis=0) - moving_range.max(axis=0), fixed_range.max(axis=0) - moving_range.min(axis=0)]
     )
-    still = speed == 0.0
-    if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
+    is_parallel = speed == 0.0
+    if (is_parallel & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
         return math.inf, -math.inf
-    stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
+    stretches = np.sort(reach[:, ~is_parallel] / speed[~is_parallel], axis=0)
     begin = float(stretches[0].max())
     end = float(stretches[1].min())
     return (begin, end) if begin < end else (math.inf, -math.inf)

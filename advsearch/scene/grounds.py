@@ -104,12 +104,14 @@ class Photograph:
         last one is straight down, and columns are those of the map.
         """
         rows = radiance.shape[0]
-        at = torch.arange(self._first, self._rows, device=radiance.device) * (
+        position = torch.arange(self._first, self._rows, device=radiance.device) * (
             (rows - 1) / (self._rows - 1)
         )
-        upper = at.floor().long().clamp_max(rows - 2)
-        share = (at - upper)[:, None, None].to(radiance.dtype)
-        lower_half = radiance[upper] + share * (radiance[upper + 1] - radiance[upper])
+        upper = position.floor().long().clamp_max(rows - 2)
+        fraction = (position - upper)[:, None, None].to(radiance.dtype)
+        lower_half = radiance[upper] + fraction * (
+            radiance[upper + 1] - radiance[upper]
+        )
         arriving = irradiance(radiance)
         return torch.where(
             arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
@@ -341,24 +343,24 @@ def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
     """
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
-    behind = (FACTOR - 1.0) * _reach(environment.stands, camera.towards)
+    behind = (FACTOR - 1.0) * _reach_of_area(environment.stands, camera.towards)
     unseen = (
         math.inf
         if camera.lowest <= 0.0
         else camera.height / math.tan(math.radians(min(camera.lowest, 179.0)))
     )
     return max(
-        0.0, min(behind, _reach(environment.laid, camera.azimuth) + unseen)
+        0.0, min(behind, _reach_of_area(environment.laid, camera.azimuth) + unseen)
     ), FACTOR * environment.height
 
 
-def _reach(area: Box | float, azimuth: float) -> float:
+def _reach_of_area(area: Box | float, azimuth: float) -> float:
     if isinstance(area, float):
         return area
     x = math.cos(math.radians(azimuth))
     y = math.sin(math.radians(azimuth))
-    across = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
-    return min(across, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
+    x_reach = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
+    return min(x_reach, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
 
 
 def surroundings_of(scene: SceneDescription) -> Surroundings | None:
@@ -366,27 +368,35 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
 
     None where nothing of it has to fit a ground.
     """
-    lit = scene.environment
+    environment = scene.environment
     # what encloses the object is geometry, true from everywhere
-    if lit is None or scene.backdrop or enclosed(scene):
+    if environment is None or scene.backdrop or enclosed(scene):
         return None
     place = find_place(scene)
-    laid: Box | float = math.inf if place is None else bound_ground(place)
-    bundled = PLACES.get(lit.ground or "")
-    shown = lit.place if bundled is None else load_bundled_place(*bundled)
-    if place is not None and shown is not None and shown.file.picture is not None:
-        picture = shown.file.picture
+    extent: Box | float = math.inf if place is None else bound_ground(place)
+    bundled = PLACES.get(environment.ground or "")
+    pictured_place = (
+        environment.place if bundled is None else load_bundled_place(*bundled)
+    )
+    if (
+        place is not None
+        and pictured_place is not None
+        and pictured_place.file.picture is not None
+    ):
+        picture = pictured_place.file.picture
         return Surroundings(
             picture.height,
             (*picture.x, *picture.y),
-            laid,
+            extent,
             scene.number("environment.rotation"),
         )
-    if lit.photographed and (paved(scene) or scene.photograph is not None):
+    if environment.photographed and (paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.metres
         radius = scene.values.get("ground.radius")
-        return Surroundings(height, RADIUS * height if radius is None else radius, laid)
-    return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
+        return Surroundings(
+            height, RADIUS * height if radius is None else radius, extent
+        )
+    return Surroundings(math.inf, math.inf, extent) if paved(scene) else None
 
 
 def bound_ground(place: Place) -> Box:
@@ -410,18 +420,18 @@ def view_of(
     x, y, z = pose[:3, 3] * scene.metres
     ahead = pose[:3, 2]
     half = math.radians(scene.number("camera.fov") if fov is None else fov) / 2.0
-    below = math.degrees(math.atan(math.tan(half) * min(1.0, 1.0 / scene.aspect)))
+    half_height = math.degrees(math.atan(math.tan(half) * min(1.0, 1.0 / scene.aspect)))
     if scene.camera_model is not None and scene.camera_model.name:
-        below = 90.0
+        half_height = 90.0
     azimuth = math.degrees(math.atan2(y, x))
-    level = math.hypot(ahead[0], ahead[1])
-    towards = (
+    level_length = math.hypot(ahead[0], ahead[1])
+    direction = (
         math.degrees(math.atan2(ahead[1], ahead[0]))
-        if level > 1e-6
+        if level_length > 1e-6
         else azimuth + 180.0
     )
-    lowest = below - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
-    return CameraView(azimuth, towards, math.hypot(x, y), float(z), lowest)
+    lowest = half_height - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
+    return CameraView(azimuth, direction, math.hypot(x, y), float(z), lowest)
 
 
 def place_of(view: CameraView) -> Doubles:

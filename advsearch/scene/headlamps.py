@@ -214,8 +214,11 @@ def _make_lamps(
         metres = part.metres if isinstance(part, ThingPart) else scene.metres
         # a metre in its coordinates
         step = float(np.ptp(part.mesh.vertices, axis=0).max()) / metres
-        front = _glass(part, "headlamps", 1.0, step, GLASS / unit * WHITE)
-        yield from (front, _glass(part, "taillamps", -1.0, step, REAR / unit * RED))
+        front = _make_glass(part, "headlamps", 1.0, step, GLASS / unit * WHITE)
+        yield from (
+            front,
+            _make_glass(part, "taillamps", -1.0, step, REAR / unit * RED),
+        )
         positions = _find_beam_positions(front.mesh.vertices, step)
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
@@ -248,7 +251,7 @@ def _find_beam_positions(vertices: Floats, step: float) -> list[Doubles]:
     return positions
 
 
-def _glass(
+def _make_glass(
     part: MeshPart, where: str, ahead: float, step: float, power: Doubles
 ) -> LampGlass:
     """Return the glass of a car's two headlamps or tail lamps.
@@ -265,13 +268,13 @@ def _glass(
             there.
     """
     mesh = part.mesh
-    named = [
+    named_faces = [
         faces
         for name, faces in mesh.materials.items()
         if NAMED[where].search(name) and len(faces)
     ]
-    if named:
-        lies_on = np.concatenate(named)
+    if named_faces:
+        lies_on = np.concatenate(named_faces)
         follows, faces = np.unique(
             mesh.faces[lies_on].astype(np.int64), return_inverse=True
         )
@@ -279,21 +282,21 @@ def _glass(
         normals = mesh.normals[follows].astype(np.float64)
         vertices = mesh.vertices[follows] + OUT * step * normals
     else:
-        vertices, faces = _disks(mesh, where, ahead, step)
+        vertices, faces = _make_disks(mesh, where, ahead, step)
         normals = np.tile([[ahead, 0.0, 0.0]], (len(vertices), 1))
         follows = cKDTree(mesh.vertices).query(vertices)[1]
         lies_on = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(
             vertices[faces].mean(axis=1)
         )[1]
     corners = vertices[faces] / step
-    across = ahead * face_vectors(corners)[:, 0] / 2.0
+    facing_area = ahead * face_vectors(corners)[:, 0] / 2.0
     shape = (
         vertices.astype(np.float32),
         faces.astype(np.uint32),
         normals.astype(np.float32),
         mesh.uvs[follows],
     )
-    radiance = 2.0 * power / max(float(across.clip(0.0).sum()), 1e-9)
+    radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
         name=f"{part.name}-{where}",
         mesh=Mesh(*shape),
@@ -306,7 +309,9 @@ def _glass(
     )
 
 
-def _disks(mesh: Mesh, where: str, ahead: float, step: float) -> tuple[Doubles, Ints]:
+def _make_disks(
+    mesh: Mesh, where: str, ahead: float, step: float
+) -> tuple[Doubles, Ints]:
     """Make two disks before what is foremost of a car, for lamps without a material.
 
     Args:

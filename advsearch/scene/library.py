@@ -46,12 +46,16 @@ def finished(
     Some materials of the mesh as `finishes` say, and all other faces like `main`, whose
     `specular` holds for all.
     """
-    faces = np.tile(
+    face_values = np.tile(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
     )
-    for name, one in finishes.items():
-        faces[mesh.materials[name]] = one.roughness, one.metallic, one.clearcoat
-    maps = faces[rasterised(mesh, SIDE).face].astype(np.float32)
+    for name, finish in finishes.items():
+        face_values[mesh.materials[name]] = (
+            finish.roughness,
+            finish.metallic,
+            finish.clearcoat,
+        )
+    texel_values = face_values[rasterised(mesh, SIDE).face].astype(np.float32)
     surface: dict[str, object] = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
@@ -59,7 +63,7 @@ def finished(
         "clearcoat_gloss": 1.0,
     }
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
-        picture = maps[:, :, channel : channel + 1]
+        picture = texel_values[:, :, channel : channel + 1]
         surface[name] = {
             "type": "bitmap",
             "bitmap": picture,
@@ -81,7 +85,7 @@ MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, wor
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
-def _data() -> Traversable:
+def _data_directory() -> Traversable:
     return resources.files("advsearch.bundled") / "data"
 
 
@@ -89,7 +93,7 @@ def list_objects() -> tuple[str, ...]:
     return tuple(
         sorted(
             p.name
-            for p in (_data() / "objects").iterdir()
+            for p in (_data_directory() / "objects").iterdir()
             if (p / "mesh.ply").is_file()
         )
     )
@@ -100,14 +104,14 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
     `split` selects those of "train", "heldout", "street" or "place".
     """
-    facts = _environments().items()
+    facts = _read_environment_facts().items()
     return tuple(
         sorted(name for name, fact in facts if split is None or fact["split"] == split)
     )
 
 
-def _environments() -> dict[str, dict[str, Any]]:
-    text = (_data() / "environments" / "environments.json").read_text("utf-8")
+def _read_environment_facts() -> dict[str, dict[str, Any]]:
+    text = (_data_directory() / "environments" / "environments.json").read_text("utf-8")
     facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
@@ -124,7 +128,7 @@ def load_object(name: str) -> ObjectAsset:
     known = list_objects()
     if name not in known:
         raise UnknownNameError("object", name, known, OBJECT_HINT)
-    directory = _data() / "objects" / name
+    directory = _data_directory() / "objects" / name
     try:
         facts = json.loads((directory / "object.json").read_text("utf-8"))
         mesh = _read_mesh(name, directory, facts.get("faces", ()))
@@ -210,10 +214,10 @@ def load_environment(name: str) -> EnvironmentAsset:
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
-    facts = _environments()[name]
+    facts = _read_environment_facts()[name]
     try:
         content = (
-            _data() / "environments" / f"{facts.get('map', name)}.exr"
+            _data_directory() / "environments" / f"{facts.get('map', name)}.exr"
         ).read_bytes()
         radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(
             np.float32
@@ -322,7 +326,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _sized(picture.band, picture.size)
+    radiance = _resize_map(picture.band, picture.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"
@@ -336,7 +340,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     )
 
 
-def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
+def _resize_map(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
     """Average a map down to at most `LARGEST`, or repeat texels up to `SMALLEST`.
 
     See `LightPicture`.
@@ -358,10 +362,11 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
             )
             / covered
         )
-    down, across = (
-        -(-least // extent)
-        for least, extent in zip(SMALLEST, texels.shape[:2], strict=True)
+    repeat_rows, repeat_columns = (
+        -(-smallest // extent)
+        for smallest, extent in zip(SMALLEST, texels.shape[:2], strict=True)
     )
     return np.asarray(
-        texels.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32
+        texels.repeat(repeat_rows, axis=0).repeat(repeat_columns, axis=1),
+        dtype=np.float32,
     )

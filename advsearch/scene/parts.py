@@ -119,8 +119,8 @@ class _Point(ScenePart):
 
         The irradiance is that of a surface that faces the lamp. By base values.
         """
-        way = np.array(self.position) - place
-        return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
+        to_lamp = np.array(self.position) - place
+        return to_lamp, np.array(self.intensity) / max(float(to_lamp @ to_lamp), 1e-12)
 
 
 class PointLamp(_Point):
@@ -177,11 +177,15 @@ class SpotLamp(_Point):
         )
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        way, faced = super().lighting(place)
+        to_lamp, irradiance = super().lighting(place)
         cutoff, beam = self.cone
-        along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
-        angle = math.degrees(math.acos(min(max(float(along), -1.0), 1.0)))
-        return way, faced * min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
+        cosine = (
+            -to_lamp @ self.to_world[:3, 2] / max(float(np.linalg.norm(to_lamp)), 1e-12)
+        )
+        angle = math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
+        return to_lamp, irradiance * min(
+            max((cutoff - angle) / (cutoff - beam), 0.0), 1.0
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,15 +247,15 @@ class BeamLamp(ScenePart):
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
-        way = self.to_world[:3, 3] - place
-        aside, up, ahead = -way @ self.to_world[:3, :3]
+        to_lamp = self.to_world[:3, 3] - place
+        aside, up, ahead = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
         column = math.floor((aside / max(ahead, 1e-9) + 1.0) / 2.0 * width)
         row = math.floor((1.0 - up / max(ahead, 1e-9) * width / height) / 2.0 * height)
         if ahead <= 0.0 or not (0 <= column < width and 0 <= row < height):
-            return way, np.zeros(3)
-        return way, self.table[row, column] * np.array(self.tint) / max(
-            float(way @ way), 1e-12
+            return to_lamp, np.zeros(3)
+        return to_lamp, self.table[row, column] * np.array(self.tint) / max(
+            float(to_lamp @ to_lamp), 1e-12
         )
 
 
@@ -384,8 +388,8 @@ def sphere(rows: int, columns: int) -> Mesh:
     `rows` bands from pole to pole, 2 (rows - 1) columns faces.
     """
     v, u = (
-        one.ravel()
-        for one in np.meshgrid(
+        array.ravel()
+        for array in np.meshgrid(
             np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij"
         )
     )
@@ -404,7 +408,7 @@ def sphere(rows: int, columns: int) -> Mesh:
     # without those that are points at the poles
     faces = np.concatenate([lower[columns:], upper[:-columns]])
     vertices, outwards, uvs = (
-        one.astype(np.float32)
-        for one in (0.5 * normals, normals, np.stack([u, v], axis=1))
+        array.astype(np.float32)
+        for array in (0.5 * normals, normals, np.stack([u, v], axis=1))
     )
     return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)

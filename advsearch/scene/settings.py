@@ -171,7 +171,7 @@ class Parameter:
 
         The text goes on behind "Red", "Green", "Blue".
         """
-        texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
+        descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
             cls(
                 name,
@@ -180,11 +180,13 @@ class Parameter:
                 low,
                 1.0,
                 default,
-                words,
+                description,
                 search=search,
                 estimators=estimators,
             )
-            for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
+            for name, default, description in zip(
+                CHANNELS, defaults, descriptions, strict=True
+            )
         )
 
 
@@ -588,8 +590,8 @@ def resolve(given: Given) -> dict[str, float | None]:
             "leave one of them out"
         )
     values = {
-        name: None if isinstance(one.default, str) else one.default
-        for name, one in SETTINGS.items()
+        name: None if isinstance(parameter.default, str) else parameter.default
+        for name, parameter in SETTINGS.items()
     }
     for name, value in given.items():
         setting = parameter_of(name)
@@ -609,8 +611,8 @@ def resolve(given: Given) -> dict[str, float | None]:
             )
         values[name] = float(value)
         if not setting.low <= value <= setting.high:  # NaN is not, either
-            inside = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
+            allowed_range = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
             raise InputError(
-                f"`set` {name}: expected a number from {inside}, got {value:g}"
+                f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
             )
     return values

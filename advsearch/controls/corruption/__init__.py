@@ -37,9 +37,9 @@ _GREY = 1.0 / 512.0
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
-    (more,) = filters.at_level(BRIGHTNESS, level)
+    (increase,) = filters.at_level(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
-    return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (
+    return image + ((value + increase).clamp(max=1.0) - value) * (image + _GREY) / (
         value + _GREY
     )
 
@@ -53,11 +53,11 @@ def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Scale the saturation, keep hue and value; grey stays grey."""
-    factor, more = filters.at_level(SATURATE, level)
+    factor, increase = filters.at_level(SATURATE, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
-    wanted = (factor * saturation + more).clamp(max=1.0)
-    return value - (value - image) * wanted / (saturation + _GREY)
+    new_saturation = (factor * saturation + increase).clamp(max=1.0)
+    return value - (value - image) * new_saturation / (saturation + _GREY)
 
 
 def pixelate(image: Tensor, whole: int) -> Tensor:
@@ -67,8 +67,8 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     and as many in a smaller one.
     """
     height, width = image.shape[:2]
-    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
-    cells = (max(1, int(height * share)), max(1, int(width * share)))
+    fraction = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
+    cells = (max(1, int(height * fraction)), max(1, int(width * fraction)))
     averaged = F.interpolate(images.planes(image), cells, mode="area")
     return images.picture(
         F.interpolate(averaged, (height, width), mode="nearest-exact")
@@ -196,16 +196,16 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         `docs/controls/corruption.md` says.
     """
     if which in STEPPED:
-        at = STEPPED[which]
-        whole = nearest(severity)
-        out = at(image, whole) if whole else image
+        apply_at = STEPPED[which]
+        applied_severity = nearest(severity)
+        result = apply_at(image, applied_severity) if applied_severity else image
         # by the straight lines between the steps: a staircase has no slope
         if severity.requires_grad:
             below = min(int(severity.detach()), filters.LEVELS - 1)
-            low = at(image, below).detach() if below else image.detach()
-            high = at(image, below + 1).detach()
-            out = out + (severity - severity.detach()) * (high - low)
-        return out.clamp(0.0, 1.0)
+            low = apply_at(image, below).detach() if below else image.detach()
+            high = apply_at(image, below + 1).detach()
+            result = result + (severity - severity.detach()) * (high - low)
+        return result.clamp(0.0, 1.0)
     if which in FROM_NOTHING:
         return FROM_NOTHING[which](image, severity, seed).clamp(0.0, 1.0)
     if float(severity.detach()) >= 1.0:

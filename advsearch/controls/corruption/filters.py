@@ -53,7 +53,7 @@ def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, .
     Returns one tensor () a column; differentiable.
     """
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
-    return between(level, lambda whole: rows[whole - 1]).unbind()
+    return between(level, lambda severity: rows[severity - 1]).unbind()
 
 
 def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
@@ -240,9 +240,9 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
         disc / disc.sum(), s=size
     )
-    whole = torch.fft.irfft2(product, s=size)
+    convolved = torch.fft.irfft2(product, s=size)
     return images.picture(
-        whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
+        convolved[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
     )
 
 
@@ -276,13 +276,14 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Blur, show at each pixel what a neighbor shows, and blur again."""
     sigma = at_level(GLASS, level)[0] * scale(image)
     shift = between(
-        level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole)
+        level,
+        lambda severity: _glass_shift(image.shape[0], image.shape[1], seed, severity),
     )
     return blurred(images.warped(blurred(image, sigma), shift * scale(image)), sigma)
 
 
 @lru_cache(maxsize=8)
-def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
+def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Return from how far each pixel is taken behind frosted glass.
 
     One pixel after another, from the bottom right, takes over what a random neighbor
@@ -298,7 +299,7 @@ def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = reference_size(height, width)
-    _, reach, n_passes = (int(value) for value in GLASS[whole - 1])
+    _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
     source = generator(seed, "glass blur")
     origins = list(range(rows * columns))
     for _ in range(n_passes):
@@ -329,13 +330,14 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
         shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
         shift = between(
-            severity, lambda whole: _elastic_shift(height, width, seed, whole)
+            severity,
+            lambda whole_severity: _elastic_shift(height, width, seed, whole_severity),
         )
     return images.warped(image, scale(image) * shift)
 
 
 @lru_cache(maxsize=8)
-def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
+def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Return from how far each pixel is taken: wrinkles and a shear.
 
     Args:
@@ -348,7 +350,7 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = reference_size(height, width)
-    wrinkle_height, wrinkle_width, corner_shift = ELASTIC[whole - 1]
+    wrinkle_height, wrinkle_width, corner_shift = ELASTIC[severity - 1]
     source = generator(seed, "elastic")
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner_shift
     noise = torch.rand(rows, columns, 2, generator=source) * 2.0 - 1.0
@@ -404,7 +406,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     height, width = image.shape[:2]
     (density,) = at_level(FOG, level)
     drift = between(
-        level, lambda whole: _drift(height, width, seed, FOG_DECAY[whole - 1])
+        level, lambda severity: _drift(height, width, seed, FOG_DECAY[severity - 1])
     )
     brightest = image.max()
     return (
@@ -415,9 +417,11 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 @lru_cache(maxsize=8)
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """Make fog (H, W, 1) in [0, 1]."""
-    tall, wide = reference_size(height, width)
+    rows, columns = reference_size(height, width)
     return images.resized(
-        fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None],
+        fractal(max(rows, columns), decay, generator(seed, "fog"))[
+            :rows, :columns, None
+        ],
         height,
         width,
     )
@@ -461,10 +465,10 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 @lru_cache(maxsize=4)
 def _crystals(height: int, width: int, seed: int) -> Tensor:
     """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
-    tall, wide = reference_size(height, width)
+    rows, columns = reference_size(height, width)
     source = generator(seed, "frost")
-    film = fractal(max(tall, wide), 1.4, source)[:tall, :wide, None]
-    feathers = images.resized(_feathers(2 * tall, 2 * wide, source), tall, wide)
+    film = fractal(max(rows, columns), 1.4, source)[:rows, :columns, None]
+    feathers = images.resized(_feathers(2 * rows, 2 * columns, source), rows, columns)
     ice = 0.2 + 0.3 * film + (0.45 + 0.75 * film) * feathers
     return images.resized((ice * torch.tensor(ICE)).clamp(0.0, 1.0), height, width)
 
@@ -500,7 +504,8 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
     (keep,) = at_level(SNOW_KEEP, level)
     layer = between(
-        level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole)
+        level,
+        lambda severity: _snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
@@ -508,16 +513,19 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _snowfall(height: int, width: int, seed: int, whole: int) -> Tensor:
+def _snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
-    tall, wide = reference_size(height, width)
-    mean, spread, flake, over, radius, sigma = SNOW[whole - 1]
+    rows, columns = reference_size(height, width)
+    mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = generator(seed, "snow")
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
-        math.ceil(tall / flake), math.ceil(wide / flake), 1, generator=source
+        math.ceil(rows / flake_size),
+        math.ceil(columns / flake_size),
+        1,
+        generator=source,
     )
-    flakes = images.resized(noise, tall, wide)
-    flakes = torch.where(flakes < over, torch.zeros_like(flakes), flakes)
+    flakes = images.resized(noise, rows, columns)
+    flakes = torch.where(flakes < threshold, torch.zeros_like(flakes), flakes)
     streaks = streaked(flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0)
     return images.resized(streaks.clamp(0.0, 1.0), height, width)

@@ -68,7 +68,7 @@ def loaded(spec: str) -> assets.ObjectAsset:
     )
 
 
-def _asset(option: str) -> assets.ObjectAsset:
+def _load_asset(option: str) -> assets.ObjectAsset:
     return made(option) if option in MADE else loaded(option)
 
 
@@ -213,14 +213,19 @@ class OcclusionControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add every occluder that can be chosen, out of sight."""
-        away = geometry.put_away(
+        hidden_pose = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
-        for option in self._candidates():
-            asset = _asset(option)
-            looks = asset.base_color, asset.material, asset.label
+        for option in self._list_options():
+            asset = _load_asset(option)
+            appearance = asset.base_color, asset.material, asset.label
             scene = scene.with_part(
-                parts.MeshPart(self._part(option), asset.mesh, *looks, to_world=away)
+                parts.MeshPart(
+                    self._part_name(option),
+                    asset.mesh,
+                    *appearance,
+                    to_world=hidden_pose,
+                )
             )
         return scene
 
@@ -230,13 +235,13 @@ class OcclusionControl(Control):
         """Return the poses of all occluders; those that are not used are out of sight."""
         camera = geometry.camera_in(self.scene, so_far).to(values["turn"])
         inputs = {
-            f"{self._part(option)}.to_world": geometry.put_away(camera)
-            for option in self._candidates()
+            f"{self._part_name(option)}.to_world": geometry.put_away(camera)
+            for option in self._list_options()
         }
         placed = self.placement(values, so_far)
         if not placed.away:
-            part = self._part(self._option(values))
-            inputs[f"{part}.to_world"] = _matrix(camera, placed, values)
+            part = self._part_name(self._select_option(values))
+            inputs[f"{part}.to_world"] = _compute_pose(camera, placed, values)
         return inputs
 
     def measured(
@@ -251,25 +256,25 @@ class OcclusionControl(Control):
                 measurements[name] = Value(value=float(length), unit="object sizes")
         return measurements
 
-    def _candidates(self) -> tuple[str, ...]:
+    def _list_options(self) -> tuple[str, ...]:
         """Return every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
         return tuple(map(str, self.allowed("which", MADE[0])))
 
-    def _option(self, values: Values) -> str:
+    def _select_option(self, values: Values) -> str:
         return (
-            self._candidates()[0]
+            self._list_options()[0]
             if self.chosen["object"] is not None
             else OPTIONS[int(values["which"])]
         )
 
-    def _part(self, option: str) -> str:
+    def _part_name(self, option: str) -> str:
         """Return the name of an occluder's part of the scene.
 
         The instance's name, with the option where there are several.
         """
-        return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
+        return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
     def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
         """Work out where the occluder goes, with camera and object where others put them.
@@ -281,11 +286,11 @@ class OcclusionControl(Control):
         view = _ObjectView.of(self.scene, so_far)
         requested_distance = requested["distance"] * view.far
         if view.directions is None or coverage <= 0.0:
-            return _put_away(requested["size"], requested_distance)
-        mesh = _asset(self._option(values)).mesh
+            return _make_hidden_placement(requested["size"], requested_distance)
+        mesh = _load_asset(self._select_option(values)).mesh
         turn = geometry.rotation(requested["turn"], 0.0, 0.0)
         points = mesh.vertices.astype(np.float64) @ turn.T
-        size, distance = _fitting(
+        size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.near
         )
         # right, up and forward of a camera that looks at it
@@ -295,7 +300,7 @@ class OcclusionControl(Control):
         )
         cover = silhouettes.silhouette(in_camera, mesh.faces)
         if cover is None:
-            return _put_away(size, distance)
+            return _make_hidden_placement(size, distance)
         axes = silhouettes.middle_axes(view.directions)
         direction = requested["direction"]
         passage = silhouettes.Passage(view.directions, cover, axes, direction)
@@ -312,7 +317,7 @@ class OcclusionControl(Control):
 # ---- what the camera sees
 
 
-def _put_away(size: float, distance: float) -> Placement:
+def _make_hidden_placement(size: float, distance: float) -> Placement:
     """Return the placement of an occluder that is out of sight."""
     return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
 
@@ -341,9 +346,9 @@ class _ObjectView:
         if model is not None:
             if "camera.lens" in so_far:
                 model = model.with_numbers(so_far["camera.lens"].detach().cpu())
-            spread = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
+            spread = _spread_directions(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
             rim = spread
-            directions = _through(model, points, faces)
+            directions = _directions_through_lens(model, points, faces)
         else:
             frame = _image_frame(scene, so_far)
             silhouette = silhouettes.silhouette(points, faces, frame)
@@ -361,8 +366,8 @@ def _object_in_camera(
 ) -> assets.Doubles:
     """Return the object's vertices (V, 3) to the right, up and forward of the camera."""
     camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
-    pose = _numpy(so_far, "object.to_world", geometry.object_to_world(scene))
-    offsets = _numpy(so_far, "object.offsets", np.zeros(3))
+    pose = _input_or(so_far, "object.to_world", geometry.object_to_world(scene))
+    offsets = _input_or(so_far, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
     world = vertices @ pose[:3, :3].T + pose[:3, 3]
     # a sensor's own x axis points to the left
@@ -375,12 +380,12 @@ def _image_frame(
 ) -> geometry.Frame:
     """Return what the image of a camera without distortion shows."""
     scene_fov = np.array([scene.number("camera.fov")])
-    fov = float(_numpy(so_far, "camera.fov", scene_fov)[0])
-    shift = _numpy(so_far, "camera.shift", np.zeros(2))
+    fov = float(_input_or(so_far, "camera.fov", scene_fov)[0])
+    shift = _input_or(so_far, "camera.shift", np.zeros(2))
     return geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
 
 
-def _through(
+def _directions_through_lens(
     model: geometry.CameraModel, points: assets.Doubles, faces: npt.NDArray[np.uint32]
 ) -> assets.Doubles | None:
     """Return the directions in which a mesh is seen through a lens.
@@ -404,12 +409,14 @@ def _through(
     if bool(is_visible.all()):
         left, top = positions.amin(dim=0).clamp(0.0, 1.0).tolist()
         right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
-    directions = _looked(model, (left, right), (top, bottom), silhouettes.RASTER)
+    directions = _spread_directions(
+        model, (left, right), (top, bottom), silhouettes.RASTER
+    )
     hidden = directions[cover.contains(*(directions @ axes.T).T)]
     return hidden if len(hidden) else None
 
 
-def _looked(
+def _spread_directions(
     model: geometry.CameraModel,
     across: tuple[float, float],
     down: tuple[float, float],
@@ -436,7 +443,7 @@ def _looked(
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
 
 
-def _numpy(
+def _input_or(
     inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles
 ) -> assets.Doubles:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
@@ -445,7 +452,7 @@ def _numpy(
 # ---- where the occluder goes
 
 
-def _fitting(
+def _fit_occluder(
     points: assets.Doubles, size: float, distance: float, near: float
 ) -> tuple[float, float]:
     """Fit an occluder between the camera and the object.
@@ -478,7 +485,7 @@ def _fitting(
     return size, min(max(distance, nearest), farthest)
 
 
-def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
+def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     """Return the occluder's pose (4, 4).
 
     Differentiable in the camera, the direction and the turn, at the angle of the

@@ -97,14 +97,14 @@ def silhouette(
     window = _find_window(tangents, frame)
     if window is None:
         return None
-    wide = window.right - window.left
-    high = window.high - window.low
-    pixel = max(wide, high) / RASTER
-    width = max(1, math.ceil(wide / pixel))
-    height = max(1, math.ceil(high / pixel))
+    window_width = window.right - window.left
+    window_height = window.high - window.low
+    pixel = max(window_width, window_height) / RASTER
+    width = max(1, math.ceil(window_width / pixel))
+    height = max(1, math.ceil(window_height / pixel))
     in_pixels = (tangents - (window.left, window.low)) * (
-        width / wide,
-        height / high,
+        width / window_width,
+        height / window_height,
     ) - 0.5
     _, row, column, _ = images.pixels_in(in_pixels, (height, width))
     mask = np.zeros((height, width), dtype=np.bool_)
@@ -144,14 +144,14 @@ class Passage:
         """Return the hidden fraction (K,) at angles (K,) in radians from the middle."""
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
-        along = math.cos(turn) * right + math.sin(turn) * up
-        across = -math.sin(turn) * right + math.cos(turn) * up
+        outwards = math.cos(turn) * right + math.sin(turn) * up
+        sideways = -math.sin(turn) * right + math.cos(turn) * up
         fractions = []
         for angle in angles:
-            moved = along * math.cos(angle) - forward * math.sin(angle)
-            depth = along * math.sin(angle) + forward * math.cos(angle)
-            x = math.cos(turn) * moved - math.sin(turn) * across
-            y = math.sin(turn) * moved + math.cos(turn) * across
+            moved = outwards * math.cos(angle) - forward * math.sin(angle)
+            depth = outwards * math.sin(angle) + forward * math.cos(angle)
+            x = math.cos(turn) * moved - math.sin(turn) * sideways
+            y = math.sin(turn) * moved + math.cos(turn) * sideways
             fractions.append(float(self.cover.contains(x, y, depth).mean()))
         return np.array(fractions)
 

@@ -265,10 +265,14 @@ class PathControl(Control):
                 f"different paths, got {', '.join(names)}"
             )
         self._check_object_at()
-        self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
-        self._movers = {mover for ways in self._paths for mover in ways}
-        all_ways = [way for ways in self._paths for way in ways.values()]
-        self._files = [way for way in all_ways if isinstance(way, Waypoints)]
+        self._paths: tuple[Ways, ...] = tuple(map(self._read_path, names))
+        self._movers = {mover for movements in self._paths for mover in movements}
+        all_movements = [
+            movement for movements in self._paths for movement in movements.values()
+        ]
+        self._files = [
+            movement for movement in all_movements if isinstance(movement, Waypoints)
+        ]
         has_single_path = any(BOTH not in name for name in names)
         if "moves" in self._given and not has_single_path:
             raise InputError(
@@ -277,12 +281,14 @@ class PathControl(Control):
             )
         if "path" in self._given:  # otherwise the run may say it, later
             self._check_needless()
-        if any(way.has_times for way in self._files):
+        if any(movement.has_times for movement in self._files):
             self._check_not_set("seconds")
-        if len(self._files) == len(all_ways):
+        if len(self._files) == len(all_movements):
             self._check_not_set("reach")
         if self._files:
-            self.chosen["seconds"] = max(float(way.times[-1]) for way in self._files)
+            self.chosen["seconds"] = max(
+                float(movement.times[-1]) for movement in self._files
+            )
         self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
     def _check_not_set(self, setting: str) -> None:
@@ -293,7 +299,7 @@ class PathControl(Control):
                 "that itself; leave it out"
             )
 
-    def _read(self, name: str) -> Ways:
+    def _read_path(self, name: str) -> Ways:
         """Return what the path of a name makes of camera and object."""
         names = [name]
         both = name.split(BOTH)
@@ -308,20 +314,20 @@ class PathControl(Control):
                 f"{name!r}"
             )
         movers = [str(self.chosen["moves"])] if alone else MOVERS
-        ways: dict[str, Way] = {}
+        movements: dict[str, Way] = {}
         for mover, path_name in zip(movers, names, strict=True):
             if path_name in PATHS:
-                ways[mover] = path_name
+                movements[mover] = path_name
             else:
-                ways |= self._read_file(Path(path_name), mover, alone)
-        return ways
+                movements |= self._read_file(Path(path_name), mover, alone)
+        return movements
 
     def _check_needless(self) -> None:
         """Check that choices about trajectories have one. Raises InputError."""
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
-        if needless and not any(way.is_trajectory for way in self._files):
+        if needless and not any(waypoints.is_trajectory for waypoints in self._files):
             raise InputError(
                 f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or "
                 "KITTI, and there is none; "
@@ -330,16 +336,16 @@ class PathControl(Control):
 
     def _check_object_at(self) -> None:
         """Check the position of the object in a file's world. Raises InputError."""
-        given = self.chosen["object_at"]
-        if given is None:
+        position = self.chosen["object_at"]
+        if position is None:
             return
-        fits = isinstance(given, list | tuple) and len(given) == 3
-        if not fits or not all(
-            Parameter.is_number(value) and math.isfinite(value) for value in given
+        is_triple = isinstance(position, list | tuple) and len(position) == 3
+        if not is_triple or not all(
+            Parameter.is_number(value) and math.isfinite(value) for value in position
         ):
             raise InputError(
                 f"{self.name}.object_at: expected three numbers as in "
-                f"[20, 0, 0], got {given!r}"
+                f"[20, 0, 0], got {position!r}"
             )
 
     def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
@@ -354,9 +360,9 @@ class PathControl(Control):
                 "object moves; write its way as "
                 "time,x,y,z,heading"
             )
-        return {mover: self._follow(path, trajectory)}
+        return {mover: self._read_camera_path(path, trajectory)}
 
-    def _follow(self, path: Path, trajectory: Trajectory) -> Waypoints:
+    def _read_camera_path(self, path: Path, trajectory: Trajectory) -> Waypoints:
         """Return the path of the camera on a trajectory.
 
         Its notes say what the file does not state.
@@ -411,7 +417,7 @@ class PathControl(Control):
             seconds = float(self.chosen["seconds"])
         else:
             assumed["seconds"] = (
-                f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
+                f"{KITTI_RATE:g} poses a second, {_format_rounded(seconds)} in all"
             )
         return np.linspace(0.0, seconds, count)
 
@@ -452,7 +458,7 @@ class PathControl(Control):
             return OneOf(parameter.options)
         return super().spec(parameter)
 
-    _later = 0.0
+    _time_shift = 0.0
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
@@ -465,9 +471,9 @@ class PathControl(Control):
         )
 
     def later(self, seconds: float) -> PathControl:
-        then = copy.copy(self)
-        then._later = self._later + seconds
-        return then
+        shifted = copy.copy(self)
+        shifted._time_shift = self._time_shift + seconds
+        return shifted
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add notes on the files, and check the paths in the scene.
@@ -484,16 +490,16 @@ class PathControl(Control):
         self._check_needless()
         in_scene = self.within(scene)
         names = _split_paths(self.chosen["path"])
-        for name, ways in zip(names, self._paths, strict=True):
-            if CAMERA in ways:
-                in_scene._check_looks(name, ways)
-        notes = [note for way in self._files for note in way.notes]
-        durations = [float(way.times[-1]) for way in self._files]
+        for name, movements in zip(names, self._paths, strict=True):
+            if CAMERA in movements:
+                in_scene._check_looks(name, movements)
+        notes = [note for waypoints in self._files for note in waypoints.notes]
+        durations = [float(waypoints.times[-1]) for waypoints in self._files]
         shortest = min(durations, default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
-                f"path: the shortest of the files takes {_round_text(shortest)} s of "
-                f"{_round_text(self.seconds)}; who "
+                f"path: the shortest of the files takes {_format_rounded(shortest)} s of "
+                f"{_format_rounded(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
         if not notes:
@@ -501,16 +507,20 @@ class PathControl(Control):
         remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
         return replace(scene, remarks=remarks)
 
-    def _check_looks(self, name: str, ways: Ways) -> None:
+    def _check_looks(self, name: str, movements: Ways) -> None:
         """Check that the camera is never at what it looks at, also between waypoints.
 
         Raises InputError: it is.
         """
-        files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
+        files = [
+            movement.times
+            for movement in movements.values()
+            if isinstance(movement, Waypoints)
+        ]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = start_of(self.scene, time.device)
-        shift, _ = self._object(ways, begin, time)
-        position, target = self._camera(ways, begin, time, shift)
+        shift, _ = self._shift_object(movements, begin, time)
+        position, target = self._position_camera(movements, begin, time, shift)
         gap = (target - position).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
         # of each step, where the gap is smallest
@@ -538,28 +548,35 @@ class PathControl(Control):
             return parameter
         first, *last = self._paths[0].values()
         # who goes around is back at the end
-        way = last[0] if last and first == TURN else first
-        clean = CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
+        movement = last[0] if last and first == TURN else first
+        clean_time = (
+            CLEAN_AT.get(movement, 0.0) * self.seconds
+            if isinstance(movement, str)
+            else 0.0
+        )
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
         return replace(
-            parameter, default=clean, search=(0.0, self.seconds), estimators=estimators
+            parameter,
+            default=clean_time,
+            search=(0.0, self.seconds),
+            estimators=estimators,
         )
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the poses of the camera, the object or both at the time."""
-        time = values["time"] + self._later
-        ways = self._ways(values)
+        time = values["time"] + self._time_shift
+        movements = self._select_movements(values)
         start = start_of(self.scene, time.device)
-        shift, heading = self._object(ways, start, time)
+        shift, heading = self._shift_object(movements, start, time)
         inputs = {}
         if CAMERA in self._movers:
-            position, target = self._camera(ways, start, time, shift)
+            position, target = self._position_camera(movements, start, time, shift)
             roll = self.scene.number("camera.roll")
-            way = ways.get(CAMERA)
-            if isinstance(way, Waypoints) and way.rotations is not None:
-                pose = pose_camera(position, way.rotation_at(time), roll)
+            movement = movements.get(CAMERA)
+            if isinstance(movement, Waypoints) and movement.rotations is not None:
+                pose = pose_camera(position, movement.rotation_at(time), roll)
             else:
                 pose = looking(position, target, roll)
             inputs["camera.to_world"] = pose
@@ -572,7 +589,7 @@ class PathControl(Control):
     ) -> dict[str, Value]:
         """Return the distance of the camera from the object."""
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        distance = self._distance(self._ways(values), values["time"])
+        distance = self._camera_distance(self._select_movements(values), values["time"])
         return {"distance": Value(value=float(distance), unit=unit)}
 
     def distances(self, times: Tensor) -> Tensor:
@@ -585,24 +602,27 @@ class PathControl(Control):
             (paths, n) in the unit of `measured`.
         """
         return torch.stack(
-            [self._distance(ways, times).expand(times.shape) for ways in self._paths]
+            [
+                self._camera_distance(movements, times).expand(times.shape)
+                for movements in self._paths
+            ]
         )
 
-    def _distance(self, ways: Ways, time: Tensor) -> Tensor:
+    def _camera_distance(self, movements: Ways, time: Tensor) -> Tensor:
         start = start_of(self.scene, time.device)
-        shift, _ = self._object(ways, start, time)
-        position, _ = self._camera(ways, start, time, shift)
+        shift, _ = self._shift_object(movements, start, time)
+        position, _ = self._position_camera(movements, start, time, shift)
         offset = position - start.middle - shift
         distance: Tensor = offset.norm(dim=-1).double() * self.scene.metres
         return distance
 
-    def _ways(self, values: Values) -> Ways:
+    def _select_movements(self, values: Values) -> Ways:
         if Control.WAY in values:
             return self._paths[int(values[Control.WAY])]
         return self._paths[0]
 
-    def _camera(
-        self, ways: Ways, begin: Start, time: Tensor, shift: Tensor
+    def _position_camera(
+        self, movements: Ways, scene_start: Start, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is, and what it looks at.
 
@@ -617,22 +637,22 @@ class PathControl(Control):
         Returns:
             Two positions (..., 3), object sizes.
         """
-        pose = begin.camera
-        center = begin.middle
-        way = ways.get(CAMERA)
+        pose = scene_start.camera
+        center = scene_start.middle
+        movement = movements.get(CAMERA)
         start = pose[:3, 3]
-        if way is None:
+        if movement is None:
             return start, center
-        if isinstance(way, Waypoints):
-            return self._camera_on_waypoints(way, center, time, shift)
+        if isinstance(movement, Waypoints):
+            return self._camera_on_waypoints(movement, center, time, shift)
         distance = (start - center).norm()
         reach = float(self.chosen["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
-        if way == APPROACH:
-            ahead = _level(pose[:3, 2])
+        if movement == APPROACH:
+            ahead = _level_direction(pose[:3, 2])
             to_go = (1.0 - progress)[..., None]
             return start - ahead * distance * (reach - 1.0) * to_go, center + shift
-        if way == PASS:
+        if movement == PASS:
             from_middle = (1.0 - 2.0 * progress)[..., None]
             return start + pose[:3, 0] * distance * reach * from_middle, center + shift
         return center + _turn_about_vertical(start - center, progress), center + shift
@@ -640,7 +660,7 @@ class PathControl(Control):
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is on waypoints, and what it looks at; see `_camera`."""
+        """Return where the camera is on waypoints, and what it looks at; see `_position_camera`."""
         position = center + waypoints.at(time, waypoints.places) / self.scene.metres
         if waypoints.rotations is not None:
             return position, position + waypoints.rotation_at(time)[..., 2]
@@ -649,29 +669,31 @@ class PathControl(Control):
         target = waypoints.at(time, waypoints.targets) / self.scene.metres
         return position, center + target
 
-    def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
+    def _shift_object(
+        self, movements: Ways, scene_start: Start, time: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return how far the object is shifted, and the degrees that it is turned by."""
-        camera = begin.camera
-        way = ways.get(THING)
+        camera = scene_start.camera
+        movement = movements.get(THING)
         no_shift = camera.new_zeros(3)
         no_turn = camera.new_zeros(())
-        if way is None:
+        if movement is None:
             return no_shift, no_turn
-        if isinstance(way, Waypoints):
-            shift = way.at(time, way.places) / self.scene.metres
-            if way.headings is None:
+        if isinstance(movement, Waypoints):
+            shift = movement.at(time, movement.places) / self.scene.metres
+            if movement.headings is None:
                 return shift, no_turn
-            return shift, way.at(time, way.headings)
+            return shift, movement.at(time, movement.headings)
         progress = (time / self.seconds).clamp(0.0, 1.0)
         reach = float(self.chosen["reach"])
-        if way == TURN:
+        if movement == TURN:
             return no_shift, 360.0 * progress
-        distance = (camera[:3, 3] - begin.middle).norm()
-        if way == APPROACH:
+        distance = (camera[:3, 3] - scene_start.middle).norm()
+        if movement == APPROACH:
             to_go = distance * (reach - 1.0) * (1.0 - progress)
-            return _level(camera[:3, 2]) * to_go[..., None], no_turn
+            return _level_direction(camera[:3, 2]) * to_go[..., None], no_turn
         from_middle = distance * reach * (1.0 - 2.0 * progress)
-        return _level(-camera[:3, 0]) * from_middle[..., None], no_turn
+        return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
 
 
 @lru_cache(maxsize=4)
@@ -685,7 +707,7 @@ def start_of(scene: SceneDescription, device: torch.device) -> Start:
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
-def _level(direction: Tensor) -> Tensor:
+def _level_direction(direction: Tensor) -> Tensor:
     """Return the level direction (3,) of one: what travels keeps its height."""
     flat = torch.stack([direction[0], direction[1], direction.new_zeros(())])
     return torch.as_tensor(flat / flat.norm().clamp_min(1e-6))
@@ -715,7 +737,7 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
     # where it looks straight up or down
     aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
     left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
-    return _rolled(place, left, torch.linalg.cross(ahead, left), ahead, roll)
+    return _roll_camera(place, left, torch.linalg.cross(ahead, left), ahead, roll)
 
 
 def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
@@ -727,16 +749,17 @@ def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
         roll: degrees.
     """
     right, down, ahead = rotation.unbind(dim=-1)
-    return _rolled(place, -right, -down, ahead, roll)
+    return _roll_camera(place, -right, -down, ahead, roll)
 
 
-def _rolled(
-    place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
+def _roll_camera(
+    position: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
 ) -> Tensor:
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
     return geometry.affine(
-        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place
+        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1),
+        position,
     )
 
 
@@ -813,7 +836,7 @@ def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None
     return np.asarray(np.unwrap(degrees, period=360.0)), note
 
 
-def _round_text(number: float) -> str:
+def _format_rounded(number: float) -> str:
     """Return a number with three significant digits, for a sentence."""
     return f"{float(f'{number:.3g}'):g}"
 

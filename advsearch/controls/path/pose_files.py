@@ -133,12 +133,12 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first is None:
         return None
     leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
-    is_own = any(OWN_COLUMNS <= set(words) for words in leading) and not any(
+    is_waypoint_table = any(OWN_COLUMNS <= set(names) for names in leading) and not any(
         map(_find_columns, leading)
     )
     rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
-    headers = [words for words in leading if _find_columns(words)]
-    if is_own or (not headers and "," in lines[first] and leading):
+    headers = [names for names in leading if _find_columns(names)]
+    if is_waypoint_table or (not headers and "," in lines[first] and leading):
         return None  # a table with a head of another kind
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
@@ -207,8 +207,8 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         not has_quaternion and set(QUATERNION) & set(columns)
     ):
         return {}
-    is_own = not has_quaternion and OWN_COLUMNS <= set(names)
-    return {} if is_own else columns
+    is_waypoint_table = not has_quaternion and OWN_COLUMNS <= set(names)
+    return {} if is_waypoint_table else columns
 
 
 def _read_table(

@@ -70,7 +70,7 @@ class ProjectorControl(PictureControl):
     """
 
     part: parts.ProjectorPart
-    _later = 0.0
+    _time_shift = 0.0
     kind = "projector"
     competes_with_ambient = True
     shown = "pattern"
@@ -231,14 +231,14 @@ class ProjectorControl(PictureControl):
                 f"{self.name}.picture: expected the path of a picture, got {picture!r}"
             )
         self._given["picture"] = self.chosen["picture"] = str(picture)
-        beside = [
-            one
-            for one in ("pattern", "epsilon", "norm", "resolution", "aspect")
-            if one in self._given
+        conflicting = [
+            setting
+            for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
+            if setting in self._given
         ]
-        if beside:
+        if conflicting:
             raise InputError(
-                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; "
+                f"{self.name}.{conflicting[0]}: expected none beside {self.name}.picture; "
                 "leave one of them out"
             )
 
@@ -263,7 +263,10 @@ class ProjectorControl(PictureControl):
             )
             reach = farthest * max(1.0, columns / rows) * scene.metres
             fov = min(
-                math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0
+                math.degrees(
+                    2.0 * math.atan(reach / self.within(scene)._start_distance())
+                ),
+                150.0,
             )
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
@@ -283,8 +286,8 @@ class ProjectorControl(PictureControl):
         """Return a parameter with its default beside the scene's camera, in its light."""
         parameter = super().in_scene(parameter)
         scene = self.scene
-        away = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
-        far = float(np.linalg.norm(away))
+        camera_offset = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
+        camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
                 return replace(
@@ -305,31 +308,38 @@ class ProjectorControl(PictureControl):
                     TIMES
                     * float(self.resting("ambient"))
                     * self.part.area
-                    * self._far() ** 2
+                    * self._start_distance() ** 2
                 )
                 return replace(parameter, default=min(LUMENS, bright))
             case "azimuth":
                 return replace(
                     parameter,
-                    default=math.degrees(math.atan2(away[1], away[0])) + BESIDE,
+                    default=math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
+                    + BESIDE,
                 )
             case "elevation":
                 return replace(
                     parameter,
                     default=min(
-                        max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0
+                        max(
+                            math.degrees(math.asin(camera_offset[2] / camera_distance)),
+                            -89.0,
+                        ),
+                        89.0,
                     ),
                 )
             case "distance":
                 unit = "object sizes" if scene.object.metres is None else "metres"
-                return replace(parameter, default=far * scene.metres, unit=unit)
+                return replace(
+                    parameter, default=camera_distance * scene.metres, unit=unit
+                )
         return parameter
 
     @property
     def sides(self) -> tuple[int, int]:
         return self.part.sides
 
-    def _far(self) -> float:
+    def _start_distance(self) -> float:
         """Return how far away it stands at the start."""
         spec = self.specs.get("distance")
         return float(
@@ -371,15 +381,15 @@ class ProjectorControl(PictureControl):
     def in_light(self, times: float) -> Self:
         if self.ambient is None:
             return self
-        there = copy.copy(self)
-        there.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
-        there.fit()
-        return there
+        scaled = copy.copy(self)
+        scaled.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
+        scaled.fit()
+        return scaled
 
     def later(self, seconds: float) -> Self:
-        then = copy.copy(self)
-        then._later = self._later + seconds
-        return then
+        shifted = copy.copy(self)
+        shifted._time_shift = self._time_shift + seconds
+        return shifted
 
     # ---- at a configuration
 
@@ -394,21 +404,23 @@ class ProjectorControl(PictureControl):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the projector's pose and its light."""
-        place = (
+        pose_arguments = (
             float(values[name].detach())
             for name in ("azimuth", "elevation", "distance")
         )
-        pose = looking_from(self.scene, *place).to(values["distance"], copy=True)
+        pose = looking_from(self.scene, *pose_arguments).to(
+            values["distance"], copy=True
+        )
         light = self.thrown(values)
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
-        if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:
+        if rate and (rate * self._time_shift + phase) % 1.0 >= LIT_SHARE:
             light = 0.0 * light
-        at_one = (
-            self._beside(values)
+        at_unit_distance = (
+            self._relative_to_ambient(values)
             * (values["distance"].detach() / self.scene.metres) ** 2
         )
-        white = at_one * self.scene.metered_irradiance / math.pi
+        white = at_unit_distance * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def thrown(self, values: Values) -> Tensor:
@@ -423,7 +435,7 @@ class ProjectorControl(PictureControl):
         """Return the illuminance () of a white image at the object's middle."""
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
-    def _beside(self, values: Values) -> Tensor:
+    def _relative_to_ambient(self, values: Values) -> Tensor:
         return self._lux(values) / values["ambient"]
 
     def measured(
@@ -433,7 +445,8 @@ class ProjectorControl(PictureControl):
         return {
             "white": Value(value=float(self._lux(values)), unit="lux"),
             "beside_ambient": Value(
-                value=float(self._beside(values)), unit="times the ambient light"
+                value=float(self._relative_to_ambient(values)),
+                unit="times the ambient light",
             ),
             "mean": Value(
                 value=float(color.srgb_to_linear(values["pattern"]).mean()),
@@ -490,8 +503,8 @@ def looking_from(
     left, up, outwards = torch.from_numpy(
         geometry.camera_axes(azimuth, elevation, 0.0)
     ).float()
-    place = (
+    position = (
         torch.from_numpy(geometry.middle(scene)).float()
         + distance / scene.metres * outwards
     )
-    return geometry.affine(torch.stack([left, up, -outwards], dim=1), place)
+    return geometry.affine(torch.stack([left, up, -outwards], dim=1), position)

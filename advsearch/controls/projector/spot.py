@@ -152,21 +152,21 @@ class SpotControl(ProjectorControl):
 
     def thrown(self, values: Values) -> Tensor:
         """Return the round spot (h, w, 3) as it is thrown, linear."""
-        half = (
+        half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.metres
         )
         rows, columns = self.part.sides
-        across, up = (
-            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half) * half
+        right, up = (
+            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)
         )
         deviation = values["width"] / WIDTH_OF_ONE
-        away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
+        squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = (
-            torch.exp(-0.5 * away / deviation**2)
-            * (2.0 * half) ** 2
+            torch.exp(-0.5 * squared / deviation**2)
+            * (2.0 * half_width) ** 2
             / (2.0 * math.pi * deviation**2)
         )
         return spot[..., None] * color.combine_channels(values)
@@ -182,7 +182,7 @@ class SpotControl(ProjectorControl):
                 unit="lux, where it is brightest",
             ),
             "beside_ambient": Value(
-                value=float(brightest * float(self._beside(values))),
+                value=float(brightest * float(self._relative_to_ambient(values))),
                 unit="times the ambient light",
             ),
         }

@@ -87,10 +87,12 @@ def warped(image: Tensor, shift: Tensor) -> Tensor:
     rows, columns = torch.meshgrid(
         torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
     )
-    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
+    positions = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
         image.device
     )
-    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    grid = (
+        positions * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    )
     return picture(
         F.grid_sample(
             planes(image), grid[None], padding_mode="reflection", align_corners=False
@@ -119,5 +121,7 @@ def drawn(
 
     Standard normal, or uniform in [0, 1).
     """
-    source = torch.Generator().manual_seed(seeds.stream(seed, stream))
-    return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)
+    generator = torch.Generator().manual_seed(seeds.stream(seed, stream))
+    return (torch.randn if normal else torch.rand)(
+        height, width, 3, generator=generator
+    )

@@ -95,12 +95,12 @@ def find_beside(path: Path, name: str) -> Path:
 
     Raises FileFormatError: it leads out of the folder.
     """
-    beside = path.parent / name
-    if "\0" in name or not is_inside(beside, path.parent):
+    sibling = path.parent / name
+    if "\0" in name or not is_inside(sibling, path.parent):
         raise FileFormatError(
             f"{path}: {name[:200]!r} {OUTSIDE}; put it beside the file"
         )
-    return beside
+    return sibling
 
 
 def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
@@ -123,16 +123,16 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for entry in file.solids
         for outline in entry.list_footprints()
     )
-    placed = [
+    marked = [
         replace(
             part,
             is_ground=part.name in file.ground,
-            solids=solids if number == 0 else (),
+            solids=solids if index == 0 else (),
         )
-        for number, part in enumerate(parts)
+        for index, part in enumerate(parts)
     ]
     return Place(
-        safe_name(Path(os.path.abspath(path)).parent), file, tuple(placed), tuple(notes)
+        safe_name(Path(os.path.abspath(path)).parent), file, tuple(marked), tuple(notes)
     )
 
 
@@ -141,8 +141,8 @@ def load_bundled_place(name: str, variant: str | None = None) -> Place:
     """Return a bundled place. Raises FileFormatError: the installation is damaged."""
     with resources.as_file(
         resources.files("advsearch.bundled") / "data" / "places" / name
-    ) as folder:
-        path = folder / "place.yaml"
+    ) as directory:
+        path = directory / "place.yaml"
         with reading(path):
             return read_place(path, read_place_file(path), variant)
 

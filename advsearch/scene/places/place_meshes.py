@@ -221,8 +221,8 @@ def _note_left_out(
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
-    held = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
-    names = [entry.name for entry in held.variants]
+    extension = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
+    names = [entry.name for entry in extension.variants]
     if variant not in names:
         raise UnknownNameError(f"variant of {path.name}:", variant, names)
     return names.index(variant)
@@ -339,9 +339,9 @@ def _check_materials(path: Path, count: int) -> None:
 
 
 def _count_texels(surface: ImportedSurface) -> int:
-    held = (surface.texture, surface.normal_map, surface.emission)
+    images = (surface.texture, surface.normal_map, surface.emission)
     return sum(
-        texels.shape[0] * texels.shape[1] for texels in held if texels is not None
+        texels.shape[0] * texels.shape[1] for texels in images if texels is not None
     )
 
 
@@ -371,11 +371,11 @@ def _group_by_material(
     return dict(sorted(groups.items(), key=material_order))
 
 
-def _name_material(header: Header, number: int | None) -> str:
+def _name_material(header: Header, index: int | None) -> str:
     return (
         UNNAMED
-        if number is None
-        else header.materials[number].name or f"material {number}"
+        if index is None
+        else header.materials[index].name or f"material {index}"
     )
 
 
@@ -406,16 +406,16 @@ def _make_part(
 
 
 def _with_finish(
-    path: Path, header: Header, number: int | None, part: MeshPart
+    path: Path, header: Header, index: int | None, part: MeshPart
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material."""
-    entry = MaterialEntry() if number is None else header.materials[number]
+    entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
     ior = finish.KHR_materials_ior.ior
-    facing = (
+    facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
     )
-    specular = min(round(facing / REFLECTANCE, 9), 1.0)
+    specular = min(round(facing_reflectance / REFLECTANCE, 9), 1.0)
     coat = finish.KHR_materials_clearcoat
     material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)
     part = replace(part, material=material)

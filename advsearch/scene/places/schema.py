@@ -36,10 +36,10 @@ def _is_convex(corners: Doubles) -> bool:
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
-    least = float(turns.min())
-    most = float(turns.max())
-    rounding = 1e-9 * max(-least, most)
-    return rounding > 0.0 and (least >= -rounding or most <= rounding)
+    smallest = float(turns.min())
+    largest = float(turns.max())
+    rounding = 1e-9 * max(-smallest, largest)
+    return rounding > 0.0 and (smallest >= -rounding or largest <= rounding)
 
 
 class SolidEntry(_Entry):
