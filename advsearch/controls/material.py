@@ -86,32 +86,33 @@ def pattern(
 def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Doubles:
     """Return gradient noise with whole lattice cells across the tile.
 
-    About -1 to 1, mean 0.
+    About -1 to 1, mean 0 (Perlin 1985).
     """
     columns, rows = cells
-    angle = np.random.Generator(np.random.PCG64(seed)).uniform(
-        0.0, 2.0 * np.pi, (rows, columns)
-    )
-    x = grid[0] * columns
-    y = grid[1] * rows
-    left = np.floor(x)
-    top = np.floor(y)
-    fx = x - left
-    fy = y - top
+    generator = np.random.Generator(np.random.PCG64(seed))
+    angle = generator.uniform(0.0, 2.0 * np.pi, (rows, columns))
+    left = np.floor(grid[0] * columns)
+    top = np.floor(grid[1] * rows)
+    x = grid[0] * columns - left
+    y = grid[1] * rows - top
     column = left.astype(np.int64)
     row = top.astype(np.int64)
 
     def corner(right: int, below: int) -> Doubles:
         turn = angle[(row + below) % rows, (column + right) % columns]
-        return np.asarray(np.cos(turn) * (fx - right) + np.sin(turn) * (fy - below))
+        return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
-    wx, wy = (
-        fraction * fraction * fraction * (fraction * (fraction * 6.0 - 15.0) + 10.0)
-        for fraction in (fx, fy)
-    )
-    upper = corner(0, 0) * (1.0 - wx) + corner(1, 0) * wx
-    lower = corner(0, 1) * (1.0 - wx) + corner(1, 1) * wx
-    return np.asarray((upper * (1.0 - wy) + lower * wy) * 1.5)
+    x_weight = _fade(x)
+    y_weight = _fade(y)
+    upper = corner(0, 0) * (1.0 - x_weight) + corner(1, 0) * x_weight
+    lower = corner(0, 1) * (1.0 - x_weight) + corner(1, 1) * x_weight
+    return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
+
+
+def _fade(position: Doubles) -> Doubles:
+    """Return the weight of the further corner at a position in a lattice cell."""
+    cubed = position * position * position
+    return np.asarray(cubed * (position * (position * 6.0 - 15.0) + 10.0))
 
 
 def _clouds(grid: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
@@ -320,29 +321,31 @@ def fabric(grid: Grid) -> Doubles:
     thread_y = y * count
     round_x = np.sin(np.pi * (thread_x % 1.0))
     round_y = np.sin(np.pi * (thread_y % 1.0))
-    # 1: the warp (upright thread) lies on top
-    warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0
+    # the warp is the upright thread
+    warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
     height = np.where(
-        warp_is_over > 0.5,
+        warp_is_over,
         round_x * (0.55 + 0.45 * round_y),
         round_y * (0.55 + 0.45 * round_x),
     )
-    fibres_up = _noise((x, y), (count * 8, count), 42)
-    fibres_flat = _noise((x, y), (count, count * 8), 43)
-    fibres = np.where(warp_is_over > 0.5, fibres_up, fibres_flat)
+    fibres = np.where(
+        warp_is_over,
+        _noise((x, y), (count * 8, count), 42),
+        _noise((x, y), (count, count * 8), 43),
+    )
     generator = np.random.Generator(np.random.PCG64(44))
-    warp_tone = generator.uniform(0.8, 1.1, count)
-    weft_tone = generator.uniform(0.8, 1.1, count)
-    warp = (
-        _color("b9a77f")
-        * warp_tone[np.floor(thread_x).astype(np.int64) % count][..., None]
-    )
-    weft = (
-        _color("3f5f86")
-        * weft_tone[np.floor(thread_y).astype(np.int64) % count][..., None]
-    )
-    thread = np.where(warp_is_over[..., None] > 0.5, warp, weft)
+    warp = _color("b9a77f") * _thread_tones(generator, thread_x, count)
+    weft = _color("3f5f86") * _thread_tones(generator, thread_y, count)
+    thread = np.where(warp_is_over[..., None], warp, weft)
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
+
+
+def _thread_tones(
+    generator: np.random.Generator, position: Doubles, count: int
+) -> Doubles:
+    """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in."""
+    tone = generator.uniform(0.8, 1.1, count)
+    return np.asarray(tone[np.floor(position).astype(np.int64) % count][..., None])
 
 
 @pattern(0.7, roughness=0.8, specular=0.2)
@@ -351,30 +354,40 @@ def leopard(grid: Grid) -> Doubles:
     warped = _warped(_warped(grid, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
     distance, index = _cells(warped, points)
-    generator = np.random.Generator(np.random.PCG64(54))
-    size = generator.uniform(0.85, 1.15, len(points))[index[..., 0]]
-    radius = distance[..., 0] / size
-    offset_x = (warped[0] - points[index[..., 0], 0] + 0.5) % 1.0 - 0.5
-    offset_y = (warped[1] - points[index[..., 0], 1] + 0.5) % 1.0 - 0.5
-    angle = np.arctan2(offset_y, offset_x)
-    turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index[..., 0]]
-    broken = _step(
-        np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn), -0.75, 0.5
-    )
-    ring = _step(radius, 0.031, 0.008) * (
-        1.0 - _step(radius, 0.056 + 0.004 * np.cos(angle + turn), 0.008)
-    )
-    core = 1.0 - _step(radius, 0.042, 0.02)
+    rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
     fur = _clouds(grid, (24, 90), 2, 55)
-    coat = _mix(
-        _color("d8a861"), _color("e7c58c"), 0.5 + 0.5 * _clouds(grid, (3, 3), 2, 56)
-    )
+    shade = 0.5 + 0.5 * _clouds(grid, (3, 3), 2, 56)
+    coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
     dot_distance, _ = _cells(warped, _scattered(150, 57), 1)
-    between = _step(distance[..., 0], 0.07, 0.012)
-    dots = (1.0 - _step(dot_distance.reshape(SIDE, SIDE), 0.011, 0.006)) * between
-    spots = np.clip(ring * broken + dots, 0.0, 1.0)
+    between_rosettes = _step(distance[..., 0], 0.07, 0.012)
+    dots = 1.0 - _step(dot_distance.reshape(SIDE, SIDE), 0.011, 0.006)
+    spots = np.clip(rosettes + dots * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
+
+
+def _draw_rosettes(
+    grid: Grid, points: Doubles, distance: Doubles, index: npt.NDArray[np.int64]
+) -> tuple[Doubles, Doubles]:
+    """Draw broken rings around points, and their darker cores; each (SIDE, SIDE).
+
+    Args:
+        grid: coordinates of the texels.
+        points: (N, 2) on the torus.
+        distance: (SIDE, SIDE) to the nearest point.
+        index: (SIDE, SIDE) of that point.
+    """
+    generator = np.random.Generator(np.random.PCG64(54))
+    size = generator.uniform(0.85, 1.15, len(points))[index]
+    turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
+    radius = distance / size
+    x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
+    y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
+    angle = np.arctan2(y_offset, x_offset)
+    waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
+    outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
+    ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, outer_edge, 0.008))
+    return ring * _step(waves, -0.75, 0.5), 1.0 - _step(radius, 0.042, 0.02)
 
 
 @pattern(0.8, roughness=0.8, specular=0.2)
@@ -425,46 +438,35 @@ def grass(grid: Grid) -> Doubles:
     Later ones lie on top.
     """
     generator = np.random.Generator(np.random.PCG64(81))
-    count = 2600
-    n_along = 64
-    n_across = 5
-    root = generator.random((count, 1, 1, 2))
-    lean = generator.normal(-np.pi / 2, 0.55, (count, 1, 1))
-    bend = generator.normal(0.0, 0.9, (count, 1, 1))
-    length = generator.uniform(0.08, 0.17, (count, 1, 1))
-    position = np.linspace(0.0, 1.0, n_along)[None, :, None]
-    offset = (
-        (np.linspace(-1.0, 1.0, n_across))[None, None, :] * 0.0042 * (1.0 - position**2)
-    )
-    heading = lean + bend * position
-    x = (
-        root[..., 0]
-        + length * position * np.cos(lean + 0.5 * bend * position)
-        - offset * np.sin(heading)
-    )
-    y = (
-        root[..., 1]
-        + length * position * np.sin(lean + 0.5 * bend * position)
-        + offset * np.cos(heading)
-    )
-    brightness = (
-        0.30 + 0.70 * position + 0.12 * np.linspace(-1.0, 1.0, n_across)[None, None, :]
-    )
-    hue = generator.random((count, 1, 1, 1)) ** 1.5
-    blade = (
-        _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue
-    ) * brightness[..., None]
+    n_blades = 2600
+    root = generator.random((n_blades, 1, 1, 2))
+    lean = generator.normal(-np.pi / 2, 0.55, (n_blades, 1, 1))
+    bend = generator.normal(0.0, 0.9, (n_blades, 1, 1))
+    length = generator.uniform(0.08, 0.17, (n_blades, 1, 1))
+    hue = generator.random((n_blades, 1, 1, 1)) ** 1.5
+    # of the samples of a blade: along it from 0 to 1, across it from -1 to 1
+    along = np.linspace(0.0, 1.0, 64)[None, :, None]
+    across = np.linspace(-1.0, 1.0, 5)[None, None, :]
+    offset = across * 0.0042 * (1.0 - along**2)
+    heading = lean + bend * along
+    middle = lean + 0.5 * bend * along
+    x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
+    y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
+    brightness = 0.30 + 0.70 * along + 0.12 * across
+    blade_color = _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue
+    colors = np.broadcast_to(blade_color * brightness[..., None], (*x.shape, 3))
+    return _draw_points(x.reshape(-1), y.reshape(-1), colors.reshape(-1, 3))
+
+
+def _draw_points(x: Doubles, y: Doubles, colors: Doubles) -> Doubles:
+    """Draw points (N,) of a torus with colors (N, 3) on dark soil, the last on top."""
     column = np.floor(x * SIDE).astype(np.int64) % SIDE
     row = np.floor(y * SIDE).astype(np.int64) % SIDE
     texels = np.broadcast_to(_color("14240b"), (SIDE * SIDE, 3)).copy()
-    cell = (row * SIDE + column).reshape(-1)
-    order = np.arange(cell.size)
-    top = np.full(SIDE * SIDE, -1)
-    np.maximum.at(top, cell, order)
-    is_covered = top >= 0
-    texels[is_covered] = np.broadcast_to(blade, (*x.shape, 3)).reshape(-1, 3)[
-        top[is_covered]
-    ]
+    topmost = np.full(SIDE * SIDE, -1)
+    np.maximum.at(topmost, row * SIDE + column, np.arange(len(x)))
+    is_covered = topmost >= 0
+    texels[is_covered] = colors[topmost[is_covered]]
     return np.asarray(texels.reshape(SIDE, SIDE, 3))
 
 

@@ -80,15 +80,14 @@ class MitsubaControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return {
-            plugin_number.input: torch.stack(
-                [
-                    values[channel.name]
-                    for channel in _make_channel_parameters(plugin_number)
-                ]
+        """Return the numbers and colors by the inputs that set them."""
+        inputs = {}
+        for plugin_number in self._get_numbers():
+            channels = _make_channel_parameters(plugin_number)
+            inputs[plugin_number.input] = torch.stack(
+                [values[channel.name] for channel in channels]
             )
-            for plugin_number in self._get_numbers()
-        }
+        return inputs
 
     def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
         return not isinstance(spec, Fixed)

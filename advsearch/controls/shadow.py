@@ -221,18 +221,17 @@ class ShadowControl(Control):
         Returns:
             The distance in object sizes; None where the card is put away.
         """
-        size, requested, x, y = (
-            float(values[name].detach()) for name in ("size", "distance", "x", "y")
-        )
+        size = float(values["size"].detach())
+        requested = float(values["distance"].detach())
         if size < SMALLEST:
             return None
         right, up, outwards = self._axes(values)
-        offset = x * right + y * up
+        offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
         camera = geometry.camera_in(self.scene, so_far).detach().double().cpu().numpy()
         cone_angle = self._image_cone_angle(so_far)
-        _, lamp_distance = strongest_light(self.scene)
+        max_distance = BELOW_LAMP * strongest_light(self.scene)[1]
         for factor in np.geomspace(1.0, FARTHEST, STEPS):
-            distance = min(requested * factor, BELOW_LAMP * lamp_distance)
+            distance = min(requested * factor, max_distance)
             card = geometry.middle(self.scene) + distance * outwards + offset
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, size, cone_angle):

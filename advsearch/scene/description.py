@@ -519,13 +519,10 @@ class SceneDescription:
                 and not self.backdrop
                 and self.given.isdisjoint(settings.TABLE_SETTINGS)
             )
-        return (
-            photograph_of(
-                environment, self.capture_height, self.number("environment.rotation")
-            )
-            if shows_photograph
-            else None
-        )
+        if not shows_photograph:
+            return None
+        rotation = self.number("environment.rotation")
+        return photograph_of(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:

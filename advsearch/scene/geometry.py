@@ -516,7 +516,10 @@ def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, floa
     fixed_range = other.outline @ normals.T
     speed = normals @ way
     reach = np.stack(
-        [fixed_range.min(axis=0) - moving_range.max(axis=0), fixed_range.max(axis=0) - moving_range.min(axis=0)]
+        [
+            fixed_range.min(axis=0) - moving_range.max(axis=0),
+            fixed_range.max(axis=0) - moving_range.min(axis=0),
+        ]
     )
     is_parallel = speed == 0.0
     if (is_parallel & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():

@@ -177,15 +177,14 @@ class SpotLamp(_Point):
         )
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
         to_lamp, irradiance = super().lighting(place)
         cutoff, beam = self.cone
-        cosine = (
-            -to_lamp @ self.to_world[:3, 2] / max(float(np.linalg.norm(to_lamp)), 1e-12)
-        )
+        distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
+        cosine = -to_lamp @ self.to_world[:3, 2] / distance
         angle = math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
-        return to_lamp, irradiance * min(
-            max((cutoff - angle) / (cutoff - beam), 0.0), 1.0
-        )
+        fraction = min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
+        return to_lamp, irradiance * fraction
 
 
 @dataclass(frozen=True, eq=False)

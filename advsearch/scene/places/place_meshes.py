@@ -260,12 +260,11 @@ def _read_primitives(
         The primitives in the pose of each node, and the surface of each material.
     """
     header = file.header
-    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
-    posed_meshes = [
-        (mesh, pose)
-        for node, pose in poses
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
+    posed_meshes = []
+    for node, pose in sorted(gltf_skeleton.poses(header), key=lambda item: item[0]):
+        mesh = header.nodes[node].mesh
+        if mesh is not None:
+            posed_meshes.append((mesh, pose))
     used_meshes = list(dict.fromkeys(mesh for mesh, _ in posed_meshes))
     pieces = _read_pieces(file, used_meshes, variant)
     fitted = _fit_surfaces(file, pieces, notes)
@@ -273,16 +272,22 @@ def _read_primitives(
     for mesh, pose in posed_meshes:
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             piece = pieces.get((mesh, index))
-            if piece is None:
-                continue
-            _, scale, shift = fitted[piece.material]
-            uvs = piece.part.uvs
-            if uvs is not None:
-                uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
-            part = placed(replace(piece.part, uvs=uvs), pose)
-            primitives.append(PosedPrimitive(primitive.material, piece.material, part))
+            if piece is not None:
+                part = placed(_fit_uvs(piece.part, *fitted[piece.material][1:]), pose)
+                primitives.append(
+                    PosedPrimitive(primitive.material, piece.material, part)
+                )
     surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
     return primitives, surfaces
+
+
+def _fit_uvs(part: ImportedPart, scale: Doubles, shift: Doubles) -> ImportedPart:
+    """Return a part with its UVs in the texture of its surface, v = 0 at the bottom."""
+    uvs = part.uvs
+    if uvs is None:
+        return part
+    uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+    return replace(part, uvs=uvs)
 
 
 def _read_pieces(
