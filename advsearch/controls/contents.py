@@ -94,11 +94,11 @@ def interior(asset: assets.ObjectAsset) -> Vessel | None:
     if basin is None:
         return None
     axis, floor, rim = basin
-    heights = np.linspace(floor, floor + BRIM * (rim - floor), ROWS)
-    inset = 0.004 * (rim - floor)  # a ray along a flat floor would see anything
-    walls = [
-        _find_wall(mesh, axis, max(float(height), floor + inset)) for height in heights
-    ]
+    depth = rim - floor
+    heights = np.linspace(floor, floor + BRIM * depth, ROWS)
+    # a ray along a flat floor would see anything
+    lowest = floor + 0.004 * depth
+    walls = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
     radii = np.stack([distance for distance, _ in walls])
     is_hit = np.isfinite(radii)
     if is_hit.mean() < CLOSED or not is_hit.any(axis=1).all():

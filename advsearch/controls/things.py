@@ -279,17 +279,15 @@ class ThingsControl(Control):
         requested = foot[:2] + np.array([x, y]) / scene.metres
         outline = _rotate_outline(base.outline - foot[:2], heading)
         direction = _unit_direction(requested - object_center)
-        push_distance = 0.0
+        pushed = 0.0
         if not is_absent:
             footprint = parts.Footprint(outline + requested, base.low, base.high)
             gap = GAP / scene.metres
-            push_distance = _find_free_shift(
-                footprint, direction, obstacles, solids, gap
-            )
-        position = requested + push_distance * direction
-        lift = foot[2] - scene.ground_height(foot[:2])
-        height = lift + scene.ground_height(position)
-        return Stand(position, height, push_distance), outline + position
+            pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
+        position = requested + pushed * direction
+        height_above_ground = foot[2] - scene.ground_height(foot[:2])
+        height = height_above_ground + scene.ground_height(position)
+        return Stand(position, height, pushed), outline + position
 
 
 def _rotate_outline(outline: assets.Doubles, degrees: float) -> assets.Doubles:

@@ -432,7 +432,7 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
 
     It is at least side x side.
 
-    Each step doubles the grid: new points are the mean of their four neighbours plus
+    Each step doubles the grid: new points are the mean of their four neighbors plus
     noise, whose height falls by `decay` squared from step to step (Fournier, Fussell,
     Carpenter 1982, Computer rendering of stochastic models).
     """
@@ -445,7 +445,8 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
         down = grid.roll(-1, 0)
         middle = (grid + right + down + right.roll(-1, 0)) / 4.0 + noise[0]
         finer = torch.empty(2 * size, 2 * size)
-        finer[::2, ::2], finer[1::2, 1::2] = grid, middle
+        finer[::2, ::2] = grid
+        finer[1::2, 1::2] = middle
         finer[::2, 1::2] = (grid + right + middle + middle.roll(1, 0)) / 4.0 + noise[1]
         finer[1::2, ::2] = (grid + down + middle + middle.roll(1, 1)) / 4.0 + noise[2]
         grid = finer
@@ -483,17 +484,23 @@ def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
     pen = ImageDraw.Draw(canvas)
     needles = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
     for shine, x, y, turn, size in sorted(needles):
-        start = complex(x * width, y * height)
-        direction = cmath.rect(1.0, 2.0 * math.pi * turn)
-        length = 12.0 + 110.0 * size**3
-        _line(pen, start, start + length * direction, shine)
-        for step in range(4, int(length), 4):
-            unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
-            barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
-            root = start + step * direction
-            for angle in (math.pi / 3.0, -math.pi / 3.0):
-                _line(pen, root, root + barb * cmath.rect(1.0, angle), 0.7 * shine)
+        _draw_feather(pen, complex(x * width, y * height), turn, size, shine)
     return torch.from_numpy(np.asarray(canvas, dtype=np.float32) / 255.0)[..., None]
+
+
+def _draw_feather(
+    pen: ImageDraw.ImageDraw, start: complex, turn: float, size: float, shine: float
+) -> None:
+    """Draw one ice needle from a point, with a direction, a size and a shine in [0, 1]."""
+    direction = cmath.rect(1.0, 2.0 * math.pi * turn)
+    length = 12.0 + 110.0 * size**3
+    _line(pen, start, start + length * direction, shine)
+    for step in range(4, int(length), 4):
+        unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
+        barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
+        root = start + step * direction
+        for angle in (math.pi / 3.0, -math.pi / 3.0):
+            _line(pen, root, root + barb * cmath.rect(1.0, angle), 0.7 * shine)
 
 
 def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) -> None:

@@ -282,10 +282,9 @@ class OcclusionControl(Control):
         Without derivatives.
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
-        coverage = requested["coverage"]
         view = _ObjectView.of(self.scene, so_far)
         requested_distance = requested["distance"] * view.far
-        if view.directions is None or coverage <= 0.0:
+        if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
         turn = geometry.rotation(requested["turn"], 0.0, 0.0)
@@ -302,19 +301,31 @@ class OcclusionControl(Control):
         if cover is None:
             return _make_hidden_placement(size, distance)
         axes = silhouettes.middle_axes(view.directions)
-        direction = requested["direction"]
-        passage = silhouettes.Passage(view.directions, cover, axes, direction)
-        outside = silhouettes.angle_outside(
-            view.shown, view.rim, cover, axes, direction
+        passage = silhouettes.Passage(
+            view.directions, cover, axes, requested["direction"]
         )
-        angle = passage.solve(max(coverage, EASE), outside)
-        if coverage < EASE:
-            angle = outside + (angle - outside) * coverage / EASE
+        angle = _find_covering_angle(view, passage, requested["coverage"])
         hidden = float(passage.coverage(np.array([angle]))[0])
         return Placement(axes, angle, size, distance, hidden, False)
 
 
 # ---- what the camera sees
+
+
+def _find_covering_angle(
+    view: _ObjectView, passage: silhouettes.Passage, coverage: float
+) -> float:
+    """Find the angle, radians, at which an occluder hides a fraction of the object.
+
+    Below `EASE` it slides in from outside of the image.
+    """
+    outside = silhouettes.angle_outside(
+        view.shown, view.rim, passage.cover, passage.axes, passage.direction
+    )
+    angle = passage.solve(max(coverage, EASE), outside)
+    if coverage < EASE:
+        angle = outside + (angle - outside) * coverage / EASE
+    return angle
 
 
 def _make_hidden_placement(size: float, distance: float) -> Placement:
