@@ -62,12 +62,12 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     options: dict[str, Any] = {
         name: value for name, value in (settings or {}).items() if value is not None
     }
-    kind, name, parameter = _read_name(asked, options)
+    kind, name, parameter = _parse_name(asked, options)
     if kind not in CONTROLS:
         raise unknown_control(kind)
     control = CONTROLS[kind]
     if parameter is not None:
-        options.setdefault(parameter, _default_range(control, parameter))
+        options.setdefault(parameter, _get_default_range(control, parameter))
     known = [choice.name for choice in control.choices] + [
         known.name for known in control.declared(options)
     ]
@@ -82,48 +82,52 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
 def unknown_control(
     kind: str, hint: str = "", instances: Iterable[str] = ()
 ) -> UnknownNameError:
-    """Return the error for a control that there is not; it says of which it is a
-    parameter, or else the hint.
+    """Return the error for a control that does not exist.
+
+    It says of which control the name is a parameter, or else the hint.
     """
     usable = CONTROLS.list_usable().items()
     owners = [
         name
         for name, control in usable
-        if any(one.name == kind for one in control.parameters)
+        if any(parameter.name == kind for parameter in control.parameters)
     ]
-    of = (
+    explanation = (
         f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}."
         if owners
         else hint
     )
-    return UnknownNameError("control", kind, {*CONTROLS, *instances}, of)
+    return UnknownNameError("control", kind, {*CONTROLS, *instances}, explanation)
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
-    """Return the kind and the name of the instance that `make_control` makes of a name
-    and settings.
-    """
-    return _read_name(asked, dict(given))[:2]
+    """Return the kind and the instance name that `make_control` would use."""
+    return _parse_name(asked, dict(given))[:2]
 
 
-def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
-    """Return kind, instance name and single parameter; takes "kind" out of the
-    settings.
+def _parse_name(
+    control_name: str, settings: dict[str, object]
+) -> tuple[str, str, str | None]:
+    """Return kind, instance name and single parameter.
+
+    Takes "kind" out of the settings.
     """
-    kind, colon, name = asked.partition(":")
+    kind, colon, name = control_name.partition(":")
     kind, dot, parameter = kind.partition(".")
-    kind_given = given.pop("kind", None)
-    if kind_given is not None:
-        return str(kind_given), asked, None
-    if CONTROLS.names_class(asked):
-        return asked, CONTROLS[asked].kind, None
-    check_instance(f"`controls` {asked}", name, colon)
+    kind_setting = settings.pop("kind", None)
+    if kind_setting is not None:
+        return str(kind_setting), control_name, None
+    if CONTROLS.names_class(control_name):
+        return control_name, CONTROLS[control_name].kind, None
+    check_instance(f"`controls` {control_name}", name, colon)
     return kind, instance_of(kind, name), parameter if dot else None
 
 
 def instance_of(kind: str, name: str) -> str:
-    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where
-    the name is that of a mesh; the name is empty where there is no colon.
+    """Return the name of an instance.
+
+    It is "key" for ``light:key``, but "pose:chair" where the name is that of a mesh,
+    and the kind where there is no colon (an empty name).
     """
     of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
     if not name or (of_a_mesh and name == OBJECT):
@@ -132,8 +136,10 @@ def instance_of(kind: str, name: str) -> str:
 
 
 def check_instance(where: str, name: str, colon: str = ":") -> None:
-    """Refuse what can't stand behind the colon of `KIND:NAME`. Raises InputError where
-    it has other characters than letters, digits, dashes and underscores, or is empty.
+    """Check what stands behind the colon of `KIND:NAME`.
+
+    Raises InputError: it has other characters than letters, digits, dashes and
+    underscores, or is empty.
     """
     if colon and not re.fullmatch(r"[\w-]+", name):
         raise InputError(
@@ -142,36 +148,41 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
         )
 
 
-def _default_range(control: type[Control], parameter: str) -> object:
+def _get_default_range(control: type[Control], parameter: str) -> object:
+    """Return the range, or the choices, of a parameter that is searched by name alone."""
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
             f"{control.kind}:{parameter}=[0.2, 0.8]"
         )
-    declared = {one.name: one for one in control.declared((parameter,))}
-    if parameter not in declared:
+    parameter_by_name = {
+        declared_parameter.name: declared_parameter
+        for declared_parameter in control.declared((parameter,))
+    }
+    if parameter not in parameter_by_name:
         raise UnknownNameError(
-            f"parameter of control {control.kind}", parameter, declared
+            f"parameter of control {control.kind}", parameter, parameter_by_name
         )
-    named = declared[parameter]
+    found_parameter = parameter_by_name[parameter]
     return (
-        {"choices": list(named.options)}
-        if named.options
-        else list(named.search or (named.low, named.high))
+        {"choices": list(found_parameter.options)}
+        if found_parameter.options
+        else list(found_parameter.search or (found_parameter.low, found_parameter.high))
     )
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
     """Return the settings of each control, with ranges of Mitsuba's names under one.
+
     Raises InputError: one has something else than settings.
     """
     by_name: dict[str, Mapping[str, object]] = {}
-    for name, given in by_key(asked).items():
-        if given is not None and not isinstance(given, Mapping):
+    for name, control_settings in by_key(asked).items():
+        if control_settings is not None and not isinstance(control_settings, Mapping):
             raise InputError(
-                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}"
+                f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {control_settings!r}"
             )
-        by_name[name] = given or {}
+        by_name[name] = control_settings or {}
     return by_name
 
 
@@ -185,22 +196,28 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
             "kind:name.parameter".
     """
     by_control: dict[str, dict[str, object]] = {}
-    for name, given in settings_by_name(asked).items():
+    for name, control_settings in settings_by_name(asked).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
-            by_control.setdefault(name, {}).update(given)
+            by_control.setdefault(name, {}).update(control_settings)
             continue
         parameter, colon, instance = rest.partition(":")
-        into = by_control.setdefault(head + colon + instance, {})
-        into.update({parameter: _default_range(CONTROLS[kind], parameter), **given})
+        target = by_control.setdefault(head + colon + instance, {})
+        target.update(
+            {
+                parameter: _get_default_range(CONTROLS[kind], parameter),
+                **control_settings,
+            }
+        )
     return by_control
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something
-    that can be searched. Raises InputError: no control, two of one name, one that the
-    scene cannot take, or nothing that varies.
+    """Compose controls and a scene into a space that can be searched.
+
+    Raises InputError: no control, two of one name, one that the scene cannot take, or
+    nothing that varies.
     """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
@@ -224,9 +241,11 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them; none, or only
-    fixed ones, will do. Raises InputError: two controls of one name, one that the scene
-    cannot take, or one that leaves out what the scene was asked to have.
+    """Let controls prepare a scene, bind them to it and compose them.
+
+    There may be none, or only fixed ones. Raises InputError: two controls of one name,
+    one that the scene cannot take, or one that leaves out what was requested of the
+    scene.
     """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
@@ -248,36 +267,57 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 f"object; {able} can, as in pose:{control.name}"
             )
     described = scene
-    moved = list[Moved]()
+    adjusted = list[Moved]()
     for control in controls:
         prepared = control.prepare(scene)
-        moved += check_prepared(control.name, scene, prepared)
+        adjusted += check_prepared(control.name, scene, prepared)
         scene = prepared
     for control in controls:
         if control.mesh != OBJECT:
             control.mesh_in(scene)
     bound = tuple(control.bind(scene) for control in controls)
-    moved = sorted(
-        [*moved, *(one for control in bound for one in control.moved)],
-        key=lambda one: names.index(one.control),
+    adjusted = sorted(
+        [
+            *adjusted,
+            *(
+                adjusted_default
+                for control in bound
+                for adjusted_default in control.moved
+            ),
+        ],
+        key=lambda adjusted_default: names.index(adjusted_default.control),
     )
-    lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
+    lit_by = [
+        str(adjusted_default.used)
+        for adjusted_default in adjusted
+        if adjusted_default.parameter == ENVIRONMENT
+    ]
     lit_by += (
         [scene.environment_spec]
         if scene.environment_spec != described.environment_spec
         else []
     )
-    return Space(bound, scene, tuple(moved), lit_by[0] if lit_by else None)
+    return Space(bound, scene, tuple(adjusted), lit_by[0] if lit_by else None)
 
 
 def __getattr__(name: str) -> Any:
-    """Import the class of a control when it is asked for by name: TextureControl, or
-    Texture for short.
-    """
+    """Import the class of a control by name: TextureControl, or Texture for short."""
     return get_class("control", name if name.endswith("Control") else f"{name}Control")
 
 
 __all__ = [
-    "CONTROLS", "Budget", "Choice", "Control", "Group", "NumberControl", "Parameter", "Space",
-    "compose", "gathered", "make_control", "make_space", "names_of", "settings_by_name",
-]  # fmt: skip
+    "CONTROLS",
+    "Budget",
+    "Choice",
+    "Control",
+    "Group",
+    "NumberControl",
+    "Parameter",
+    "Space",
+    "compose",
+    "gathered",
+    "make_control",
+    "make_space",
+    "names_of",
+    "settings_by_name",
+]

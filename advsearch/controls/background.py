@@ -69,11 +69,17 @@ class BackgroundControl(Control):
             (0.0, 1.0),
         ),
     )
-    choices = (Choice("ground", "hide", "Whether the ground plane stays in the "
-                                        "picture: keep or hide.",
-                      options=("keep", "hide")),)  # fmt: skip
+    choices = (
+        Choice(
+            "ground",
+            "hide",
+            "Whether the ground plane stays in the picture: keep or hide.",
+            options=("keep", "hide"),
+        ),
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Check that something can be searched. Raises InputError."""
         super().__init__(name, **settings)
         # a list for `what` alone leaves the colour to be searched
         self.asked = any(
@@ -117,11 +123,10 @@ class BackgroundControl(Control):
 
 
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
-    """Return the (3,) colour of a hue in degrees and a saturation and a value in [0,
-    1]; all display-referred.
+    """Return the color (3,) of a hue in degrees, a saturation and a value in [0, 1].
 
-    Piecewise linear in each argument, so differentiable almost everywhere; a grey has
-    no derivative by hue but zero.
+    All are display-referred. Piecewise linear in each argument, so differentiable
+    almost everywhere; a grey has the derivative 0 by hue.
     """
     sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
     ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)

@@ -70,9 +70,15 @@ LARGEST_EPSILON = 1e6
 
 @dataclass(frozen=True)
 class Moved:
-    """A value of the clean scene that a control leaves out, although nobody asked for
-    it: that of a parameter (``pose.yaw``, ``ground.size``, ``environment``), in a unit
-    ("name" of names), as the scene described it, and the one that is used instead.
+    """A value of the clean scene that a control had to adjust, unrequested.
+
+    Attributes:
+        control: name of the control.
+        parameter: that was adjusted (``pose.yaw``, ``ground.size``,
+            ``environment``).
+        unit: of the values; "name" of names.
+        scene: the value that the scene was described with.
+        used: the value that is used instead.
     """
 
     control: str
@@ -83,35 +89,35 @@ class Moved:
 
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
-    """Return what is said of the values that had to move: one sentence a control."""
-
-    def instead(value: Moved) -> str:
-        unit = (
-            ""
-            if value.unit in ("1", "name") or isinstance(value.used, str)
-            else f" {value.unit}"
+    """Return one sentence a control about the values that had to be adjusted."""
+    result = []
+    for control, values in groupby(moved, key=lambda value: value.control):
+        adjustments = " and ".join(map(_describe_adjustment, values))
+        result.append(
+            f"The clean scene has {adjustments}, which the control {control} leaves out."
         )
-        short = [
-            end if isinstance(end, str) else rounded(end)
-            for end in (value.used, value.scene)
-        ]
-        used, scene = (
-            short if short[0] != short[1] else (shown(value.used), shown(value.scene))
-        )
-        return f"{value.parameter} {used}{unit} instead of {scene}"
+    return result
 
-    return [
-        f"The clean scene has {' and '.join(map(instead, several))}, which the control "
-        f"{control} leaves out."
-        for control, several in groupby(moved, key=lambda value: value.control)
-    ]
+
+def _describe_adjustment(value: Moved) -> str:
+    """Return a clause such as "pose.yaw 10 degrees instead of 0"."""
+    unit = f" {value.unit}"
+    if value.unit in ("1", "name") or isinstance(value.used, str):
+        unit = ""
+    used = value.used if isinstance(value.used, str) else rounded(value.used)
+    scene = value.scene if isinstance(value.scene, str) else rounded(value.scene)
+    if used == scene:
+        used = shown(value.used)
+        scene = shown(value.scene)
+    return f"{value.parameter} {used}{unit} instead of {scene}"
 
 
 def check_prepared(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> Iterator[Moved]:
-    """Yield what a control has replaced in a scene by what it needs there, and nobody
-    has described. Raises InputError where it was asked for.
+    """Yield what a control has replaced in a scene and nobody has described.
+
+    Raises InputError: it was requested.
     """
     if after.environment is not None and after.environment is not before.environment:
         check_one_environment(after.parts, f"`controls` {control}")
@@ -141,14 +147,6 @@ def check_prepared(
             )
         yield Moved(control, name, SETTINGS[name].unit, scene, value)
 
-
-HANDED = (
-    "prepare", "bind", "inputs", "picture", "describe", "artifacts", "printed", "numbers", "files", "scene_inputs",
-    "on_picture", "measured", "kept_pictures", "kept_files",
-)  # fmt: skip
-"""Methods of controls to which those of another package are handed copies of
-tensors.
-"""
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
@@ -186,31 +184,34 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is
-        the default. Raises InputError: it cannot be chosen.
+        """Check what was chosen in an instance of a control.
+
+        None is fine where it is the default. Raises InputError: it cannot be chosen.
         """
-        allowed = ""
-        fits = True
+        if given is None and self.default is None:
+            return
+        expected = ""
+        is_valid = True
         if self.options:
-            allowed = f"one of {', '.join(self.options)}"
-            fits = given in self.options
+            expected = f"one of {', '.join(self.options)}"
+            is_valid = given in self.options
         elif self.whole is not None:
             low, high = self.whole
-            allowed = f"a whole number from {low} to {high}"
-            fits = (
+            expected = f"a whole number from {low} to {high}"
+            is_valid = (
                 Parameter.is_number(given)
                 and low <= given <= high
                 and given == int(given)
             )
         elif self.most is not None and self.signed:
-            allowed = f"a number from {-self.most:g} to {self.most:g}"
-            fits = Parameter.is_number(given) and abs(given) <= self.most
+            expected = f"a number from {-self.most:g} to {self.most:g}"
+            is_valid = Parameter.is_number(given) and abs(given) <= self.most
         elif self.most is not None:
-            allowed = f"a number over 0 and up to {self.most:g}"
-            fits = Parameter.is_number(given) and 0.0 < given <= self.most
-        if not fits and not (given is None and self.default is None):
+            expected = f"a number over 0 and up to {self.most:g}"
+            is_valid = Parameter.is_number(given) and 0.0 < given <= self.most
+        if not is_valid:
             raise InputError(
-                f"{control}.{self.name}: expected {allowed}, got {given!r}"
+                f"{control}.{self.name}: expected {expected}, got {given!r}"
             )
 
 
@@ -221,8 +222,9 @@ discrete choice, its number.
 
 
 class Control:
-    """A family of scene parameters. `bind` returns a copy with a scene, which has a
-    slice of u and maps it to inputs.
+    """A family of scene parameters.
+
+    `bind` returns a copy with a scene, which has a slice of u and maps it to inputs.
 
     It is made of named numbers and choices. Once one parameter is given a range or a
     list, only those given so are searched; otherwise each parameter is searched over
@@ -296,71 +298,71 @@ class Control:
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        hand_copies(cls, **dict.fromkeys(HANDED, slice(None)))
+        names = [method.__name__ for method in METHODS_WITH_COPIES]
+        hand_copies(cls, **dict.fromkeys(names, slice(None)))
         if "summary" not in vars(cls) and cls.__doc__:
             cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Read the settings; see the class."""
         self.name = name or self.kind
         settings = {setting: as_setting(value) for setting, value in settings.items()}
         self.own = self.declared(settings)
-        known = [parameter.name for parameter in self.own] + [
-            choice.name for choice in self.choices
-        ]
+        parameter_names = [parameter.name for parameter in self.own]
+        known = parameter_names + [choice.name for choice in self.choices]
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(
                     f"setting of control {self.kind}", setting, known
                 )
-        given = {
+        settings_by_name = {
             setting: plain(value)
             for setting, value in settings.items()
             if value is not None
         }
-        self._given: dict[str, Any] = given
+        self._given: dict[str, Any] = settings_by_name
         self.chosen: dict[str, Any] = {
-            choice.name: given.get(choice.name, choice.default)
+            choice.name: settings_by_name.get(choice.name, choice.default)
             for choice in self.choices
         }
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
-        self.specs = {
-            parameter.name: read(
-                f"{self.name}.{parameter.name}", parameter, given[parameter.name]
-            )
-            for parameter in self.own
-            if parameter.name in given
-        }
+        self.specs: dict[str, Spec] = {}
+        for parameter in self.own:
+            if parameter.name in settings_by_name:
+                label = f"{self.name}.{parameter.name}"
+                self.specs[parameter.name] = read(
+                    label, parameter, settings_by_name[parameter.name]
+                )
         self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings, by name,
-        perhaps with the values: those of the class, unless the scene or the settings
-        name them.
+        """Return the parameters of an instance with some settings, by name.
+
+        Those of the class, unless the scene or the settings name them. A mapping has
+        the values too.
         """
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by
-        default nothing. Raises InputError: a choice is out of range.
+        """Check what the choices' own declarations do not say of `self.chosen`.
+
+        By default nothing. Raises InputError: a choice is out of range.
         """
 
     def settings(self) -> dict[str, object]:
-        """Return what `make_control` needs to make an equal instance, as JSON
-        values.
-        """
-        return (
-            {"kind": self.kind, **self._given}
-            if self.name != self.kind
-            else dict(self._given)
-        )
+        """Return what `make_control` needs to make an equal instance, as JSON values."""
+        if self.name == self.kind:
+            return dict(self._given)
+        return {"kind": self.kind, **self._given}
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh that it is about: the one behind the colon of its name, or
-        else the object.
+        """Name of the mesh that it is about.
+
+        It stands behind the colon of the control's name; by default it is the object.
         """
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
@@ -370,8 +372,9 @@ class Control:
         return file_name(self.name)
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene. Raises UnknownNameError: there is none of that
-        name.
+        """Return that mesh in a scene.
+
+        Raises UnknownNameError: there is none of that name.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -393,98 +396,98 @@ class Control:
         )
 
     def setting(self, parameter: Parameter) -> str:
-        """Return the name of the scene's setting that says the same as a parameter,
-        whether or not there is one.
+        """Return the name of a parameter among the scene's settings.
+
+        Whether or not the scene has it.
         """
         return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def chosen_form(self, forms: Sequence[str]) -> str:
-        """Return which form of itself a control takes, where each of its parameters
-        stands for one, and the choice `form` for any.
+        """Return which form of itself a control takes.
+
+        Each of its parameters stands for one form, and the choice `form` for any.
 
         Args:
             forms: the forms, in the order of the parameters; the first is the default.
 
         Raises:
-            InputError: two forms are asked for, or a parameter was given a range of its
-                own.
+            InputError: two forms are requested, or a parameter has a range of its own.
             UnknownNameError: there is no such form.
         """
-        asked = []
+        requested = []
         for parameter, form in zip(self.parameters, forms, strict=True):
-            chosen = self._given.get(parameter.name)
-            if chosen not in (
-                None,
+            value = self._given.get(parameter.name)
+            if value is None:
+                continue
+            if value not in (
                 [parameter.low, parameter.high],
                 (parameter.low, parameter.high),
             ):
                 raise InputError(
                     f"{self.name}.{parameter.name}: expected no value but "
                     f"[{parameter.low:g}, {parameter.high:g}], got "
-                    f"{chosen!r}; set how far it may go with {self.name}.epsilon"
+                    f"{value!r}; set how far it may go with {self.name}.epsilon"
                 )
-            asked += [] if chosen is None else [form]
+            requested.append(form)
         if "form" in self._given:
-            asked.append(str(self._given["form"]))
-            if asked[-1] not in forms:
-                raise UnknownNameError(f"{self.name}.form", asked[-1], forms)
-        if len(set(asked)) > 1:
+            form = str(self._given["form"])
+            requested.append(form)
+            if form not in forms:
+                raise UnknownNameError(f"{self.name}.form", form, forms)
+        if len(set(requested)) > 1:
             raise InputError(
-                f"{self.name}.form: expected one form, got {', '.join(asked)}"
+                f"{self.name}.form: expected one form, got {', '.join(requested)}"
             )
-        return asked[0] if asked else forms[0]
+        return requested[0] if requested else forms[0]
 
     def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
-        """Return the values, one by one, that a parameter was set to; others where
-        nothing was said of it.
+        """Return the values that a parameter was set to, one by one.
+
+        Args:
+            parameter: its name.
+            *otherwise: what is returned where it was not set, or has a range.
         """
         spec = self.specs.get(parameter)
-        return (
-            spec.values
-            if isinstance(spec, OneOf)
-            else (spec.value,)
-            if isinstance(spec, Fixed)
-            else otherwise
-        )
+        if isinstance(spec, OneOf):
+            return spec.values
+        if isinstance(spec, Fixed):
+            return (spec.value,)
+        return otherwise
 
     def searches(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is
-        searched.
-        """
-        return (
-            not isinstance(self.specs[parameter], Fixed)
-            if parameter in self.specs
-            else not self.asked
-        )
+        """Return whether a parameter with a range of its own is among what is searched."""
+        if parameter in self.specs:
+            return not isinstance(self.specs[parameter], Fixed)
+        return not self.asked
 
     # ---- in a scene
-    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Return the scene with whatever this control needs to be in it (a light, a
-        medium); by default unchanged. Raises InputError: the scene cannot take it.
+        """Return the scene with the parts that this control needs (a light, a medium).
+
+        By default it is unchanged. Raises InputError: the scene cannot take them.
         """
         return scene
 
     def within(self, scene: SceneDescription) -> Self:
         """Return a copy that has a scene, without a slice of u yet."""
-        there = copy.copy(self)
-        there.scene = scene if is_ours(type(self)) else copied(scene)
-        return there
+        in_scene = copy.copy(self)
+        in_scene.scene = scene if is_ours(type(self)) else copied(scene)
+        return in_scene
 
     def bind(self, scene: SceneDescription) -> Self:
-        """Return a copy that is fit to a scene that all controls of the space have
-        prepared. Raises InputError: a setting of the control is impossible in this
-        scene.
+        """Return a copy that is bound to a scene, which all controls have prepared.
+
+        Raises InputError: a setting of the control is impossible in this scene.
         """
         bound = self.within(scene)
         bound.fit()
         return bound
 
     def fit(self) -> None:
-        """Set `start` and `groups`, and `moved` where there is something to say, for
-        `self.scene`. Raises InputError: a setting of the control is impossible in this
-        scene.
+        """Set `start`, `groups` and `moved` for `self.scene`.
+
+        Raises InputError: a setting of the control is impossible in this scene.
         """
         slots = list[Slot]()
         begin = 0
@@ -493,25 +496,27 @@ class Control:
             slots.append(slot)
             begin += slot.width
         self.slots = tuple(slots)
-        self.moved = tuple(self._list_moved())
+        self.moved = tuple(self._list_adjusted_defaults())
         self.start = torch.tensor(
-            [share for slot in slots for share in slot.start()], dtype=torch.float32
+            [coordinate for slot in slots for coordinate in slot.start()],
+            dtype=torch.float32,
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
         ]
-        ends = torch.tensor(
+        low_and_span = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         widths = torch.tensor([slot.width for slot in slots], dtype=torch.long)
-        self._low, self._span = ends.T.repeat_interleave(widths, dim=1)
+        self._low, self._span = low_and_span.T.repeat_interleave(widths, dim=1)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as this scene has it: with its value in the unchanged
-        scene as the default, the range that is searched when nothing is said about it,
-        and the unit, the shape and the estimators that it has there.
+        """Return a parameter as this scene has it.
+
+        Its default is its value in the unchanged scene; its search range, unit, shape
+        and estimators are those that it has there.
         """
         value = self.scene.values.get(self.setting(parameter))
         return parameter if value is None else replace(parameter, default=value)
@@ -525,8 +530,10 @@ class Control:
         )
 
     def unchanged(self, parameter: Parameter) -> Number:
-        """Return what a parameter, as `in_scene` has it, is in the scene as it was
-        described: its default, unless that changes the scene.
+        """Return the value of a parameter in the scene as it was described.
+
+        That is its default, unless that changes the scene. The parameter is as
+        `in_scene` has it.
         """
         return parameter.default
 
@@ -536,24 +543,23 @@ class Control:
             return self.specs[parameter.name]
         if self.asked or parameter.search is None:
             return Fixed(parameter.default)
-        return (
-            OneOf(parameter.options) if parameter.options else Range(*parameter.search)
-        )
+        if parameter.options:
+            return OneOf(parameter.options)
+        return Range(*parameter.search)
 
     def budget_of(self, parameter: Parameter) -> Budget:
         """Return how far a searched parameter may go: by default its whole range."""
         return WHOLE_RANGE
 
     def laid_out(self) -> Iterator[tuple[Parameter, Spec]]:
-        """Yield the parameters in the order of their coordinates, each with what it is
-        set to.
-        """
+        """Yield the parameters in the order of their coordinates, with their specs."""
         for parameter in map(self.in_scene, self.own):
             yield parameter, self.spec(parameter)
 
     def is_compared(self, parameter: Parameter, spec: Spec) -> bool:
-        """Return whether the start has to have the clean scene's value of a parameter;
-        by default always.
+        """Return whether the start has to have the clean scene's value of a parameter.
+
+        By default always.
         """
         return True
 
@@ -566,81 +572,82 @@ class Control:
             ),
         )
 
-    def _list_moved(self) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not. Raises
-        InputError: one of them was asked for.
+    def _list_adjusted_defaults(self) -> Iterator[Moved]:
+        """Yield the values of the clean scene that the start does not have.
+
+        Raises InputError: one of them was requested.
         """
         for slot in self.slots:
-            if not self.is_compared(slot.parameter, slot.spec):
-                continue
             parameter = slot.parameter
-            wanted = self.unchanged(slot.parameter)
+            if not self.is_compared(parameter, slot.spec):
+                continue
+            scene_value = self.unchanged(parameter)
             used = slot.start_value()
-            if self.amount not in (None, parameter.name) or same(
-                used, wanted, turns=slot.turns
-            ):
+            hides_others = self.amount not in (None, parameter.name)
+            if hides_others or same(used, scene_value, turns=slot.turns):
                 continue
             setting = self.setting(parameter)
-            where = f"{self.name}.{parameter.name}"
+            label = f"{self.name}.{parameter.name}"
             if setting in self.scene.given:
-                asked = f"`environment={self.scene.environment_spec}`"
-                if setting != ENVIRONMENT:
-                    asked = f"`set` {setting}={shown(self.scene.number(setting))}"
                 raise InputError(
-                    f"{asked} and `controls` {self.name} contradict each other: "
-                    f"{where} is {slot.spec}, "
-                    f"which leaves {shown(wanted)} out; change one of the two, or "
+                    f"{self._quote_setting(setting)} and `controls` {self.name} contradict "
+                    f"each other: {label} is {slot.spec}, "
+                    f"which leaves {shown(scene_value)} out; change one of the two, or "
                     "leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
-                unit = "name" if parameter.options else parameter.unit
                 yield Moved(
                     self.name,
-                    setting if setting == ENVIRONMENT else where,
-                    unit,
-                    wanted,
+                    setting if setting == ENVIRONMENT else label,
+                    "name" if parameter.options else parameter.unit,
+                    scene_value,
                     used,
                 )
 
+    def _quote_setting(self, setting: str) -> str:
+        """Return how a setting of the scene is written, with its value."""
+        if setting == ENVIRONMENT:
+            return f"`environment={self.scene.environment_spec}`"
+        return f"`set` {setting}={shown(self.scene.number(setting))}"
+
     def _group(self, slot: Slot) -> Group:
+        """Return the group of coordinates of a searched parameter."""
         parameter = slot.parameter
+        name = parameter.name
         spec = slot.spec
-        setting = self.setting(slot.parameter)
+        setting = self.setting(parameter)
         if isinstance(spec, OneOf):
             return Group(
-                parameter.name,
-                slot.width,
-                (),
-                options=len(spec.values),
-                setting=setting,
+                name, slot.width, (), options=len(spec.values), setting=setting
             )
         budget = self.budget_of(parameter)
         if type(spec) is not Range and budget != WHOLE_RANGE:
             raise InputError(
-                f"{self.name}.{parameter.name}: it has a ball and no "
-                "distribution; give it a range"
+                f"{self.name}.{name}: it has a ball and no distribution; give it a range"
             )
-        name = parameter.name
-        valid = parameter.estimators
         return Group(
-            name, slot.width, valid, budget, periodic=slot.periodic, setting=setting
+            name,
+            slot.width,
+            parameter.estimators,
+            budget,
+            periodic=slot.periodic,
+            setting=setting,
         )
 
     @property
     def ambient(self) -> float | None:
-        """Lux of ambient light beside the light that it throws; None where there is
-        none or where that is searched.
+        """Lux of ambient light beside the light that it throws.
+
+        None where there is none, or where it is searched.
         """
         return None
 
     def in_light(self, times: float) -> Self:
-        """Return the bound control in so many times the ambient light."""
+        """Return the bound control with its ambient light scaled by a factor."""
         return self
 
     def later(self, seconds: float) -> Control:
-        """Return the bound control as it is so many seconds later, where it knows a
-        time; else itself.
-        """
+        """Return the control at a later time; itself if it does not depend on time."""
         return self
 
     @property
@@ -658,56 +665,53 @@ class Control:
         return frozenset()
 
     # ---- at a configuration
-    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        """Return every parameter's value at a slice of u: float32 of the parameter's
-        shape, or the number of an option. Fixed ones are there too.
+        """Return every parameter's value at a slice of u, fixed ones too.
+
+        Returns:
+            By name, float32 of the parameter's shape; of a choice the index of its option.
         """
         values: dict[str, Tensor] = {}
         if not self.slots:
             return values
         # at once, but for what is searched on a logarithmic scale
-        every = self._low.to(u) + self._span.to(u) * u
+        linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.slots:
             parameter = slot.parameter
             spec = slot.spec
-            place = slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
-                mapped = parameter.log or type(spec) is not Range
-                value = spec.at(u[place], log=parameter.log) if mapped else every[place]
+                coordinates = slice(slot.begin, slot.begin + slot.size)
+                if parameter.log or type(spec) is not Range:
+                    value = spec.at(u[coordinates], log=parameter.log)
+                else:
+                    value = linear[coordinates]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
-            chosen = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
-            shape = (
-                (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
-            )
-            number = (
-                parameter.options.index(chosen) if isinstance(chosen, str) else chosen
-            )
-            values[parameter.name] = torch.full(
-                shape, float(number), dtype=torch.float32, device=u.device
-            )
+            constant = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
+            values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return what the values do to the scene, by differentiable torch operations;
-        see `inputs`.
+        """Return what the values do to the scene, by differentiable torch operations.
+
+        See `inputs`.
         """
         return {}
 
     def inputs(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        """Map a slice (d,) of u to named scene inputs, by differentiable torch
-        operations, on the device of u.
+        """Map a slice of u to scene inputs by name.
+
+        By differentiable torch operations, on the device of u.
 
         Args:
             u: (d,) in [0, 1].
-            so_far: inputs of the controls before this one; only names in `refines` may
-                be returned again.
+            so_far: inputs of the controls before this one; only names in `refines`
+                may be returned again.
         """
         return self.scene_inputs(self.values(u), so_far)
 
@@ -716,60 +720,53 @@ class Control:
         return image
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1];
-        differentiable in both arguments.
+        """Change the finished image, (H, W, 3) display-referred sRGB in [0, 1].
+
+        Differentiable in both arguments.
         """
-        # many do nothing to the picture: their values are not worked out again
-        return (
-            image
-            if type(self).on_picture is Control.on_picture
-            else self.on_picture(self.values(u), image)
-        )
+        # many do nothing to the image: their values are not worked out again
+        if type(self).on_picture is Control.on_picture:
+            return image
+        return self.on_picture(self.values(u), image)
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return further values worth storing with a configuration, by name without the
-        instance's.
-        """
+        """Return further values to store, by name without the instance's."""
         return {}
 
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
-        """Say a configuration in a few named values with units, small enough for one
-        row of a table.
+        """Describe a configuration by a few named values with units.
 
-        It is a function of its arguments alone; arguments as for `inputs`.
+        Small enough for one row of a table; a function of its arguments alone, which are
+        those of `inputs`.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}
         for slot in self.slots:
             parameter = slot.parameter
-            value = values[slot.parameter.name]
-            name = f"{self.name}.{slot.parameter.name}"
             if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
                 continue
+            value = values[parameter.name]
+            name = f"{self.name}.{parameter.name}"
             if parameter.options:
-                described[name] = {
-                    "value": parameter.options[int(value)],
-                    "unit": "name",
-                }
+                option = parameter.options[int(value)]
+                described[name] = {"value": option, "unit": "name"}
             elif value.ndim == 0:
                 described[name] = measure(value, parameter.unit)
             else:
-                described |= {
-                    f"{name}.{k}": measure(number, parameter.unit)
-                    for k, number in enumerate(value)
-                }
-        return described | {
-            f"{self.name}.{name}": value
-            for name, value in self.measured(values, so_far).items()
-        }
+                for k, number in enumerate(value):
+                    described[f"{name}.{k}"] = measure(number, parameter.unit)
+        for name, measurement in self.measured(values, so_far).items():
+            described[f"{self.name}.{name}"] = measurement
+        return described
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the numbers of the configuration by parameter, in its unit, (k,) or
-        without dimensions, as differentiable functions of u; names have none.
+        """Return the numbers of a configuration by parameter; names are left out.
+
+        Each is (k,) or (), in the parameter's unit, and differentiable in u.
         """
         values = self.values(u)
         declared = [slot.parameter for slot in self.slots]
@@ -781,42 +778,78 @@ class Control:
         return {name: values[name] for name in named}
 
     def printed(self, u: Tensor) -> Tensor | None:
-        """Return the searched colours that a printer would print, (h, w, 3)
-        display-referred sRGB in [0, 1], as a differentiable function of u; where only
-        some are searched (h, w, 4), with 1 for these and 0 for others; None without.
+        """Return the searched colors that a printer would print; None without any.
+
+        Returns:
+            (h, w, 3) display-referred sRGB in [0, 1], differentiable in u. Where
+                only some are searched (h, w, 4), with 1 for these and 0 for others.
         """
         return None
 
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return pictures worth keeping; see `artifacts`."""
+        """Return images worth storing; see `artifacts`."""
         return {}
 
     def artifacts(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB
-        in [0, 1]; see `describe`.
+        """Return images worth storing, by file stem.
+
+        Each is (h, w, 3), display-referred sRGB in [0, 1]. Arguments as for `describe`.
         """
         return self.kept_pictures(self.values(u.detach()), so_far)
 
     def kept_files(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files worth keeping; see `files`."""
+        """Return other files worth storing; see `files`."""
         return {}
 
     def files(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, bytes]:
-        """Return other files worth keeping, by name with ending: a mesh as PLY, say;
-        see `describe`.
+        """Return other files worth storing, by name with suffix, such as a mesh as PLY.
+
+        Arguments as for `describe`.
         """
         return self.kept_files(self.values(u.detach()), so_far)
 
 
 NumberControl = Control  # its name in packages that add controls
+
+
+def _to_tensor(constant: Number, slot: Slot, device: torch.device) -> Tensor:
+    """Return one number, or the index of a name, in the shape of a parameter."""
+    if isinstance(constant, str):
+        return torch.full(
+            (),
+            float(slot.parameter.options.index(constant)),
+            dtype=torch.float32,
+            device=device,
+        )
+    shape = (slot.size,) if slot.parameter.shape else ()
+    return torch.full(shape, float(constant), dtype=torch.float32, device=device)
+
+
+METHODS_WITH_COPIES = (
+    Control.prepare,
+    Control.bind,
+    Control.inputs,
+    Control.picture,
+    Control.describe,
+    Control.artifacts,
+    Control.printed,
+    Control.numbers,
+    Control.files,
+    Control.scene_inputs,
+    Control.on_picture,
+    Control.measured,
+    Control.kept_pictures,
+    Control.kept_files,
+)
+"""Methods of controls that get copies of tensors in controls of another package."""
 
 
 def measure(value: Tensor | float, unit: str) -> Value:
@@ -825,8 +858,11 @@ def measure(value: Tensor | float, unit: str) -> Value:
 
 
 def changed(name: str, change: Tensor) -> dict[str, Value]:
-    """Say a change of searched colours, display-referred: the largest, and the root of
-    the mean square.
+    """Describe a change of searched colors: the largest, and the root mean square.
+
+    Args:
+        name: of the control.
+        change: any shape, display-referred.
     """
     root_mean_square = change.square().mean().sqrt()
     return {
@@ -836,7 +872,5 @@ def changed(name: str, change: Tensor) -> dict[str, Value]:
 
 
 def file_name(name: str) -> str:
-    """Return a control's name as it stands in names of files: texture@chair of
-    texture:chair.
-    """
+    """Return a control's name as file names have it: texture@chair of texture:chair."""
     return name.replace(":", "@")

@@ -65,20 +65,31 @@ class BodyControl(Control):
     def clip(self) -> str | None:
         """The name of the animation that is played; None for none."""
         clips = self.rig.clips
-        asked = self.chosen["clip"]
-        if asked is None:
-            timed = geometry.TIME.name in self.specs or not self._given
-            return clips[0] if clips and timed else None
-        number = (
-            int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
+        requested = self.chosen["clip"]
+        if requested is None:
+            plays_time = geometry.TIME.name in self.specs or not self._given
+            return clips[0] if clips and plays_time else None
+        index = (
+            int(requested)
+            if Parameter.is_number(requested) or str(requested).isdigit()
+            else -1
         )
-        if asked not in clips and not 0 <= number < len(clips):
+        if requested not in clips and not 0 <= index < len(clips):
             raise errors.UnknownNameError(
-                f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}."
+                f"{self.name}.clip",
+                str(requested),
+                clips,
+                f"Animations of {self.mesh}.",
             )
-        return str(asked) if asked in clips else clips[number]
+        return str(requested) if requested in clips else clips[index]
 
     def fit(self) -> None:
+        """Check the parameters and the clip against the rig of the mesh.
+
+        Raises:
+            InputError: there is nothing to search.
+            UnknownNameError: the rig has no such parameter.
+        """
         known = [parameter.name for parameter in self.rig.parameters]
         for name in self.specs:
             if name not in known:
@@ -100,6 +111,7 @@ class BodyControl(Control):
         super().fit()
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with the value of the rig; not searched if the rig lacks it."""
         default = self.rig.defaults.get(parameter.name)
         if default is None:
             return replace(super().in_scene(parameter), search=None)

@@ -128,6 +128,11 @@ class CameraControl(Control):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Check the settings against the scene, and add the lens that they need.
+
+        Raises InputError: the scene has another camera, two settings are the same
+        thing, or its lens does not support one.
+        """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
                 f"`controls` {self.name}: moves along an orbit around the object, and "
@@ -143,45 +148,46 @@ class CameraControl(Control):
                 )
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
             scene = replace(scene, remarks=(*scene.remarks, traffic_remark(scene)))
-        wanted = "aperture" in self.specs or "focus" in self.specs
-        if wanted and self._shifted:
+        has_thin_lens = "aperture" in self.specs or "focus" in self.specs
+        if has_thin_lens and self._is_shifted:
             raise InputError(
                 f"`controls` {self.name}: a shifted picture together with an aperture "
                 "is not supported; leave one out"
             )
-        bent = [name for name in COEFFICIENTS if name in self.specs]
-        if bent and scene.camera_model is None:
+        bent_coefficients = [name for name in COEFFICIENTS if name in self.specs]
+        if bent_coefficients and scene.camera_model is None:
             scene = replace(
                 scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect)
             )
         model = scene.camera_model
         if model is None:
-            return replace(scene, thin_lens=True) if wanted else scene
-        for name in bent:
+            return replace(scene, thin_lens=True) if has_thin_lens else scene
+        for name in bent_coefficients:
             if name not in OF_KIND[model.kind]:
-                has = ", ".join(OF_KIND[model.kind]) or "none"
+                coefficients = ", ".join(OF_KIND[model.kind]) or "none"
                 raise InputError(
                     f"`controls` {self.name}: a {model.kind} lens has the "
-                    f"coefficients {has}, not {name}"
+                    f"coefficients {coefficients}, not {name}"
                 )
-        own = ("fov", "focal_length") if model.name else ()
-        shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
-        for name in (*own, *shift, "aperture", "focus"):
+        lens_parameters = ("fov", "focal_length") if model.name else ()
+        shift_parameters = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
+        for name in (*lens_parameters, *shift_parameters, "aperture", "focus"):
             if name in self.specs:
-                whose = (
+                lens = (
                     f"the lens of `camera={model.name}`"
                     if model.name
                     else "a lens with distortion, or raindrops"
                 )
                 raise InputError(
                     f"`controls` {self.name}: {name} is not supported "
-                    f"with {whose}; leave one of them out"
+                    f"with {lens}; leave one of them out"
                 )
         return scene
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
-        """Whether the camera does so at the begin, the middle and the end of all its
-        ranges.
+        """Return whether the camera always drives against the traffic.
+
+        That is at the lower end, the center and the upper end of all its ranges.
         """
         control = self.bind(scene)
         configurations = (
@@ -194,10 +200,11 @@ class CameraControl(Control):
         return all(is_against_traffic(scene, pose) for pose in poses)
 
     @property
-    def _shifted(self) -> bool:
+    def _is_shifted(self) -> bool:
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with the default and the range of the scene's own camera."""
         parameter = measured_in(
             super().in_scene(parameter), self.scene.object.metres is not None
         )
@@ -208,13 +215,17 @@ class CameraControl(Control):
         if name in COEFFICIENTS and scene.camera_model is not None:
             default = scene.camera_model.values[name]
         elif name in ("distance", "focus", "sizes"):
-            described = self._described()
-            away = float(
-                np.linalg.norm(camera_to_world(described)[:3, 3] - middle(described))
+            fixed_lens_scene = self._with_fixed_lens()
+            distance = float(
+                np.linalg.norm(
+                    camera_to_world(fixed_lens_scene)[:3, 3] - middle(fixed_lens_scene)
+                )
             )
-            default = away * (1.0 if name == "sizes" else scene.metres)
+            default = distance * (1.0 if name == "sizes" else scene.metres)
         elif name == "height":
-            default = float(camera_to_world(self._described())[2, 3]) * scene.metres
+            default = (
+                float(camera_to_world(self._with_fixed_lens())[2, 3]) * scene.metres
+            )
         elif name == "focal_length":
             default = (
                 SENSOR_WIDTH
@@ -223,13 +234,13 @@ class CameraControl(Control):
             )
         preset = PRESETS.get(scene.preset)
         if preset is not None:
-            own = scene.number("camera.azimuth")
-            around = (
+            scene_azimuth = scene.number("camera.azimuth")
+            azimuth_range = (
                 (0.0, 360.0)
                 if preset.aside >= 180.0
-                else (own - preset.aside, own + preset.aside)
+                else (scene_azimuth - preset.aside, scene_azimuth + preset.aside)
             )
-            search = around if name == "azimuth" else preset.search.get(name)
+            search = azimuth_range if name == "azimuth" else preset.search.get(name)
         elif on_roads(scene.object) and name == "elevation":
             search = None
         elif on_roads(scene.object) and name == "height":
@@ -245,10 +256,11 @@ class CameraControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the camera's pose, lens, focus, shift and exposure."""
         scene = self.scene
         fov = values["fov"]
         if "focal_length" in self.specs:
-            fov = _fov_of(values["focal_length"])
+            fov = _compute_fov(values["focal_length"])
         if "sizes" in self.specs:
             distance = values["sizes"]
         elif (
@@ -259,9 +271,11 @@ class CameraControl(Control):
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
-        inputs = {"camera.to_world": self._orbit(values, distance)}
+        inputs = {"camera.to_world": self._compute_pose(values, distance)}
         if scene.camera_model is not None:
-            inputs["camera.lens"] = self._numbers(scene.camera_model, values, fov)
+            inputs["camera.lens"] = self._compute_model_numbers(
+                scene.camera_model, values, fov
+            )
         else:
             inputs["camera.fov"] = fov.reshape(1)
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
@@ -270,7 +284,7 @@ class CameraControl(Control):
                 values["focus"] / scene.metres if "focus" in self.specs else distance
             )
             inputs["camera.focus"] = focus.reshape(1)
-        if scene.camera_model is None and self._shifted:
+        if scene.camera_model is None and self._is_shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
             inputs["camera.exposure"] = values["exposure"] - scene.number(
@@ -278,26 +292,33 @@ class CameraControl(Control):
             )
         return inputs
 
-    def _numbers(self, model: CameraModel, values: Values, fov: Tensor) -> Tensor:
-        """The numbers (17,) of the camera's model."""
-        numbers = {name: torch.tensor(value) for name, value in model.values.items()}
+    def _compute_model_numbers(
+        self, model: CameraModel, values: Values, fov: Tensor
+    ) -> Tensor:
+        """Return the numbers (17,) of the camera's model."""
+        model_values = {
+            name: torch.tensor(value) for name, value in model.values.items()
+        }
         if not model.name:
             aspect = self.scene.aspect
             focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
-            numbers |= {
+            model_values |= {
                 "fx": focal * max(1.0, 1.0 / aspect),
                 "fy": focal * max(1.0, aspect),
             }
-        numbers |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
-        numbers |= {
-            "cx": numbers["cx"] + values["shift_x"],
-            "cy": numbers["cy"] + values["shift_y"],
+        model_values |= {
+            name: values[name] for name in COEFFICIENTS if name in self.specs
         }
-        return torch.stack([numbers[name].to(fov) for name in NUMBERS])
+        model_values |= {
+            "cx": model_values["cx"] + values["shift_x"],
+            "cy": model_values["cy"] + values["shift_y"],
+        }
+        return torch.stack([model_values[name].to(fov) for name in NUMBERS])
 
-    def _described(self) -> SceneDescription:
-        """The scene with a fixed lens, for which the distance is worked out as for the
-        same setting.
+    def _with_fixed_lens(self) -> SceneDescription:
+        """Return the scene with the field of view that was set.
+
+        The distance is worked out as for the same setting.
         """
         fov = self.specs.get("fov")
         focal_length = self.specs.get("focal_length")
@@ -305,26 +326,31 @@ class CameraControl(Control):
             return self.scene.with_values(camera__fov=float(fov.value))
         if isinstance(focal_length, Fixed):
             return self.scene.with_values(
-                camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item()
+                camera__fov=_compute_fov(torch.tensor(float(focal_length.value))).item()
             )
         return self.scene
 
-    def _orbit(self, values: Values, distance: Tensor) -> Tensor:
+    def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
+        """Return the pose (4, 4) on the orbit, at a distance () in object sizes."""
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
         elevation = torch.deg2rad(values["elevation"])
         roll = torch.deg2rad(values["roll"])
         # above the ground, so that the elevation follows
         keeps_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():
-            searched = any(
+            is_height_searched = any(
                 slot.width for slot in self.slots if slot.parameter.name == "height"
             )
             keeps_height = (
-                self.scene.values.get("camera.height") is not None or searched
+                self.scene.values.get("camera.height") is not None or is_height_searched
             )
         if keeps_height:
-            above = values["height"] / self.scene.metres - float(middle(self.scene)[2])
-            elevation = torch.asin((above / distance).clamp(-STEEPEST, STEEPEST))
+            height_above_center = values["height"] / self.scene.metres - float(
+                middle(self.scene)[2]
+            )
+            elevation = torch.asin(
+                (height_above_center / distance).clamp(-STEEPEST, STEEPEST)
+            )
         zero = torch.zeros_like(azimuth)
         outwards = torch.stack(
             [
@@ -339,13 +365,16 @@ class CameraControl(Control):
             roll.cos() * left + roll.sin() * up,
             roll.cos() * up - roll.sin() * left,
         )
-        place = torch.from_numpy(middle(self.scene)).to(distance) + distance * outwards
-        return affine(torch.stack([left, up, -outwards], dim=1), place)
+        position = (
+            torch.from_numpy(middle(self.scene)).to(distance) + distance * outwards
+        )
+        return affine(torch.stack([left, up, -outwards], dim=1), position)
 
 
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
-    """Return a parameter of the camera as it is around an object that has a size in
-    metres, or has none.
+    """Return a parameter in the unit of lengths that a scene has.
+
+    That is object sizes around an object without a size in metres.
     """
     return (
         replace(parameter, unit="object sizes")
@@ -354,6 +383,6 @@ def measured_in(parameter: Parameter, metres: bool) -> Parameter:
     )
 
 
-def _fov_of(focal_length: Tensor) -> Tensor:
-    """The field of view, degrees, of a lens of a focal length in millimetres."""
+def _compute_fov(focal_length: Tensor) -> Tensor:
+    """Return the field of view, degrees, of a lens of a focal length in millimetres."""
     return torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / focal_length))

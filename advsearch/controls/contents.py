@@ -6,7 +6,8 @@ and Mulla 2014, arXiv 1511.04463, section 2) marks the inside; rays from its axi
 the wall. Colours are in linear light (Kubelka and Munk 1931):
 
     K / S = sum(p_i K_i) / sum(p_i S_i),   milky coffee = 1 + K/S - sqrt((K/S)^2 + 2 K/S)
-    color = opacity * milky coffee + (1 - opacity) * vessel * tint of water,   opacity = 1 - exp(-DENSITY (1 - water))
+    color = opacity * milky coffee + (1 - opacity) * vessel * tint of water
+    opacity = 1 - exp(-DENSITY (1 - water))
 
 Proportions add up to one: the two that are free are cut off a stick of length one in
 turn, each from what is left.
@@ -89,139 +90,183 @@ class Vessel:
 def interior(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel."""
     mesh = asset.mesh
-    basin = _basin(mesh)
+    basin = _find_basin(mesh)
     if basin is None:
         return None
     axis, floor, rim = basin
-    heights = np.linspace(floor, floor + BRIM * (rim - floor), ROWS)
-    inset = 0.004 * (rim - floor)  # a ray along a flat floor would see anything
-    rows = [_wall(mesh, axis, max(float(height), floor + inset)) for height in heights]
-    radii = np.stack([row[0] for row in rows])
-    faces = np.concatenate([row[1] for row in rows[: ROWS // 2]])
-    met = np.isfinite(radii)
-    if met.mean() < CLOSED or not met.any(axis=1).all():
+    depth = rim - floor
+    heights = np.linspace(floor, floor + BRIM * depth, ROWS)
+    # a ray along a flat floor would see anything
+    lowest = floor + 0.004 * depth
+    walls = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
+    radii = np.stack([distance for distance, _ in walls])
+    is_hit = np.isfinite(radii)
+    if is_hit.mean() < CLOSED or not is_hit.any(axis=1).all():
         return None
-    middle = np.array([np.median(row[np.isfinite(row)]) for row in radii])
-    # middles of faces in the texture
-    places = mesh.uvs[mesh.faces[faces[faces >= 0]].astype(np.int64)].mean(axis=1)
-    places -= np.floor(places) if mesh.repeats else 0.0
+    medians = np.array([np.median(row[np.isfinite(row)]) for row in radii])
+    lower_faces = np.concatenate([face for _, face in walls[: ROWS // 2]])
+    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
+    return Vessel(axis, heights, np.where(is_hit, radii, medians[:, None]), wall_color)
+
+
+def _mean_face_color(asset: assets.ObjectAsset, faces: assets.Ints) -> assets.Doubles:
+    """Return the mean linear color (3,) of the texture at the centers of faces (N,)."""
+    mesh = asset.mesh
+    centers = mesh.uvs[mesh.faces[faces].astype(np.int64)].mean(axis=1)
+    if mesh.repeats:
+        centers -= np.floor(centers)
     height, width = asset.base_color.shape[:2]
-    column = np.clip((places[:, 0] * width).astype(np.int64), 0, width - 1)
-    row = np.clip(((1.0 - places[:, 1]) * height).astype(np.int64), 0, height - 1)
-    wall_color = color.srgb_to_linear(asset.base_color[row, column]).mean(axis=0)
-    radii = np.where(met, radii, middle[:, None])
-    return Vessel(axis, heights, radii, np.asarray(wall_color, dtype=np.float64))
+    column = np.clip((centers[:, 0] * width).astype(np.int64), 0, width - 1)
+    row = np.clip(((1.0 - centers[:, 1]) * height).astype(np.int64), 0, height - 1)
+    mean = color.srgb_to_linear(asset.base_color[row, column]).mean(axis=0)
+    return np.asarray(mean, dtype=np.float64)
 
 
-def _basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None:
-    """Return the axis (2,), the floor and the rim of the largest basin, or None if
-    there is none worth the name.
+def _find_basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None:
+    """Find the largest basin of a mesh.
+
+    Returns:
+        Its axis (2,), its floor and its rim; None if there is none worth the name.
     """
-    low, cell, ground = _height_map(mesh)
-    water = _filled(ground)
+    corner, cell, ground = _compute_height_map(mesh)
+    water = _fill_with_water(ground)
     labels, count = ndimage.label(water - ground > 1e-3)
     if count == 0:
         return None
     volumes = ndimage.sum_labels(water - ground, labels, np.arange(1, count + 1))
-    mine = labels == 1 + int(np.argmax(volumes))
-    depth = np.where(mine, water - ground, 0.0)
-    if depth.max() < SHALLOWEST or mine.sum() * cell * cell < NARROWEST:
+    is_largest = labels == 1 + int(np.argmax(volumes))
+    depth = np.where(is_largest, water - ground, 0.0)
+    if depth.max() < SHALLOWEST or is_largest.sum() * cell * cell < NARROWEST:
         return None
-    row, column = np.nonzero(mine)
-    weight = depth[mine]
-    axis = (
-        low
-        + cell
-        * np.array([(column * weight).sum(), (row * weight).sum()])
-        / weight.sum()
-    )
-    return axis, float(ground[mine].min()), float(water[mine].max())
+    row, column = np.nonzero(is_largest)
+    weight = depth[is_largest]
+    moments = np.array([(column * weight).sum(), (row * weight).sum()])
+    axis = corner + cell * moments / weight.sum()
+    return axis, float(ground[is_largest].min()), float(water[is_largest].max())
 
 
-def _height_map(mesh: assets.Mesh) -> tuple[assets.Doubles, float, assets.Doubles]:
-    """Highest surface over a grid with an empty margin: place of cell (0, 0), side of a
-    cell, (h, w) heights. Edges are drawn as well as faces, so that a thin upright wall
-    is not missed between two cells.
+def _compute_height_map(
+    mesh: assets.Mesh,
+) -> tuple[assets.Doubles, float, assets.Doubles]:
+    """Compute the highest surface over a grid with an empty margin.
+
+    Edges are drawn as well as faces, so that a thin upright wall is not missed between
+    two cells.
+
+    Returns:
+        Position (2,) of cell (0, 0), side of a cell, heights (h, w).
     """
     vertices = mesh.vertices.astype(np.float64)
-    low = vertices[:, :2].min(axis=0)
-    high = vertices[:, :2].max(axis=0)
-    cell = float((high - low).max()) / GRID
-    low = low - 1.5 * cell
-    width, height = (np.ceil((high - low) / cell).astype(np.int64) + 2).tolist()
+    lower = vertices[:, :2].min(axis=0)
+    upper = vertices[:, :2].max(axis=0)
+    cell = float((upper - lower).max()) / GRID
+    lower = lower - 1.5 * cell
+    width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
     ground = np.full((height, width), vertices[:, 2].min() - 1.0)
     corners = vertices[mesh.faces.astype(np.int64)]
-    placed = (corners[..., :2] - low) / cell
-    face, row, column, weights = images.pixels_in(placed, (height, width))
+    in_cells = (corners[..., :2] - lower) / cell
+    face, row, column, weights = images.pixels_in(in_cells, (height, width))
     np.maximum.at(ground, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
-    for share in np.linspace(0.0, 1.0, 9):
+    _draw_edges(ground, in_cells, corners[..., 2])
+    return lower, cell, ground
+
+
+def _draw_edges(
+    ground: assets.Doubles, positions: assets.Doubles, heights: assets.Doubles
+) -> None:
+    """Raise a height map (h, w) to the edges of triangles, in place.
+
+    Args:
+        ground: the map.
+        positions: (F, 3, 2) of the corners, in cells.
+        heights: (F, 3) of the corners.
+    """
+    for fraction in np.linspace(0.0, 1.0, 9):
         for begin, end in ((0, 1), (1, 2), (2, 0)):
-            place = np.rint(
-                placed[:, begin] + share * (placed[:, end] - placed[:, begin])
-            ).astype(np.int64)
-            at = corners[:, begin, 2] + share * (
-                corners[:, end, 2] - corners[:, begin, 2]
-            )
-            np.maximum.at(ground, (place[:, 1], place[:, 0]), at)
-    return low, cell, ground
+            edge = positions[:, end] - positions[:, begin]
+            cell = np.rint(positions[:, begin] + fraction * edge).astype(np.int64)
+            rise = heights[:, end] - heights[:, begin]
+            height = heights[:, begin] + fraction * rise
+            np.maximum.at(ground, (cell[:, 1], cell[:, 0]), height)
 
 
-def _filled(ground: assets.Doubles) -> assets.Doubles:
-    """The level of water on a height map (h, w) from whose edges it runs off. Every
-    cell stands as high as its ground or its lowest neighbour's water, whichever is
-    higher; repeated until nothing changes.
+def _fill_with_water(ground: assets.Doubles) -> assets.Doubles:
+    """Return the level of water on a height map (h, w) from whose edges it runs off.
+
+    Every cell stands as high as its ground or its lowest neighbour's water, whichever
+    is higher; repeated until nothing changes.
     """
     water = np.full_like(ground, np.inf)
-    water[[0, -1]], water[:, [0, -1]] = ground[[0, -1]], ground[:, [0, -1]]
+    water[[0, -1]] = ground[[0, -1]]
+    water[:, [0, -1]] = ground[:, [0, -1]]
     while True:
-        beside = (water[:-2, 1:-1], water[2:, 1:-1], water[1:-1, :-2], water[1:-1, 2:])
-        lowest = np.minimum.reduce(beside)
+        neighbors = (
+            water[:-2, 1:-1],
+            water[2:, 1:-1],
+            water[1:-1, :-2],
+            water[1:-1, 2:],
+        )
+        lowest = np.minimum.reduce(neighbors)
         level = np.maximum(ground[1:-1, 1:-1], np.minimum(lowest, water[1:-1, 1:-1]))
         if np.array_equal(level, water[1:-1, 1:-1]):
             return water
         water[1:-1, 1:-1] = level
 
 
-def _wall(
+def _find_wall(
     mesh: assets.Mesh, axis: assets.Doubles, height: float
 ) -> tuple[assets.Doubles, assets.Ints]:
-    """Cast level rays from the axis at one height. Returns the (COLUMNS,) distance of
-    the first surface in each direction, infinite where there is none, and its face or
-    -1.
+    """Cast level rays from the axis at one height, in COLUMNS directions.
+
+    Returns:
+        Distance (COLUMNS,) of the first surface in each direction, infinite where there
+        is none; and its face, or -1.
     """
-    corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)
-    above = corners[..., 2] > height
-    face = np.nonzero(above.any(axis=1) & ~above.all(axis=1))[0]
+    face, first_end, second_end = _cut_faces(mesh, height)
     if not len(face):
         return np.full(COLUMNS, np.inf), np.full(COLUMNS, -1)
-    corners = corners[face]
-    above = above[face]
-    number = np.arange(len(face))
-    # the corner on its side
-    alone = np.where(
-        above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1)
-    )
-    apex = corners[number, alone]
-    ends = []  # of the cut through each face, from the axis
-    for step in (1, 2):
-        other = corners[number, (alone + step) % 3]
-        share = (height - apex[:, 2]) / np.where(
-            other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2]
-        )
-        ends.append(apex[:, :2] + share[:, None] * (other[:, :2] - apex[:, :2]) - axis)
+    first_end = first_end - axis
+    second_end = second_end - axis
     angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
-    toward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # sides of rays, (COLUMNS, S)
-    first, last = (
-        toward[:, :1] * end[:, 1] - toward[:, 1:] * end[:, 0] for end in ends
-    )
-    crossed = (first > 0.0) != (last > 0.0)
-    share = first / np.where(crossed, first - last, 1.0)
-    distance = (toward @ ends[0].T) * (1.0 - share) + (toward @ ends[1].T) * share
-    distance = np.where(crossed & (distance > 0.0), distance, np.inf)
-    nearest = distance.argmin(axis=1)
-    distance = distance[np.arange(COLUMNS), nearest]
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # on which side of each ray the ends are, (COLUMNS, S)
+    first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
+    second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
+    is_crossed = (first_side > 0.0) != (second_side > 0.0)
+    fraction = first_side / np.where(is_crossed, first_side - second_side, 1.0)
+    along_ray = (ray @ first_end.T) * (1.0 - fraction) + (ray @ second_end.T) * fraction
+    along_ray = np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
+    nearest = along_ray.argmin(axis=1)
+    distance = along_ray[np.arange(COLUMNS), nearest]
     return distance, np.where(np.isfinite(distance), face[nearest], -1)
+
+
+def _cut_faces(
+    mesh: assets.Mesh, height: float
+) -> tuple[assets.Ints, assets.Doubles, assets.Doubles]:
+    """Cut a mesh by a level plane.
+
+    Returns:
+        The faces (S,) that it cuts, and the two ends (S, 2) of each cut.
+    """
+    corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)
+    is_above = corners[..., 2] > height
+    face = np.nonzero(is_above.any(axis=1) & ~is_above.all(axis=1))[0]
+    corners = corners[face]
+    is_above = is_above[face]
+    index = np.arange(len(face))
+    # the corner that is on its side of the plane by itself
+    single = np.where(
+        is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
+    )
+    apex = corners[index, single]
+    ends = []
+    for step in (1, 2):
+        other = corners[index, (single + step) % 3]
+        rise = np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
+        fraction = (height - apex[:, 2]) / rise
+        ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
+    return face, ends[0], ends[1]
 
 
 class ContentsControl(Control):
@@ -237,71 +282,99 @@ class ContentsControl(Control):
     refines = frozenset({"object.to_world"})
     parameters = (
         Parameter.moving(
-            Parameter.ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is "
-                                                          "empty, 1 is full to the "
-                                                          "brim.",
+            Parameter.ORBIT,
+            "level",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Height of the liquid: 0 is empty, 1 is full to the brim.",
             (0.0, 0.95),
         ),
         *(
-            _lit(name, "1", 0.0, 1.0, float(name == "coffee"), f"Share of {name}.", (0.0, 1.0))
+            _lit(
+                name,
+                "1",
+                0.0,
+                1.0,
+                float(name == "coffee"),
+                f"Share of {name}.",
+                (0.0, 1.0),
+            )
             for name in INGREDIENTS
         ),
-    )  # fmt: skip
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
+        """Find the bounds of each proportion.
+
+        Raises InputError: they cannot add up to 1.
+        """
         super().__init__(name, **settings)
-        # of every ingredient: as given; free if not given and searched; or what the
-        # given ones leave
-        bounds = self.bounds = dict[str, tuple[float, float]]()
+        # of every ingredient: as set; free if not set and searched; or what the others
+        # leave
+        self.bounds = self._read_bounds()
+        least_total = sum(lower for lower, _ in self.bounds.values())
+        self._check_total(least_total)
+        is_searched = not self.asked or any(
+            isinstance(self.specs.get(name), Range) for name in INGREDIENTS
+        )
+        rest = max(0.0, 1.0 - least_total)
+        for name in ("coffee", "water", "milk"):
+            if name in self.bounds:
+                continue
+            if is_searched:
+                self.bounds[name] = (0.0, rest)
+            else:
+                self.bounds[name] = (rest, rest)
+                rest = 0.0
+
+    def _read_bounds(self) -> dict[str, tuple[float, float]]:
+        """Return the least and the largest proportion of each ingredient that is set.
+
+        Raises:
+            InputError: one has a list of values or a distribution.
+        """
+        bounds = dict[str, tuple[float, float]]()
         for name in INGREDIENTS:
             spec = self.specs.get(name)
-            if (
-                spec is not None
-                and not isinstance(spec, Fixed)
-                and type(spec) is not Range
-            ):
-                got = (
-                    "a list of values; a choice"
-                    if isinstance(spec, OneOf)
-                    else "a distribution; a draw"
-                )
+            if spec is None:
+                continue
+            if isinstance(spec, Fixed):
+                bounds[name] = (float(spec.value), float(spec.value))
+            elif type(spec) is Range:
+                bounds[name] = (spec.low, spec.high)
+            else:
+                got = "a distribution; a draw"
+                if isinstance(spec, OneOf):
+                    got = "a list of values; a choice"
                 raise InputError(
                     f"{self.name}.{name}: expected a number or a range [low, high], "
                     f"got {got} among proportions would "
                     "not add up to 1"
                 )
-            if isinstance(spec, Fixed):
-                bounds[name] = (float(spec.value), float(spec.value))
-            elif isinstance(spec, Range):
-                bounds[name] = (spec.low, spec.high)
-        least = sum(low for low, _ in bounds.values())
-        most = sum(high for _, high in bounds.values())
-        if least > 1.0 + TOTAL or (
-            len(bounds) == len(INGREDIENTS) and most < 1.0 - TOTAL
-        ):
-            ends = {
-                name: dict.fromkeys(f"{end:g}" for end in bounds[name])
-                for name in INGREDIENTS
-                if name in bounds
-            }
-            got = ", ".join(
-                f"{name} {' to '.join(pair)}" for name, pair in ends.items()
-            )
-            raise InputError(
-                f"`controls` {self.name}: expected proportions of water, milk and "
-                f"coffee that add up to 1, got {got}; "
-                "change one of them or leave one out"
-            )
-        searched = not self.asked or any(
-            isinstance(self.specs.get(name), Range) for name in INGREDIENTS
+        return bounds
+
+    def _check_total(self, least_total: float) -> None:
+        """Check that the proportions can add up to 1. Raises InputError: they cannot."""
+        largest_total = sum(upper for _, upper in self.bounds.values())
+        all_set = len(self.bounds) == len(INGREDIENTS)
+        too_little = all_set and largest_total < 1.0 - TOTAL
+        if least_total <= 1.0 + TOTAL and not too_little:
+            return
+        stated = []
+        for name in INGREDIENTS:
+            if name in self.bounds:
+                ends = dict.fromkeys(f"{end:g}" for end in self.bounds[name])
+                stated.append(f"{name} {' to '.join(ends)}")
+        raise InputError(
+            f"`controls` {self.name}: expected proportions of water, milk and "
+            f"coffee that add up to 1, got {', '.join(stated)}; "
+            "change one of them or leave one out"
         )
-        rest = max(0.0, 1.0 - least)
-        for name in ("coffee", "water", "milk"):
-            if name not in bounds:
-                bounds[name] = (0.0, rest) if searched else (rest, rest)
-                rest = rest if searched else 0.0
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add the surface of the liquid. Raises InputError: the object is no vessel."""
         vessel = interior(scene.object)
         if vessel is None:
             raise InputError(
@@ -311,13 +384,9 @@ class ContentsControl(Control):
                 "leave the control out"
             )
         angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
-        uvs = np.concatenate(
-            [
-                [(0.5, 0.5)],
-                0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1),
-            ]
-        )
-        vertices = _surface(vessel, torch.tensor(0.5)).numpy()
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
+        vertices = _liquid_surface(vessel, torch.tensor(0.5)).numpy()
         mesh = replace(
             parts.polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32)
         )
@@ -328,14 +397,14 @@ class ContentsControl(Control):
         )
 
     def fit(self) -> None:
+        """Start from the default proportions, or the nearest that are possible."""
         super().fit()
-        cuts = self.cuts(
-            {
-                one.name: float(one.default)
-                for one in self.parameters
-                if one.name in INGREDIENTS
-            }
-        )
+        defaults = {
+            parameter.name: float(parameter.default)
+            for parameter in self.parameters
+            if parameter.name in INGREDIENTS
+        }
+        cuts = self.cuts(defaults)
         for slot in self.slots:
             if slot.width and slot.parameter.name in cuts:
                 self.start[slot.begin] = cuts[slot.parameter.name]
@@ -354,110 +423,125 @@ class ContentsControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = interior(self.scene.object)
         assert vessel is not None  # see `prepare`
-        base = _surface(vessel, torch.full_like(values["level"], 0.5))
-        inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
+        base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
+        surface = _liquid_surface(vessel, values["level"])
+        inputs = {f"{self.name}.offsets": surface - base}
         if "object.to_world" in so_far:
             inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
-        shares = torch.stack([values[name] for name in INGREDIENTS])
-        liquid_color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
-        inputs[f"{self.name}.base_color"] = liquid_color.expand(4, 4, 3)
+        proportions = torch.stack([values[name] for name in INGREDIENTS])
+        vessel_color = torch.from_numpy(vessel.color).to(proportions)
+        inputs[f"{self.name}.base_color"] = liquid(proportions, vessel_color).expand(
+            4, 4, 3
+        )
         return inputs
 
     # ---- proportions
-    # ------------------------------------------------------------------------------------------------
 
     def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is
-        possible there.
-        """
+        """Return where the stick may be cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
             return super().spec(parameter)
-        wide = [
+        free = [
             name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]
         ]
-        return Range(0.0, 1.0) if parameter.name in wide[:-1] else Fixed(0.0)
+        return Range(0.0, 1.0) if parameter.name in free[:-1] else Fixed(0.0)
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to
-        one; differentiable.
+        """Cut the stick: return proportions that add up to one; differentiable.
+
+        Args:
+            cuts: coordinates in [0, 1] by ingredient.
         """
         left = torch.ones_like(cuts[INGREDIENTS[0]])
-        shares = dict[str, Tensor]()
+        proportions = dict[str, Tensor]()
         for name in INGREDIENTS:
-            low, high = self._ends(name, left)
-            shares[name] = low + (high - low).clamp_min(0.0) * cuts[name]
-            left = left - shares[name]
-        return shares
+            lower, upper = self._possible_range(name, left)
+            proportions[name] = lower + (upper - lower).clamp_min(0.0) * cuts[name]
+            left = left - proportions[name]
+        return proportions
 
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
-        """Return the coordinates whose shares are nearest to some, one ingredient after
-        the other.
-        """
+        """Return the cuts whose proportions are nearest to some, by ingredient."""
         left = torch.ones(())
         cuts = dict[str, float]()
         for name in INGREDIENTS:
-            low, high = map(float, self._ends(name, left))
-            share = min(max(shares[name], low), max(low, high))
-            cuts[name] = (share - low) / (high - low) if high > low else 0.0
-            left = left - share
+            lower, upper = map(float, self._possible_range(name, left))
+            proportion = min(max(shares[name], lower), max(lower, upper))
+            cuts[name] = 0.0
+            if upper > lower:
+                cuts[name] = (proportion - lower) / (upper - lower)
+            left = left - proportion
         return cuts
 
-    def _ends(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
-        """The least and the most () that an ingredient may have of what is left, so
-        that those after it make up one.
+    def _possible_range(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest proportion () that an ingredient may have.
+
+        Those after it have to make up one.
+
+        Args:
+            name: of the ingredient.
+            left: what those before it have left ().
         """
-        place = INGREDIENTS.index(name)
-        limits = left.new_tensor([self.bounds[one] for one in INGREDIENTS])
-        (low, high) = limits[place]
-        (least, most) = limits[place + 1 :].sum(dim=0)
-        return torch.maximum(low, left - most), torch.minimum(high, left - least)
+        index = INGREDIENTS.index(name)
+        limits = left.new_tensor(
+            [self.bounds[ingredient] for ingredient in INGREDIENTS]
+        )
+        lower, upper = limits[index]
+        rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
+        return torch.maximum(lower, left - rest_upper), torch.minimum(
+            upper, left - rest_lower
+        )
 
 
 # ---- how it looks
-# ---------------------------------------------------------------------------------------------------
 
 
 def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
-    """Return the linear reflectance (3,) of a cup of water, milk and coffee: of their
-    proportions (3,) in the order of `INGREDIENTS`, and the linear reflectance (3,) of
-    the vessel's inside.
+    """Return the linear reflectance (3,) of a cup of water, milk and coffee.
+
+    After Kubelka and Munk (1931).
+
+    Args:
+        shares: proportions (3,) in the order of `INGREDIENTS`.
+        vessel: linear reflectance (3,) of the vessel's inside.
     """
     amounts = dict(zip(INGREDIENTS, shares, strict=True))
     absorbed = shares.new_zeros(3)
     scattered = shares.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():
         deep = shares.new_tensor(reflectance)
-        absorbed = absorbed + amounts[name] * SCATTERING[name] * (
-            1.0 - deep
-        ).square() / (2.0 * deep)
-        scattered = scattered + amounts[name] * SCATTERING[name]
+        scattering = amounts[name] * SCATTERING[name]
+        absorbed = absorbed + scattering * (1.0 - deep).square() / (2.0 * deep)
+        scattered = scattered + scattering
     ratio = absorbed / scattered
     milky = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
     opacity = 1.0 - torch.exp(-DENSITY * (amounts["milk"] + amounts["coffee"]))
     return opacity * milky + (1.0 - opacity) * vessel * shares.new_tensor(WATER)
 
 
-def _surface(vessel: Vessel, level: Tensor) -> Tensor:
-    """Vertices (1 + COLUMNS, 3) of the liquid's surface in mesh coordinates, the middle
-    first. The wall's distance is interpolated between the heights at which it is known,
-    so the vertices are differentiable in the level, with kinks at those heights.
+def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
+    """Return the vertices (1 + COLUMNS, 3) of the liquid's surface, the middle first.
+
+    In mesh coordinates. The wall's distance is interpolated between the heights at
+    which it is known, so the vertices are differentiable in the level, with kinks at
+    those heights.
     """
     heights = torch.from_numpy(vessel.heights).to(level)
     radii = torch.from_numpy(vessel.radii).to(level)
-    place = level * (len(heights) - 1)
-    row = int(place.detach().clamp(0, len(heights) - 2))
-    radius = torch.lerp(radii[row], radii[row + 1], place - row) * RADIUS
-    there = (level / FIRST).clamp(1e-3, 1.0)
+    position = level * (len(heights) - 1)
+    row = int(position.detach().clamp(0, len(heights) - 2))
+    radius = torch.lerp(radii[row], radii[row + 1], position - row) * RADIUS
+    # 1 above the level at which the disk is drawn together
+    opening = (level / FIRST).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
-    height = heights[0] + level * depth - (1.0 - there) * FIRST * depth
+    height = heights[0] + level * depth - (1.0 - opening) * FIRST * depth
     angle = torch.arange(COLUMNS, device=level.device) * (2.0 * torch.pi / COLUMNS)
-    around = (
-        torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
-        * (radius * there)[:, None]
+    circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
+    rim = circle * (radius * opening)[:, None]
+    flat = torch.cat([rim.new_zeros(1, 2), rim]) + torch.from_numpy(vessel.axis).to(
+        level
     )
-    flat = torch.cat([around.new_zeros(1, 2), around]) + torch.from_numpy(
-        vessel.axis
-    ).to(level)
     return torch.cat([flat, height.expand(len(flat), 1)], dim=1)

@@ -4,7 +4,8 @@ it is, and its colour.
 Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the
 map is resampled by torch:
 
-    map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
+    map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1]
+    rotation / 360 * columns = k + f
 
 `harmonics` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan
 2001, section 3), 9 coefficients for each colour channel as multiples of the map's mean
@@ -48,36 +49,58 @@ class EnvironmentControl(Control):
 
     kind = "environment"
     parameters = (
-        Parameter.named("which", (OWN_MAP, *MAPS), OWN_MAP,
-                        "Another environment instead of the scene's own, metered "
-                        "afresh: bundled, or a .hdr or .exr "
-                        "file."),
+        Parameter.named(
+            "which",
+            (OWN_MAP, *MAPS),
+            OWN_MAP,
+            "Another environment instead of the scene's own, metered "
+            "afresh: bundled, or a .hdr or .exr "
+            "file.",
+        ),
         *settings.ENVIRONMENT,
-        *(_lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
-        Parameter("harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
-                  "Low-order light that is added: spherical-harmonic coefficients, 9 "
-                  "for each channel, inside the "
-                  "ball.", estimators=Parameter.LIT),
-    )  # fmt: skip
-    choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of "
-                                      "all coefficients.", "epsilon",
-                      "harmonics", most=100.0),)  # fmt: skip
+        *(
+            _lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.")
+            for color in CHANNELS
+        ),
+        Parameter(
+            "harmonics",
+            (COEFFICIENTS,),
+            "mean radiances",
+            -1.0,
+            1.0,
+            0.0,
+            "Low-order light that is added: spherical-harmonic coefficients, 9 "
+            "for each channel, inside the "
+            "ball.",
+            estimators=Parameter.LIT,
+        ),
+    )
+    choices = (
+        Choice(
+            "epsilon",
+            0.5,
+            "Radius of the ball of `harmonics`: L2 norm of all coefficients.",
+            "epsilon",
+            "harmonics",
+            most=100.0,
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """The parameters, with the files that `which` names among its options."""
+        """Return the parameters, with the files that `which` names among its options."""
         which, *others = cls.parameters
-        given = settings.get("which") if isinstance(settings, Mapping) else None
-        given = given.get("choices") if isinstance(given, Mapping) else given
-        named = (
-            [given]
-            if isinstance(given, str) or not isinstance(given, Sequence)
-            else given
+        setting = settings.get("which") if isinstance(settings, Mapping) else None
+        setting = setting.get("choices") if isinstance(setting, Mapping) else setting
+        names = (
+            [setting]
+            if isinstance(setting, str) or not isinstance(setting, Sequence)
+            else setting
         )
         files = [
-            one
-            for one in named
-            if isinstance(one, str) and one not in which.options and is_path(one)
+            name
+            for name in names
+            if isinstance(name, str) and name not in which.options and is_path(name)
         ]
         return (
             replace(which, options=tuple(dict.fromkeys((*which.options, *files)))),
@@ -85,26 +108,32 @@ class EnvironmentControl(Control):
         )
 
     def check_choices(self) -> None:
-        given = self.chosen["epsilon"]
+        epsilon = self.chosen["epsilon"]
         if "epsilon" in self._given and "harmonics" not in self._given:
             raise InputError(
                 f"{self.name}.epsilon: the radius of the ball of harmonics, which are "
                 "not there; leave it out, or give "
                 f"harmonics a range too, as in {self.name}={{harmonics: [-1, 1], "
-                f"epsilon: {given}}}"
+                f"epsilon: {epsilon}}}"
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """An environment that is fixed is the scene's; so is the first of several where
-        these are files, and the scene's own is none of them.
+        """Take a fixed environment for the scene's own.
+
+        So is the first of several where these are files, and the scene's own is none of
+        them.
         """
         spec = self.specs.get("which")
         allowed = self.allowed("which", OWN_MAP)
-        maps = {str(name): _loaded(str(name)) for name in allowed if _is_file(name)}
+        maps = {
+            str(name): _load_environment(str(name))
+            for name in allowed
+            if _is_file(name)
+        }
         notes = [note for asset in maps.values() for note in asset.warnings]
         if (
             OWN_MAP in allowed
-            or self._own_name(scene) is not None
+            or self._find_scene_environment_name(scene) is not None
             or not (isinstance(spec, Fixed) or maps)
         ):
             lit = scene.environment_for(f"`controls` {self.name}")
@@ -122,21 +151,24 @@ class EnvironmentControl(Control):
                 )
         else:
             name = str(allowed[0])
-            scene = replace(scene, environment=_loaded(name), environment_spec=name)
+            scene = replace(
+                scene, environment=_load_environment(name), environment_spec=name
+            )
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        """Of `which`, the scene's own environment, by its name where only that is
-        allowed.
+        """Return a parameter; the default of `which` is the scene's own environment.
+
+        It has its name where only that is allowed.
         """
         if parameter.name != "which":
             return super().in_scene(parameter)
-        own = (
+        own_environment = (
             None
             if OWN_MAP in self.allowed("which", OWN_MAP)
-            else self._own_name(self.scene)
+            else self._find_scene_environment_name(self.scene)
         )
-        return replace(parameter, default=own or OWN_MAP)
+        return replace(parameter, default=own_environment or OWN_MAP)
 
     def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
@@ -144,14 +176,21 @@ class EnvironmentControl(Control):
     def unchanged(self, parameter: Parameter) -> Number:
         if parameter.name != "which" or OWN_MAP in self.allowed("which", OWN_MAP):
             return parameter.default
-        return self._own_name(self.scene) or self.scene.environment_spec
+        return (
+            self._find_scene_environment_name(self.scene) or self.scene.environment_spec
+        )
 
-    def _own_name(self, scene: SceneDescription) -> str | None:
-        """What the scene's own environment is called among those that can be chosen;
+    def _find_scene_environment_name(self, scene: SceneDescription) -> str | None:
+        """Return the name of the scene's own environment among the options.
+
         None if it is none of them.
         """
         return next(
-            (str(one) for one in self.allowed("which", OWN_MAP) if _is_own(one, scene)),
+            (
+                str(name)
+                for name in self.allowed("which", OWN_MAP)
+                if _is_scene_environment(name, scene)
+            ),
             None,
         )
 
@@ -165,16 +204,19 @@ class EnvironmentControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the map (H, W, 3) of linear radiance."""
         name = self.own[0].options[int(values["which"])]
         device = values["rotation"].device
-        own = name == OWN_MAP or _is_own(name, self.scene)
-        base = _map(None if own else _loaded(name), self.scene).to(device)
-        turned = turn(
+        is_scene_map = name == OWN_MAP or _is_scene_environment(name, self.scene)
+        base = _load_map(
+            None if is_scene_map else _load_environment(name), self.scene
+        ).to(device)
+        rotated = turn(
             base, values["rotation"] - self.scene.number("environment.rotation")
         )
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - self.scene.number("environment.exposure")
-        lit = turned * tint * torch.exp2(stops)
+        lit = rotated * tint * torch.exp2(stops)
         if "harmonics" in self.specs:
             lit = (lit + harmonics(values["harmonics"], base)).clamp_min(0.0)
         return {"environment.data": lit}
@@ -186,23 +228,24 @@ def _is_file(name: Number) -> bool:
     )
 
 
-def _is_own(name: Number, scene: SceneDescription) -> bool:
-    """Whether an environment is the scene's own."""
-    own = scene.environment
-    if own is None or not _is_file(name):
+def _is_scene_environment(name: Number, scene: SceneDescription) -> bool:
+    """Return whether an environment is the scene's own."""
+    environment = scene.environment
+    if environment is None or not _is_file(name):
         return (
-            own is not None
-            and own.source == library.BUNDLED_ENVIRONMENT
-            and own.name == name
+            environment is not None
+            and environment.source == library.BUNDLED_ENVIRONMENT
+            and environment.name == name
         )
-    return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(
-        own.source
+    return bool(environment.source) and os.path.realpath(str(name)) == os.path.realpath(
+        environment.source
     )
 
 
-def _loaded(name: str) -> EnvironmentAsset:
-    """An environment by its name, or from a file, which is read again when it has
-    changed.
+def _load_environment(name: str) -> EnvironmentAsset:
+    """Return an environment by its name or from a file.
+
+    A file is read again when it has changed.
     """
     if not _is_file(name):
         return library.load_environment(name)
@@ -210,30 +253,37 @@ def _loaded(name: str) -> EnvironmentAsset:
         about = os.stat(name)
     except OSError:
         return import_environment(name)  # which says what is wrong
-    return _read(os.path.realpath(name), name, about.st_mtime_ns, about.st_size)
+    return _read_environment(
+        os.path.realpath(name), name, about.st_mtime_ns, about.st_size
+    )
 
 
 @lru_cache(maxsize=64)
-def _read(place: str, name: str, *version: int) -> EnvironmentAsset:
+def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAsset:
     return import_environment(name)
 
 
 @lru_cache(maxsize=64)
-def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """The scene's own map, or another in its own size, as bright as keeps the picture's
-    exposure; the ground stays of the same kind.
+def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
+    """Return the scene's own map, or another one, (H, W, 3) linear radiance.
+
+    Another one is as bright as keeps the exposure of the image; the ground stays of the
+    same kind.
     """
-    own = scene.environment_for("the environment")
+    scene_environment = scene.environment_for("the environment")
     if asset is None:
-        return torch.from_numpy(own.radiance.copy())
-    there = replace(scene, environment=replace(asset, photographed=own.photographed))
-    share = metered_gain(there) / metered_gain(scene) if scene.metered else 1.0
-    return torch.from_numpy(asset.radiance.copy()) * share
+        return torch.from_numpy(scene_environment.radiance.copy())
+    other_scene = replace(
+        scene, environment=replace(asset, photographed=scene_environment.photographed)
+    )
+    factor = metered_gain(other_scene) / metered_gain(scene) if scene.metered else 1.0
+    return torch.from_numpy(asset.radiance.copy()) * factor
 
 
 def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Turn a map (H, W, 3) about the vertical as `environment.rotation` does, by linear
-    resampling of its columns.
+    """Rotate a map (H, W, 3) about the vertical by linear resampling of its columns.
+
+    As `environment.rotation` does.
 
     Periodic and differentiable in both arguments; exact at whole columns.
     """
@@ -241,16 +291,19 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
     if not shift.requires_grad and float(shift) == 0.0:
         return radiance
-    whole = int(shift.detach().floor())
-    share = shift - whole
-    near = radiance.roll(-whole, dims=1)
-    far = radiance.roll(-whole - 1, dims=1)
-    return near + share * (far - near)
+    whole_columns = int(shift.detach().floor())
+    fraction = shift - whole_columns
+    lower = radiance.roll(-whole_columns, dims=1)
+    upper = radiance.roll(-whole_columns - 1, dims=1)
+    return lower + fraction * (upper - lower)
 
 
 def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
-    """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the
-    map `like` (H, W, 3).
+    """Return light (H, W, 3) from 9 spherical-harmonic coefficients a channel.
+
+    Args:
+        coefficients: (27,), multiples of the map's mean.
+        like: the map (H, W, 3).
     """
     height, width = like.shape[:2]
     basis = real_harmonics(height, width).to(coefficients.device)

@@ -1,8 +1,12 @@
 """The `geometry` control: a smooth change of the object's shape, at most so far.
 
-    modes          d = sum_k a_k m_k,  a = 2 u - 1             m_k: the smoothest displacement fields of the mesh
-    large-steps    d = g R (I + lambda L)^-2 (2 u - 1)         a push for each vertex, spread out over its surroundings
-    offsets        epsilon s(d) d                              s: one factor that keeps the mesh whole
+    modes          d = sum_k a_k m_k,  a = 2 u - 1
+    large-steps    d = g R (I + lambda L)^-2 (2 u - 1)
+    offsets        epsilon s(d) d
+
+The m_k are the smoothest displacement fields of the mesh. In the form large-steps each
+vertex has a push, which is spread out over its surroundings. s is one factor that keeps
+the mesh whole.
 
 No vertex moves by more than epsilon, no face turns over and no wall meets the other,
 for any u. A mode varies slowly over SPACE, so that close walls move together: diffusion
@@ -38,7 +42,7 @@ from advsearch.controls.base import (
     measure,
 )
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Doubles, Mesh, face_vectors
+from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors
 from advsearch.scene.raster import welded
 
 CELL = 0.035
@@ -70,39 +74,45 @@ class Body:
     """A mesh whose seams are welded: what a displacement acts on."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self.index, count = welded(mesh)  # (V,) the place of each vertex
+        """Weld the seams of a mesh, and find its walls."""
+        self.index, count = welded(mesh)  # (V,) the position of each vertex
         self.places = np.zeros((count, 3))  # distinct vertex positions
         self.places[self.index] = mesh.vertices
         self.extent = float(np.ptp(self.places, axis=0).max())
         faces = self.index[mesh.faces]
-        turned = face_vectors(self.places[faces])
-        # over places, without those that have no area
-        self.faces = faces[np.linalg.norm(turned, axis=1) > 0.0]
+        area_vectors = face_vectors(self.places[faces])
+        # over positions, without those that have no area
+        self.faces = faces[np.linalg.norm(area_vectors, axis=1) > 0.0]
         summed = np.zeros((count, 3))
-        np.add.at(summed, faces.reshape(-1), np.repeat(turned, 3, axis=0))
-        # by area
+        np.add.at(summed, faces.reshape(-1), np.repeat(area_vectors, 3, axis=0))
+        # weighted by area
         self.normals = summed / np.maximum(
             np.linalg.norm(summed, axis=1, keepdims=True), 1e-20
         )
-        # (W, 2) places on opposite sides of a wall or of a gap: for each the nearest
-        # with an opposite normal, where there is one, by |x - y|^2 + b^2 |n + m|^2, a
-        # search in six dimensions
-        turn = 0.1 * self.extent * self.normals
-        partner = cKDTree(np.hstack([self.places, turn])).query(
-            np.hstack([self.places, -turn])
-        )[1]
+        # (W, 2) positions on opposite sides of a wall or of a gap
+        self.walls = self._find_walls()
+
+    def _find_walls(self) -> Ints:
+        """Return pairs (W, 2) of positions on opposite sides of a wall or of a gap.
+
+        The partner of a position is the nearest one with an opposite normal, by
+        |x - y|^2 + b^2 |n + m|^2: a search in six dimensions.
+        """
+        scaled_normals = 0.1 * self.extent * self.normals
+        tree = cKDTree(np.hstack([self.places, scaled_normals]))
+        partner = tree.query(np.hstack([self.places, -scaled_normals]))[1]
         distance = np.linalg.norm(self.places - self.places[partner], axis=1)
-        opposite = (self.normals * self.normals[partner]).sum(axis=1) < OPPOSITE
-        place = np.flatnonzero(
-            opposite
+        cosine = (self.normals * self.normals[partner]).sum(axis=1)
+        is_wall = (
+            (cosine < OPPOSITE)
             & (distance > 1e-5 * self.extent)
             & (distance < WALL_REACH * self.extent)
         )
-        self.walls = np.stack([place, partner[place]], axis=1)
+        position = np.flatnonzero(is_wall)
+        return np.stack([position, partner[position]], axis=1)
 
 
 # ---- modes over space
-# ------------------------------------------------------------------------------------------------
 
 
 body = lru_cache(maxsize=8)(Body)  # of a mesh; kept in memory
@@ -110,40 +120,29 @@ body = lru_cache(maxsize=8)(Body)  # of a mesh; kept in memory
 
 @lru_cache(maxsize=8)
 def shape_modes(mesh: Mesh, count: int) -> Doubles:
-    """Return the `count` smoothest displacement fields of a mesh that are no rigid
-    motion; kept in memory.
+    """Return the smoothest displacement fields of a mesh that are no rigid motion.
 
-    They are (P, 3, count), for each place of `body(mesh)`, smoothest first; the largest
-    length is 1 in each.
+    Kept in memory.
+
+    Args:
+        mesh: in object sizes.
+        count: number of fields.
+
+    Returns:
+        (P, 3, count), for each position of `body(mesh)`, smoothest first; the largest
+        length is 1 in each.
     """
     welded_mesh = body(mesh)
     points, cell = _landmarks(welded_mesh)
-    scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
+    n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
     width = BANDWIDTH * cell
-    kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
-    density = kernel.sum(axis=1)
-    kernel /= density[:, None] * density[None, :]
-    mass = kernel.sum(axis=1)
-    symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
-    # by Lanczos, without entries too small to matter: dense solvers wait for all
-    # threads, which takes ten times as long on a machine with other work
-    large = sparse.csr_matrix(
-        np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
-    )
-    begin = np.cos(np.arange(len(points)))
-    reach = min(len(points), 4 * (scalars + 1))
-    values, vectors = sparse_linalg.eigsh(
-        large, scalars + 1, which="LA", v0=begin, ncv=reach
-    )
-    falling = np.argsort(-values)[1:]  # the first is constant
-    values = values[falling]
-    vectors = _signed(vectors[:, falling])
-    functions = vectors / np.sqrt(mass)[:, None]
-    combination = _without_rotation(
-        points, functions, mass, (1.0 - values) / width**2, count
-    )
-    near = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
-    weights = np.exp(near - near.max(axis=1, keepdims=True)) / density
+    density, functions, mass, values = _diffusion_map(points, width, n_scalars)
+    energy = (1.0 - values) / width**2
+    combination = _without_rotation(points, functions, mass, energy, count)
+
+    # Nystrom extension from the landmarks to all positions
+    exponent = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
+    weights = np.exp(exponent - exponent.max(axis=1, keepdims=True)) / density
     extended = (weights / weights.sum(axis=1, keepdims=True)) @ (
         functions / np.maximum(values, 0.05)
     )
@@ -151,49 +150,91 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 
 
+def _diffusion_map(
+    points: Doubles, width: float, n_scalars: int
+) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    """Compute the diffusion map of points (Coifman and Lafon 2006, alpha = 1).
+
+    Args:
+        points: (N, 3).
+        width: standard deviation of the kernel.
+        n_scalars: number of functions, without the constant one.
+
+    Returns:
+        The kernel density (N,) at the points, the slowest functions (N, n_scalars),
+        orthonormal under the mass (N,) of the points, and their eigenvalues
+        (n_scalars,), falling.
+    """
+    kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
+    density = kernel.sum(axis=1)
+    kernel /= density[:, None] * density[None, :]
+    mass = kernel.sum(axis=1)
+    symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
+    # by Lanczos, without entries too small to matter: dense solvers wait for all
+    # threads, which takes ten times as long on a machine with other work
+    matrix = sparse.csr_matrix(
+        np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
+    )
+    first_vector = np.cos(np.arange(len(points)))
+    n_lanczos = min(len(points), 4 * (n_scalars + 1))
+    values, vectors = sparse_linalg.eigsh(
+        matrix, n_scalars + 1, which="LA", v0=first_vector, ncv=n_lanczos
+    )
+    falling = np.argsort(-values)[1:]  # the first is constant
+    functions = _signed(vectors[:, falling]) / np.sqrt(mass)[:, None]
+    return density, functions, mass, values[falling]
+
+
 def _signed(vectors: Doubles) -> Doubles:
+    """Return columns with the sign that makes their largest entry positive."""
     largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
 
 
 def _landmarks(solid: Body) -> tuple[Doubles, float]:
-    """Points (N, 3) evenly spread over the surface, at most `LANDMARKS`, and the side
-    of the cubes that hold one.
+    """Return points (N, 3) spread evenly over the surface, and the side of their cells.
+
+    At most `LANDMARKS`: each is the mean of the samples in one cube.
     """
     corners = solid.places[solid.faces]
     areas = np.linalg.norm(face_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
-    face = np.searchsorted(
-        np.cumsum(areas) / areas.sum(), (np.arange(SAMPLES) + 0.5) / SAMPLES
-    ).clip(max=len(areas) - 1)
-    shares = generator.dirichlet((1.0, 1.0, 1.0), SAMPLES)
-    pool = np.concatenate(
-        [np.einsum("nk,nkc->nc", shares, corners[face]), solid.places]
-    )
+    quantiles = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
+    face = face.clip(max=len(areas) - 1)
+    barycentric = generator.dirichlet((1.0, 1.0, 1.0), SAMPLES)
+    samples = np.einsum("nk,nkc->nc", barycentric, corners[face])
+    pool = np.concatenate([samples, solid.places])
     cell = CELL * solid.extent
     while True:
         cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
-        owner = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
-        count = int(owner.max()) + 1
-        if count <= LANDMARKS:
+        cube_of = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
+        if int(cube_of.max()) + 1 <= LANDMARKS:
             break
         cell *= 1.15
-    members = np.bincount(owner)
-    return np.stack(
-        [np.bincount(owner, pool[:, axis]) / members for axis in range(3)], axis=1
-    ), cell
+    n_members = np.bincount(cube_of)
+    means = [np.bincount(cube_of, pool[:, axis]) / n_members for axis in range(3)]
+    return np.stack(means, axis=1), cell
 
 
 def _without_rotation(
     points: Doubles, functions: Doubles, mass: Doubles, energy: Doubles, count: int
 ) -> Doubles:
-    """Combine scalar modes (N, S), orthonormal under `mass` (N,), to vector fields that
-    hold no rotation, smoothest first: (S, 3, count), the weight of each mode along each
-    axis. `energy` (S,) is how fast each varies.
+    """Combine scalar modes to vector fields that hold no rotation, smoothest first.
+
+    Args:
+        points: (N, 3).
+        functions: (N, S), orthonormal under `mass`.
+        mass: (N,).
+        energy: (S,), how fast each function varies.
+        count: number of fields.
+
+    Returns:
+        (S, 3, count), the weight of each function along each axis.
     """
-    scalars = functions.shape[1]
-    middle = (points * mass[:, None]).sum(axis=0) / mass.sum()
-    turns = [np.cross(axis, points - middle) for axis in np.eye(3)]
+    n_scalars = functions.shape[1]
+    center = (points * mass[:, None]).sum(axis=0) / mass.sum()
+    turns = [np.cross(axis, points - center) for axis in np.eye(3)]
     rotations = np.stack(
         [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
     )
@@ -201,55 +242,31 @@ def _without_rotation(
     reduced = free.T @ (np.repeat(energy, 3)[:, None] * free)
     vectors = linalg.eigh(reduced)[1][:, : min(count, free.shape[1])]
     combined = _signed(free @ vectors)
-    return np.asarray(combined.reshape(scalars, 3, -1))
+    return np.asarray(combined.reshape(n_scalars, 3, -1))
 
 
 # ---- one push per vertex
-# ---------------------------------------------------------------------------------------------
 
 
 class Preconditioner:
-    """Spreads pushes over the neighbourhood of a welded mesh and takes rigid motions
-    out: `d = R (I + lambda L)^-2 p`.
+    """Spreads pushes over the neighborhood of a welded mesh: `R (I + lambda L)^-2 p`.
+
+    Rigid motions are taken out.
     """
 
     def __init__(self, solid: Body) -> None:
+        """Factorise the system, and compute the rigid motions."""
         count = len(solid.places)
-        edges = np.concatenate(
-            [solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]]
-        )
-        edges = np.unique(np.sort(edges, axis=1), axis=0)
-        lengths = np.linalg.norm(
-            solid.places[edges[:, 0]] - solid.places[edges[:, 1]], axis=1
-        )
-        mean = float(lengths.mean())
-        links = np.concatenate([edges, solid.walls])
-        weights = np.concatenate(
-            [
-                (mean / lengths.clip(0.1 * mean)) ** 2,
-                np.full(len(solid.walls), WALL_WEIGHT),
-            ]
-        )
-        adjacency = sparse.coo_matrix(
-            (weights, (links[:, 0], links[:, 1])), shape=(count, count)
-        ).tocsr()
-        adjacency = adjacency + adjacency.T
-        laplacian = (
-            sparse.diags(np.asarray(adjacency.sum(axis=1)).reshape(-1)) - adjacency
-        )
-        strength = (SMOOTHING_LENGTH * solid.extent / mean) ** 2
+        laplacian, mean_length = _wall_laplacian(solid)
+        strength = (SMOOTHING_LENGTH * solid.extent / mean_length) ** 2
         self._factor = sparse_linalg.splu(
             (sparse.identity(count) + strength * laplacian).tocsc()
         )
-        centred = solid.places - solid.places.mean(axis=0)
+        centered = solid.places - solid.places.mean(axis=0)
         shifts = [np.broadcast_to(axis, solid.places.shape) for axis in np.eye(3)]
-        turns = [np.cross(axis, centred) for axis in np.eye(3)]
-        rigid_motions = np.asarray(
-            linalg.orth(
-                np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
-            )
-        )
-        self._rigid = torch.from_numpy(rigid_motions)
+        turns = [np.cross(axis, centered) for axis in np.eye(3)]
+        motions = np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
+        self._rigid = torch.from_numpy(np.asarray(linalg.orth(motions)))
 
     def __call__(self, pushes: Tensor) -> Tensor:
         """Return displacements (P, 3) for pushes (P, 3), float64; differentiable."""
@@ -260,17 +277,43 @@ class Preconditioner:
         return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
 
 
+def _wall_laplacian(solid: Body) -> tuple[Any, float]:
+    """Return the Laplacian (P, P) of a mesh with links through its walls, sparse.
+
+    Edges are weighted by the inverse square of their length. The second value is the
+    mean length of an edge.
+    """
+    count = len(solid.places)
+    edges = np.concatenate(
+        [solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]]
+    )
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    edge_vectors = solid.places[edges[:, 0]] - solid.places[edges[:, 1]]
+    lengths = np.linalg.norm(edge_vectors, axis=1)
+    mean_length = float(lengths.mean())
+    edge_weights = (mean_length / lengths.clip(0.1 * mean_length)) ** 2
+    wall_weights = np.full(len(solid.walls), WALL_WEIGHT)
+    links = np.concatenate([edges, solid.walls])
+    weights = np.concatenate([edge_weights, wall_weights])
+    adjacency = sparse.coo_matrix(
+        (weights, (links[:, 0], links[:, 1])), shape=(count, count)
+    ).tocsr()
+    adjacency = adjacency + adjacency.T
+    degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
+    return sparse.diags(degree) - adjacency, mean_length
+
+
 class _Solve(torch.autograd.Function):
-    """Solution of a symmetric sparse system; its derivative is the same solution, any
-    number of times.
+    """Solution of a symmetric sparse system.
+
+    Its derivative is the same solution, any number of times.
     """
 
     @staticmethod
     def forward(ctx: Any, right: Tensor, factor: Any) -> Tensor:
         ctx.factor = factor
-        return torch.from_numpy(factor.solve(right.detach().cpu().numpy())).to(
-            right.device
-        )
+        solution = factor.solve(right.detach().cpu().numpy())
+        return torch.from_numpy(solution).to(right.device)
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
@@ -278,7 +321,6 @@ class _Solve(torch.autograd.Function):
 
 
 # ---- how far
-# ---------------------------------------------------------------------------------------------------------
 
 
 class Limits:
@@ -295,73 +337,81 @@ class Limits:
     """
 
     def __init__(self, solid: Body, epsilon: float) -> None:
+        """Compute what each bound needs of the mesh."""
         self.epsilon = epsilon
         corners = solid.places[solid.faces]
         first = corners[:, 1] - corners[:, 0]
         second = corners[:, 2] - corners[:, 0]
-        longest = np.linalg.norm(
-            np.stack([first, second, first - second]), axis=-1
-        ).max(axis=0)
+        edges = np.stack([first, second, first - second])
+        longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(first, second), axis=1)
-        sound = double_area > THIN_FACE * longest**2
-        first = first[sound]
-        second = second[sound]
-        double_area = double_area[sound]
+        is_sound = double_area > THIN_FACE * longest**2
+        first = first[is_sound]
+        second = second[is_sound]
+        double_area = double_area[is_sound]
         length = np.linalg.norm(first, axis=1)
-        along = (first * second).sum(axis=1) / length
+        along_first = (first * second).sum(axis=1) / length
         # gradient along the face's two axes: [d1 d2] [[length, along], [0, height]]^-1
-        self._faces = torch.from_numpy(solid.faces[sound])
-        self._across = torch.from_numpy(
-            np.stack([1.0 / length, along / length, length / double_area], axis=1)
+        self._faces = torch.from_numpy(solid.faces[is_sound])
+        self._inverse_axes = torch.from_numpy(
+            np.stack([1.0 / length, along_first / length, length / double_area], axis=1)
         )
         self._walls = torch.from_numpy(solid.walls)
-        gaps = np.linalg.norm(
-            solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]], axis=1
-        )
-        self._gaps = torch.from_numpy(gaps)
-        self._places = torch.from_numpy(solid.places)
+        wall_vectors = solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]]
+        self._wall_widths = torch.from_numpy(np.linalg.norm(wall_vectors, axis=1))
+        self._positions = torch.from_numpy(solid.places)
 
     def used(self, field: Tensor) -> Tensor:
-        """Return the squares (N,) of how far each bound is used up by `epsilon d` for d
-        (P, 3).
+        """Return how far `epsilon d` uses each bound up, squared.
+
+        Args:
+            field: d, (P, 3).
+
+        Returns:
+            (N,): of the length at each position, of each face, of each wall.
         """
-        faces_of, across, walls_of, gaps = (
-            held.to(field.device)
-            for held in (self._faces, self._across, self._walls, self._gaps)
-        )
+        device = field.device
+        face_corners = self._faces.to(device)
+        inverse_axes = self._inverse_axes.to(device)
+        walls = self._walls.to(device)
+        wall_widths = self._wall_widths.to(device)
         # index_select, for its derivative is ten times faster than that of an index
-        corners = [field.index_select(0, corner) for corner in faces_of.T]
+        corners = [field.index_select(0, corner) for corner in face_corners.T]
         first = corners[1] - corners[0]
         second = corners[2] - corners[0]
-        along = first * across[:, :1]
-        beside = (second - first * across[:, 1:2]) * across[:, 2:]
-        faces = (along.square() + beside.square()).sum(dim=1) * (
+        gradient_1 = first * inverse_axes[:, :1]
+        gradient_2 = (second - first * inverse_axes[:, 1:2]) * inverse_axes[:, 2:]
+        of_faces = (gradient_1.square() + gradient_2.square()).sum(dim=1) * (
             self.epsilon / FACE_STRAIN
         ) ** 2
-        apart = field.index_select(0, walls_of[:, 0]) - field.index_select(
-            0, walls_of[:, 1]
+        difference = field.index_select(0, walls[:, 0]) - field.index_select(
+            0, walls[:, 1]
         )
-        walls = apart.square().sum(dim=1) * (self.epsilon / WALL_STRAIN / gaps).square()
-        return torch.cat([field.square().sum(dim=1), faces, walls])
+        of_walls = (
+            difference.square().sum(dim=1)
+            * (self.epsilon / WALL_STRAIN / wall_widths).square()
+        )
+        return torch.cat([field.square().sum(dim=1), of_faces, of_walls])
 
     def held(self, field: Tensor) -> Tensor:
         """Return the offsets (P, 3) for a field d (P, 3), float64; differentiable."""
         squares = self.used(field)
-        # keeps the power within the numbers' range
+        # keeps the power within the range of floats
         largest = squares.detach().max().clamp_min(1.0)
-        total = (squares / largest).pow(SHARPNESS // 2).sum() + largest ** (
-            -SHARPNESS // 2
-        )
+        powers = (squares / largest).pow(SHARPNESS // 2).sum()
+        total = powers + largest ** (-SHARPNESS // 2)
         return self.epsilon * field * (total ** (-1.0 / SHARPNESS) / largest.sqrt())
 
     def thinnest(self, offsets: Tensor) -> float:
-        """Return the smallest width of a wall or gap after a displacement (P, 3), as a
-        share of what it was.
+        """Return the smallest width of a wall or gap after a displacement (P, 3).
+
+        It is a fraction of the width before.
         """
         if not len(self._walls):
             return 1.0
-        moved = (self._places + offsets.cpu())[self._walls]
-        return float(((moved[:, 0] - moved[:, 1]).norm(dim=1) / self._gaps).min())
+        wall_ends = (self._positions + offsets.cpu())[self._walls]
+        widths = (wall_ends[:, 0] - wall_ends[:, 1]).norm(dim=1)
+        return float((widths / self._wall_widths).min())
 
 
 FORMS = ("modes", "large-steps")
@@ -383,30 +433,60 @@ class GeometryControl(Control):
     kind = "geometry"
     of_a_mesh = True
     parameters = (
-        Parameter("amplitudes", (None,), "1", -1.0, 1.0, 0.0,
-                  "How much of each smooth mode of the shape is added (form modes).", moves_silhouettes=True,
-                  search=(-1.0, 1.0), estimators=ESTIMATORS),
-        Parameter("pushes", (None, 3), "1", -1.0, 1.0, 0.0,
-                  "Push on each vertex before it is spread out (form large-steps).", moves_silhouettes=True,
-                  search=(-1.0, 1.0), estimators=ESTIMATORS),
-    )  # fmt: skip
+        Parameter(
+            "amplitudes",
+            (None,),
+            "1",
+            -1.0,
+            1.0,
+            0.0,
+            "How much of each smooth mode of the shape is added (form modes).",
+            moves_silhouettes=True,
+            search=(-1.0, 1.0),
+            estimators=ESTIMATORS,
+        ),
+        Parameter(
+            "pushes",
+            (None, 3),
+            "1",
+            -1.0,
+            1.0,
+            0.0,
+            "Push on each vertex before it is spread out (form large-steps).",
+            moves_silhouettes=True,
+            search=(-1.0, 1.0),
+            estimators=ESTIMATORS,
+        ),
+    )
     choices = (
-        Choice("epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in "
-                                           "object sizes.", "epsilon",
-               most=LARGEST_EPSILON),
-        Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes).", whole=(1, LARGEST_MODES)),
-        Choice("form", "modes", "What is searched: modes (a few smooth fields) or "
-                                "large-steps (every vertex)."),
-    )  # fmt: skip
+        Choice(
+            "epsilon",
+            DEFAULT_EPSILON,
+            "Largest displacement of a vertex, in object sizes.",
+            "epsilon",
+            most=LARGEST_EPSILON,
+        ),
+        Choice(
+            "modes",
+            DEFAULT_MODES,
+            "Number of smooth modes (form modes).",
+            whole=(1, LARGEST_MODES),
+        ),
+        Choice(
+            "form",
+            "modes",
+            "What is searched: modes (a few smooth fields) or "
+            "large-steps (every vertex).",
+        ),
+    )
 
     def check_choices(self) -> None:
         self.form = self.chosen_form(FORMS)
 
     def fit(self) -> None:
-        self._offsets, self._mesh = (
-            f"{self.mesh}.offsets",
-            self.mesh_in(self.scene).mesh,
-        )
+        """Compute the modes, or the preconditioner, of the mesh in the scene."""
+        self._offsets_input = f"{self.mesh}.offsets"
+        self._mesh = self.mesh_in(self.scene).mesh
         solid = body(self._mesh)
         self._index = torch.from_numpy(solid.index)
         self._limits = Limits(solid, float(self.chosen["epsilon"]))
@@ -415,27 +495,27 @@ class GeometryControl(Control):
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
         else:
-            spread = Preconditioner(solid)
+            precondition = Preconditioner(solid)
             group = Group("pushes", 3 * len(solid.places), ESTIMATORS)
-            self._field = lambda a: PUSH * spread(a.reshape(-1, 3))
-        self.groups, self.start = (group,), torch.full((group.size,), 0.5)
+            self._field = lambda a: PUSH * precondition(a.reshape(-1, 3))
+        self.groups = (group,)
+        self.start = torch.full((group.size,), 0.5)
 
     def inputs(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        return {
-            self._offsets: self.offsets(u)
-            .index_select(0, self._index.to(u.device))
-            .float()
-        }
+        """Return the offset of each vertex, (V, 3)."""
+        offsets = self.offsets(u).index_select(0, self._index.to(u.device))
+        return {self._offsets_input: offsets.float()}
 
     def offsets(self, u: Tensor) -> Tensor:
-        """Displacement of each place, (P, 3) float64."""
+        """Return the displacement of each position, (P, 3) float64."""
         return self._limits.held(self._field(2.0 * u.double() - 1.0))
 
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
+        """Return how far vertices move, and how much the thinnest wall has lost."""
         offsets = self.offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
@@ -447,8 +527,10 @@ class GeometryControl(Control):
     def files(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, bytes]:
+        """Return the displaced mesh as an OBJ file."""
         moving = MovingMesh(self._mesh, np.eye(4))
-        vertices, normals = moving.place(None, self.inputs(u.detach())[self._offsets])
+        offsets = self.inputs(u.detach())[self._offsets_input]
+        vertices, normals = moving.place(None, offsets)
         lines = ["# advsearch: z is up; texture coordinates as of the original object"]
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
         lines += [f"vt {u:.7g} {v:.7g}" for u, v in self._mesh.uvs.tolist()]

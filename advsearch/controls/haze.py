@@ -39,48 +39,66 @@ class HazeControl(Control):
     kind = "haze"
     amount = "density"
     parameters = (
-        Parameter.number(Parameter.LIT, "density", "per object size", 0.0, 2.0, 0.0,
-                         "Extinction: over 1 / density the haze takes 63 % of the "
-                         "light out of a ray.", (0.0, 0.3)),
-        *Parameter.colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
-    )  # fmt: skip
+        Parameter.number(
+            Parameter.LIT,
+            "density",
+            "per object size",
+            0.0,
+            2.0,
+            0.0,
+            "Extinction: over 1 / density the haze takes 63 % of the "
+            "light out of a ray.",
+            (0.0, 0.3),
+        ),
+        *Parameter.colors(
+            "of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02
+        ),
+    )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        own = _haze_of(self.scene)
+        """Return a parameter with the value of the scene's own haze, if it has one."""
+        scene_haze = _find_haze(self.scene)
         default = parameter.default
         if parameter.name != "density":
-            if own is None:
+            if scene_haze is None:
                 return parameter
-            albedo = color.linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist()
+            albedo = color.linear_to_srgb(
+                np.asarray(scene_haze.albedo, np.float32)
+            ).tolist()
             return replace(
                 parameter, default=albedo[color.CHANNELS.index(parameter.name)]
             )
-        if own is not None:
-            default = own.density
+        if scene_haze is not None:
+            default = scene_haze.density
         elif self.asked and not self.searches("density"):
             default = THIN_HAZE
         spec = self.specs.get("density")
-        adjoint = isinstance(spec, Range) and spec.low > 0.0
+        has_adjoint = isinstance(spec, Range) and spec.low > 0.0
         return replace(
             parameter,
             default=default,
-            estimators=Parameter.LIT if adjoint else ("differences",),
+            estimators=Parameter.LIT if has_adjoint else ("differences",),
         )
 
     def unchanged(self, parameter: Parameter) -> float | str:
         # of the density; see `amount`
-        return 0.0 if _haze_of(self.scene) is None else parameter.default
+        return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        if (own := _haze_of(scene)) is not None:
-            renamed = replace(own, name=self.name)
+        """Add a ball of haze, or take over the scene's own."""
+        if (scene_haze := _find_haze(scene)) is not None:
+            renamed = replace(scene_haze, name=self.name)
             return replace(
                 scene,
-                parts=tuple(renamed if part is own else part for part in scene.parts),
+                parts=tuple(
+                    renamed if part is scene_haze else part for part in scene.parts
+                ),
             )
-        away = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
+        camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
         return scene.with_part(
-            parts.HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away))
+            parts.HazePart(
+                self.name, max(LEAST_RADIUS, BEHIND_CAMERA * camera_distance)
+            )
         )
 
     def scene_inputs(
@@ -93,8 +111,8 @@ class HazeControl(Control):
         }
 
 
-def _haze_of(scene: SceneDescription) -> parts.HazePart | None:
-    """The haze that a scene comes with."""
+def _find_haze(scene: SceneDescription) -> parts.HazePart | None:
+    """Return the haze that a scene comes with."""
     return next(
         (
             part

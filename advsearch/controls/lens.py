@@ -30,9 +30,16 @@ _FAR = 40.0
 
 
 def _per_dot(
-    name: str, unit: str, default: float, text: str, search: tuple[float, float] = (0.0, 1.0), low: float = 0.0,
-    *, log: bool = False,
-) -> Parameter:  # fmt: skip
+    name: str,
+    unit: str,
+    default: float,
+    text: str,
+    search: tuple[float, float] = (0.0, 1.0),
+    low: float = 0.0,
+    *,
+    log: bool = False,
+) -> Parameter:
+    """Return a parameter with one number for each dot."""
     return Parameter(
         name,
         (None,),
@@ -57,16 +64,37 @@ class LensControl(Control):
     parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
-        _per_dot("radius", "picture sizes", 0.12,
-                 "Distance at which a dot has lost 63 % of its opacity, as a share of "
-                 "the picture's smaller side.",
-                 (0.03, 0.25), 0.01, log=True),
-        *(_per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.") for name in color.CHANNELS),
-        _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
-        Parameter.number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
-                         "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a "
-                         "disc."),
-    )  # fmt: skip
+        _per_dot(
+            "radius",
+            "picture sizes",
+            0.12,
+            "Distance at which a dot has lost 63 % of its opacity, as a share of "
+            "the picture's smaller side.",
+            (0.03, 0.25),
+            0.01,
+            log=True,
+        ),
+        *(
+            _per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.")
+            for name in color.CHANNELS
+        ),
+        _per_dot(
+            "opacity",
+            "1",
+            0.0,
+            "Opacity in the middle of each dot; 0 is no dot.",
+            (0.0, 0.5),
+        ),
+        Parameter.number(
+            ("image",),
+            "falloff",
+            "1",
+            1.0,
+            8.0,
+            1.0,
+            "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
+        ),
+    )
     choices = (
         Choice(
             "dots",
@@ -85,47 +113,46 @@ class LensControl(Control):
         return replace(parameter, shape=(self.dots,)) if parameter.shape else parameter
 
     def fit(self) -> None:
+        """Spread the dots over the image at the start."""
         super().fit()
+        positions = spread(self.dots)
         for slot in self.slots:
             name = slot.parameter.name
-            width = slot.width
-            if name in PLACES and width and not isinstance(slot.spec, OneOf):
-                self.start[slot.begin : slot.begin + width] = spread(self.dots)[
-                    PLACES.index(name)
-                ]
+            is_range = slot.width > 0 and not isinstance(slot.spec, OneOf)
+            if name in PLACES and is_range:
+                coordinates = slice(slot.begin, slot.begin + slot.width)
+                self.start[coordinates] = positions[PLACES.index(name)]
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return with_dots(image, self._placed(values))
+        return with_dots(image, self._spread_dots(values))
 
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the sticker as it looks on a grey checkerboard."""
         square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
-        dark = (square[:, None] + square[None, :]) % 2
-        return {
-            self.name: with_dots(
-                (0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values)
-            )
-        }
+        is_dark = (square[:, None] + square[None, :]) % 2
+        checkerboard = (0.6 - 0.2 * is_dark)[..., None].repeat(1, 1, 3)
+        return {self.name: with_dots(checkerboard, self._spread_dots(values))}
 
-    def _placed(self, values: Values) -> dict[str, Tensor]:
-        """The values, with the dots spread over the picture along an axis about which
-        nothing was said.
-        """
-        placed = dict(values)
+    def _spread_dots(self, values: Values) -> dict[str, Tensor]:
+        """Return the values, with the dots spread along an axis that was not set."""
+        spread_values = dict(values)
         for axis, name in enumerate(PLACES):
             if self.asked and name not in self.specs:
-                placed[name] = spread(self.dots)[axis].to(values[name].device)
-        return placed
+                spread_values[name] = spread(self.dots)[axis].to(values[name].device)
+        return spread_values
 
 
 def spread(count: int) -> Tensor:
-    """Return `count` places spread evenly over the middle 80 % of the picture, the
-    first in its centre.
+    """Return positions spread evenly over the middle 80 % of the image.
 
-    The places are a lattice with the two irrational steps of the plastic number, a
+    They are a lattice with the two irrational steps of the plastic number, a
     two-dimensional golden ratio (Roberts 2018, The unreasonable effectiveness of
-    quasirandom sequences, R2). They are (2, count) float32: x and y in [0.1, 0.9].
+    quasirandom sequences, R2); the first is in the image's center.
+
+    Returns:
+        (2, count) float32: x and y in [0.1, 0.9].
     """
     plastic = 1.324717957244746
     steps = torch.tensor([[1.0 / plastic], [1.0 / plastic**2]], dtype=torch.float64)
@@ -134,7 +161,7 @@ def spread(count: int) -> Tensor:
 
 
 def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-    """Return a picture as it is seen through a lens with dots on it.
+    """Return an image as it is seen through a lens with dots on it.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
@@ -142,28 +169,29 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
             and `falloff` of shape (), as in `LensControl.parameters`.
 
     Returns:
-        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
+        (H, W, 3) sRGB in [0, 1]; differentiable in the image and in every value.
     """
     levels = torch.stack([values[channel] for channel in color.CHANNELS], dim=-1)
-    shades = color.srgb_to_linear(levels).to(image.device)
+    dot_colors = color.srgb_to_linear(levels).to(image.device)
     height, width = image.shape[:2]
-    side = min(height, width)
-    device = values["x"].device
-    falloff = values["falloff"]
-    across = (
-        torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width
-    ) / side
-    down = (
-        torch.arange(height, device=device) + 0.5 - values["y"][:, None] * height
-    ) / side
-    squared = down[:, :, None] ** 2 + across[:, None, :] ** 2
-    distance = squared / values["radius"][:, None, None] ** 2
-    reach = float(_FAR ** (1.0 / falloff.detach()))
-    covers = values["opacity"][:, None, None] * torch.exp(
-        -(distance.clamp(1e-12, reach) ** falloff)
-    )
-    covers = covers.to(image.device)
+    covers = _compute_covers(height, width, values).to(image.device)
     light = color.srgb_to_linear(image)
-    for cover, shade in zip(covers, shades, strict=True):
-        light = light + cover[..., None] * (shade - light)
+    for cover, dot_color in zip(covers, dot_colors, strict=True):
+        light = light + cover[..., None] * (dot_color - light)
     return color.linear_to_srgb(light)
+
+
+def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
+    """Return the opacity (dots, H, W) of each dot in each pixel; see `with_dots`."""
+    shorter_side = min(height, width)
+    device = values["x"].device
+    column = torch.arange(width, device=device) + 0.5
+    row = torch.arange(height, device=device) + 0.5
+    x_offset = (column - values["x"][:, None] * width) / shorter_side
+    y_offset = (row - values["y"][:, None] * height) / shorter_side
+    squared = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
+    squared = squared / values["radius"][:, None, None] ** 2
+    falloff = values["falloff"]
+    reach = float(_FAR ** (1.0 / falloff.detach()))
+    fading = torch.exp(-(squared.clamp(1e-12, reach) ** falloff))
+    return values["opacity"][:, None, None] * fading

@@ -5,7 +5,8 @@ Power is in multiples of the irradiance `E` with which a white surface (reflecta
 gets the display value `LIT_WHITE`. A lamp of power p and linear colour c puts `p c E /
 d^2` on a surface that faces it at distance d:
 
-    point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
+    point              intensity I = p c E
+    ball of radius r   radiance L = p c E / (pi r^2)
 
 The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity
 and Realistic Image Synthesis, section 2.4), so that size changes how soft the shadows
@@ -40,15 +41,17 @@ about as bright as the environment.
 
 
 def metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's
-    metered gain, in scene units.
+    """Return the irradiance that gives a white surface `LIT_WHITE`, in scene units.
+
+    At the scene's metered gain.
     """
     return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
 
 
-def _place(
+def _make_coordinate(
     name: str, low: float, high: float, default: float, description: str
 ) -> Parameter:
+    """Return a parameter for a coordinate of the lamp."""
     return Parameter.moving(
         ("differences",),
         name,
@@ -67,22 +70,45 @@ class LightControl(Control):
     kind = "light"
     amount = "power"
     parameters = (
-        _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
-        _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
-        _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
+        _make_coordinate("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
+        _make_coordinate("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
+        _make_coordinate(
+            "z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."
+        ),
         *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
-        Parameter.number(Parameter.LIT, "power", "1", 0.0, 1000.0, 0.0,
-                         "Irradiance at distance 1, in multiples of the one that shows "
-                         "a white surface just below "
-                         "white.",
-                         (0.0, 12.0)),
-        Parameter.moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
-                         "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
-    )  # fmt: skip
-    choices = (Choice("type", "area",
-                      "area (a ball that glows: soft shadows, visible) or point (sharp "
-                      "shadows, invisible).",
-                      options=("area", "point")),)  # fmt: skip
+        Parameter.number(
+            Parameter.LIT,
+            "power",
+            "1",
+            0.0,
+            1000.0,
+            0.0,
+            "Irradiance at distance 1, in multiples of the one that shows "
+            "a white surface just below "
+            "white.",
+            (0.0, 12.0),
+        ),
+        Parameter.moving(
+            ("differences",),
+            "size",
+            "object sizes",
+            0.001,
+            10.0,
+            0.2,
+            "Diameter of an area light; a point has none.",
+            (0.05, 0.6),
+            log=True,
+        ),
+    )
+    choices = (
+        Choice(
+            "type",
+            "area",
+            "area (a ball that glows: soft shadows, visible) or point (sharp "
+            "shadows, invisible).",
+            options=("area", "point"),
+        ),
+    )
 
     def check_choices(self) -> None:
         if self.chosen["type"] == "point" and "size" in self._given:
@@ -112,17 +138,21 @@ class LightControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        place = torch.stack([values[axis] for axis in ("x", "y", "z")])
+        """Return where the lamp is, and how bright."""
+        position = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
             color.combine_channels(values)
             * values["power"]
             * metered_irradiance(self.scene)
         )
         if self.chosen["type"] == "point":
-            return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
+            return {
+                f"{self.name}.position": position,
+                f"{self.name}.intensity": intensity,
+            }
         radius = values["size"] / 2.0
         return {
-            f"{self.name}.ball": ball(place, radius),
+            f"{self.name}.ball": ball(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),
         }
 

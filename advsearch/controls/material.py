@@ -30,7 +30,7 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.raster import looked_up, rasterised
 from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # Named materials made by procedure: seamless patterns with a surface of their own, and
 # how they cover an object.
 #
@@ -51,9 +51,11 @@ BLEND = 20.0
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material: the side of a tile in object sizes, the surface beside its
-    colour, and what draws the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred
-    sRGB, any overshoot clipped later.
+    """A named material.
+
+    The side of a tile in object sizes, the surface beside its colour, and what draws
+    the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot
+    clipped later.
     """
 
     name: str
@@ -79,57 +81,62 @@ def pattern(
 
 
 # ---- ingredients: everything repeats after 1 in x and y
-# --------------------------------------------------------------
 
 
-def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
-    """Gradient noise with a whole number of lattice cells across the tile; about -1 to
-    1, mean 0.
+def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Doubles:
+    """Return gradient noise with whole lattice cells across the tile.
+
+    About -1 to 1, mean 0 (Perlin 1985).
     """
-    across, down = cells
-    angle = np.random.Generator(np.random.PCG64(seed)).uniform(
-        0.0, 2.0 * np.pi, (down, across)
-    )
-    x = at[0] * across
-    y = at[1] * down
-    left = np.floor(x)
-    top = np.floor(y)
-    fx = x - left
-    fy = y - top
+    columns, rows = cells
+    generator = np.random.Generator(np.random.PCG64(seed))
+    angle = generator.uniform(0.0, 2.0 * np.pi, (rows, columns))
+    left = np.floor(grid[0] * columns)
+    top = np.floor(grid[1] * rows)
+    x = grid[0] * columns - left
+    y = grid[1] * rows - top
     column = left.astype(np.int64)
     row = top.astype(np.int64)
 
     def corner(right: int, below: int) -> Doubles:
-        turn = angle[(row + below) % down, (column + right) % across]
-        return np.asarray(np.cos(turn) * (fx - right) + np.sin(turn) * (fy - below))
+        turn = angle[(row + below) % rows, (column + right) % columns]
+        return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
-    wx, wy = (f * f * f * (f * (f * 6.0 - 15.0) + 10.0) for f in (fx, fy))
-    upper = corner(0, 0) * (1.0 - wx) + corner(1, 0) * wx
-    lower = corner(0, 1) * (1.0 - wx) + corner(1, 1) * wx
-    return np.asarray((upper * (1.0 - wy) + lower * wy) * 1.5)
+    x_weight = _fade(x)
+    y_weight = _fade(y)
+    upper = corner(0, 0) * (1.0 - x_weight) + corner(1, 0) * x_weight
+    lower = corner(0, 1) * (1.0 - x_weight) + corner(1, 1) * x_weight
+    return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
 
 
-def _clouds(at: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
-    """Octaves of noise, each twice as fine and half as strong; about -1 to 1."""
-    total = np.zeros_like(at[0])
+def _fade(position: Doubles) -> Doubles:
+    """Return the weight of the further corner at a position in a lattice cell."""
+    cubed = position * position * position
+    return np.asarray(cubed * (position * (position * 6.0 - 15.0) + 10.0))
+
+
+def _clouds(grid: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
+    """Return octaves of noise, each twice as fine and half as strong; about -1 to 1."""
+    total = np.zeros_like(grid[0])
     for octave in range(octaves):
         total += 0.5**octave * _noise(
-            at, (cells[0] << octave, cells[1] << octave), seed + 101 * octave
+            grid, (cells[0] << octave, cells[1] << octave), seed + 101 * octave
         )
     return total / (2.0 - 0.5 ** (octaves - 1))
 
 
-def _warped(at: Grid, cells: int, amount: float, seed: int) -> Grid:
+def _warped(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
     """Move the coordinates about by noise."""
-    across = _clouds(at, (cells, cells), 2, seed)
-    down = _clouds(at, (cells, cells), 2, seed + 7)
-    return at[0] + amount * across, at[1] + amount * down
+    right = _clouds(grid, (cells, cells), 2, seed)
+    down = _clouds(grid, (cells, cells), 2, seed + 7)
+    return grid[0] + amount * right, grid[1] + amount * down
 
 
 def _scattered(count: int, seed: int) -> Doubles:
-    """Points of a torus about as far from each other as they can be, irregular: (count,
-    2) in [0, 1). Best candidate sampling (Mitchell 1991): each point is the farthest
-    from those before it of a few random ones.
+    """Return irregular points of a torus, far from each other: (count, 2) in [0, 1).
+
+    Best candidate sampling (Mitchell 1991): each point is the farthest from those
+    before it of a few random ones.
     """
     generator = np.random.Generator(np.random.PCG64(seed))
     points = generator.random((1, 2))
@@ -144,14 +151,16 @@ def _scattered(count: int, seed: int) -> Doubles:
 
 
 def _cells(
-    at: Grid, points: Doubles, count: int = 2
+    grid: Grid, points: Doubles, count: int = 2
 ) -> tuple[Doubles, npt.NDArray[np.int64]]:
-    """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first,
-    and which points they are.
+    """Return the nearest points on the torus, nearest first.
+
+    Returns:
+        Distances (SIDE, SIDE, count), and indices of the points.
     """
-    place = np.stack([at[0] % 1.0, at[1] % 1.0], axis=-1)
+    positions = np.stack([grid[0] % 1.0, grid[1] % 1.0], axis=-1)
     distance, index = cKDTree(points, boxsize=1.0).query(
-        np.minimum(place, np.nextafter(1.0, 0.0)), k=count
+        np.minimum(positions, np.nextafter(1.0, 0.0)), k=count
     )
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
 
@@ -159,10 +168,18 @@ def _cells(
 def _turing(
     wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
 ) -> Doubles:
-    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and
-    again; after about ten rounds the pattern has settled. Wavelengths are in tiles,
-    along x and along y; unequal ones make stripes across the shorter. The bias is added
-    before saturation: stripes break up into spots away from 0.
+    """Return animal stripes or spots in [-1, 1].
+
+    Noise, band-passed and saturated again and again; after about ten rounds the pattern
+    has settled.
+
+    Args:
+        wavelength: along x and along y, in tiles; unequal ones make stripes across
+            the shorter.
+        bias: that is added before saturation: away from 0 stripes break up into
+            spots.
+        seed: of the noise.
+        rounds: number of steps.
     """
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
     radius = np.hypot(
@@ -177,24 +194,25 @@ def _turing(
 
 
 def _step(value: Doubles, edge: float, soft: float) -> Doubles:
-    """0 below the edge, 1 above it, with a smooth ramp `soft` wide."""
-    share = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
-    return np.asarray(share * share * (3.0 - 2.0 * share))
+    """Return 0 below the edge and 1 above it, with a smooth ramp `soft` wide."""
+    fraction = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
+    return np.asarray(fraction * fraction * (3.0 - 2.0 * fraction))
 
 
 def _color(code: str) -> Doubles:
     return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
 
 
-def _mix(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
-    """From the first colour to the second; colours (3,) or (SIDE, SIDE, 3), shares
-    (SIDE, SIDE).
+def _mix(first: Doubles, second: Doubles, fraction: Doubles) -> Doubles:
+    """Interpolate from the first color to the second.
+
+    Colors are (3,) or (SIDE, SIDE, 3), fractions (SIDE, SIDE).
     """
-    return np.asarray(first + (second - first) * share[..., None])
+    return np.asarray(first + (second - first) * fraction[..., None])
 
 
 def _ramp(value: Doubles, *codes: str) -> Doubles:
-    """Colours evenly spaced over values from 0 to 1."""
+    """Interpolate colors that are evenly spaced over values from 0 to 1."""
     colors = np.stack([_color(code) for code in codes])
     stops = np.linspace(0.0, 1.0, len(codes))
     return np.stack(
@@ -203,27 +221,27 @@ def _ramp(value: Doubles, *codes: str) -> Doubles:
 
 
 # ---- the patterns
-# ----------------------------------------------------------------------------------------------------
 
 
 @pattern(1.0, roughness=0.5)
-def plain(at: Grid) -> Doubles:
+def plain(grid: Grid) -> Doubles:
     return np.ones((SIDE, SIDE, 3))
 
 
 @pattern(0.6, roughness=0.45)
-def wood(at: Grid) -> Doubles:
-    x, y = at
-    bend = 0.16 * _clouds(at, (2, 1), 2, 11) + 0.012 * _noise(at, (8, 3), 12)
-    rings = 9.0 * (x + bend) + 0.25 * _noise(at, (5, 2), 17)
+def wood(grid: Grid) -> Doubles:
+    """Paint year rings with fibres and pores."""
+    x, y = grid
+    bend = 0.16 * _clouds(grid, (2, 1), 2, 11) + 0.012 * _noise(grid, (8, 3), 12)
+    rings = 9.0 * (x + bend) + 0.25 * _noise(grid, (5, 2), 17)
     phase = rings % 1.0
     # slow darkening, sudden end of a year
-    late = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))
+    late_wood = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))
     fibre = _noise((x + 0.6 * bend, y), (120, 3), 13) + 0.6 * _noise(
         (x + 0.6 * bend, y), (240, 5), 18
     )
     pores = _step(_noise((x + 0.6 * bend, y), (170, 12), 14), 0.5, 0.2)
-    tone = 0.30 + 0.42 * late + 0.13 * fibre + 0.16 * _noise(at, (3, 1), 15)
+    tone = 0.30 + 0.42 * late_wood + 0.13 * fibre + 0.16 * _noise(grid, (3, 1), 15)
     return _mix(
         _ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"),
         _color("5a3519"),
@@ -232,23 +250,29 @@ def wood(at: Grid) -> Doubles:
 
 
 @pattern(0.9, roughness=0.15)
-def marble(at: Grid) -> Doubles:
-    near = _warped(at, 2, 0.22, 21)
-    far = _warped(near, 6, 0.03, 22)
-    x, y = far
-    clouds = 0.5 + 0.5 * _clouds(near, (3, 3), 4, 25)
+def marble(grid: Grid) -> Doubles:
+    """Paint clouds with dark veins."""
+    warped = _warped(grid, 2, 0.22, 21)
+    finely_warped = _warped(warped, 6, 0.03, 22)
+    x, y = finely_warped
+    clouds = 0.5 + 0.5 * _clouds(warped, (3, 3), 4, 25)
     veins = np.zeros((SIDE, SIDE))
-    for across, down, width, depth, seed in (
+    for n_right, n_down, width, depth, seed in (
         (1, 1, 0.05, 0.75, 23),
         (2, 1, 0.02, 0.45, 24),
         (1, 3, 0.012, 0.3, 26),
     ):
         wave = np.abs(
             np.sin(
-                np.pi * (across * x + down * y + 0.5 * _clouds(far, (2, 2), 4, seed))
+                np.pi
+                * (
+                    n_right * x
+                    + n_down * y
+                    + 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
+                )
             )
         )
-        strength = 0.25 + 0.75 * _step(_clouds(near, (3, 3), 2, seed + 50), 0.0, 0.8)
+        strength = 0.25 + 0.75 * _step(_clouds(warped, (3, 3), 2, seed + 50), 0.0, 0.8)
         veins += (
             depth
             * strength
@@ -259,220 +283,242 @@ def marble(at: Grid) -> Doubles:
 
 
 @pattern(0.6, roughness=0.9, specular=0.2)
-def brick(at: Grid) -> Doubles:
-    x, y = _warped(at, 12, 0.0035, 31)
+def brick(grid: Grid) -> Doubles:
+    """Paint a wall of bricks with mortar."""
+    x, y = _warped(grid, 12, 0.0035, 31)
     rows = 8
     columns = 4
     row = np.floor(y * rows)
-    across = x * columns + 0.5 * (row % 2.0)
-    column = np.floor(across) % columns
+    course_x = x * columns + 0.5 * (row % 2.0)
+    column = np.floor(course_x) % columns
     # distance to the edge of the brick, in heights of a course
-    edge_x = 2.0 * (0.5 - np.abs(across % 1.0 - 0.5))
+    edge_x = 2.0 * (0.5 - np.abs(course_x % 1.0 - 0.5))
     edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
     solid = _step(
-        np.minimum(edge_x, edge_y) + 0.02 * _noise(at, (60, 60), 32), 0.075, 0.05
+        np.minimum(edge_x, edge_y) + 0.02 * _noise(grid, (60, 60), 32), 0.075, 0.05
     )
     tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
-    chosen = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
-    grain = _clouds(at, (40, 40), 3, 34)
-    brick = _ramp(
-        chosen + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
+    brick_tone = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
+    grain = _clouds(grid, (40, 40), 3, 34)
+    brick_color = _ramp(
+        brick_tone + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
     )
-    brick = _mix(
-        brick, _color("4f211a"), 0.5 * _step(_clouds(at, (70, 70), 2, 35), 0.35, 0.2)
+    brick_color = _mix(
+        brick_color,
+        _color("4f211a"),
+        0.5 * _step(_clouds(grid, (70, 70), 2, 35), 0.35, 0.2),
     )
-    mortar = _color("c3bbac") + 0.10 * _clouds(at, (80, 80), 2, 36)[..., None]
-    return _mix(mortar, brick, solid)
+    mortar = _color("c3bbac") + 0.10 * _clouds(grid, (80, 80), 2, 36)[..., None]
+    return _mix(mortar, brick_color, solid)
 
 
 @pattern(0.45, roughness=0.95, specular=0.1)
-def fabric(at: Grid) -> Doubles:
-    x, y = _warped(at, 6, 0.004, 41)
+def fabric(grid: Grid) -> Doubles:
+    """Paint a plain weave of two threads."""
+    x, y = _warped(grid, 6, 0.004, 41)
     count = 16
-    across = x * count
-    down = y * count
-    round_x = np.sin(np.pi * (across % 1.0))
-    round_y = np.sin(np.pi * (down % 1.0))
-    # 1: the warp (upright thread) lies on top
-    over = (np.floor(across) + np.floor(down)) % 2.0
+    thread_x = x * count
+    thread_y = y * count
+    round_x = np.sin(np.pi * (thread_x % 1.0))
+    round_y = np.sin(np.pi * (thread_y % 1.0))
+    # the warp is the upright thread
+    warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
     height = np.where(
-        over > 0.5, round_x * (0.55 + 0.45 * round_y), round_y * (0.55 + 0.45 * round_x)
+        warp_is_over,
+        round_x * (0.55 + 0.45 * round_y),
+        round_y * (0.55 + 0.45 * round_x),
     )
-    fibres_up = _noise((x, y), (count * 8, count), 42)
-    fibres_flat = _noise((x, y), (count, count * 8), 43)
-    fibres = np.where(over > 0.5, fibres_up, fibres_flat)
+    fibres = np.where(
+        warp_is_over,
+        _noise((x, y), (count * 8, count), 42),
+        _noise((x, y), (count, count * 8), 43),
+    )
     generator = np.random.Generator(np.random.PCG64(44))
-    warp_tone = generator.uniform(0.8, 1.1, count)
-    weft_tone = generator.uniform(0.8, 1.1, count)
-    warp = (
-        _color("b9a77f")
-        * warp_tone[np.floor(across).astype(np.int64) % count][..., None]
-    )
-    weft = (
-        _color("3f5f86") * weft_tone[np.floor(down).astype(np.int64) % count][..., None]
-    )
-    thread = np.where(over[..., None] > 0.5, warp, weft)
+    warp = _color("b9a77f") * _thread_tones(generator, thread_x, count)
+    weft = _color("3f5f86") * _thread_tones(generator, thread_y, count)
+    thread = np.where(warp_is_over[..., None], warp, weft)
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
 
 
+def _thread_tones(
+    generator: np.random.Generator, position: Doubles, count: int
+) -> Doubles:
+    """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in."""
+    tone = generator.uniform(0.8, 1.1, count)
+    return np.asarray(tone[np.floor(position).astype(np.int64) % count][..., None])
+
+
 @pattern(0.7, roughness=0.8, specular=0.2)
-def leopard(at: Grid) -> Doubles:
-    place = _warped(_warped(at, 4, 0.03, 51), 12, 0.012, 52)
+def leopard(grid: Grid) -> Doubles:
+    """Paint rosettes with dots between them."""
+    warped = _warped(_warped(grid, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
-    distance, index = _cells(place, points)
-    generator = np.random.Generator(np.random.PCG64(54))
-    size = generator.uniform(0.85, 1.15, len(points))[index[..., 0]]
-    radius = distance[..., 0] / size
-    offset_x = (place[0] - points[index[..., 0], 0] + 0.5) % 1.0 - 0.5
-    offset_y = (place[1] - points[index[..., 0], 1] + 0.5) % 1.0 - 0.5
-    angle = np.arctan2(offset_y, offset_x)
-    turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index[..., 0]]
-    broken = _step(
-        np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn), -0.75, 0.5
-    )
-    ring = _step(radius, 0.031, 0.008) * (
-        1.0 - _step(radius, 0.056 + 0.004 * np.cos(angle + turn), 0.008)
-    )
-    core = 1.0 - _step(radius, 0.042, 0.02)
-    fur = _clouds(at, (24, 90), 2, 55)
-    coat = _mix(
-        _color("d8a861"), _color("e7c58c"), 0.5 + 0.5 * _clouds(at, (3, 3), 2, 56)
-    )
+    distance, index = _cells(warped, points)
+    rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
+    fur = _clouds(grid, (24, 90), 2, 55)
+    shade = 0.5 + 0.5 * _clouds(grid, (3, 3), 2, 56)
+    coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
-    small, _ = _cells(place, _scattered(150, 57), 1)
-    between = _step(distance[..., 0], 0.07, 0.012)
-    dots = (1.0 - _step(small.reshape(SIDE, SIDE), 0.011, 0.006)) * between
-    spots = np.clip(ring * broken + dots, 0.0, 1.0)
+    dot_distance, _ = _cells(warped, _scattered(150, 57), 1)
+    between_rosettes = _step(distance[..., 0], 0.07, 0.012)
+    dots = 1.0 - _step(dot_distance.reshape(SIDE, SIDE), 0.011, 0.006)
+    spots = np.clip(rosettes + dots * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
 
 
+def _draw_rosettes(
+    grid: Grid, points: Doubles, distance: Doubles, index: npt.NDArray[np.int64]
+) -> tuple[Doubles, Doubles]:
+    """Draw broken rings around points, and their darker cores; each (SIDE, SIDE).
+
+    Args:
+        grid: coordinates of the texels.
+        points: (N, 2) on the torus.
+        distance: (SIDE, SIDE) to the nearest point.
+        index: (SIDE, SIDE) of that point.
+    """
+    generator = np.random.Generator(np.random.PCG64(54))
+    size = generator.uniform(0.85, 1.15, len(points))[index]
+    turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
+    radius = distance / size
+    x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
+    y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
+    angle = np.arctan2(y_offset, x_offset)
+    waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
+    outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
+    ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, outer_edge, 0.008))
+    return ring * _step(waves, -0.75, 0.5), 1.0 - _step(radius, 0.042, 0.02)
+
+
 @pattern(0.8, roughness=0.8, specular=0.2)
-def zebra(at: Grid) -> Doubles:
+def zebra(grid: Grid) -> Doubles:
     stripes = _turing((0.42, 0.125), 0.0, 61)
-    black = _step(stripes + 0.12 * _noise(at, (10, 40), 62), 0.0, 0.7)
-    fur = 1.0 + 0.06 * _clouds(at, (30, 110), 2, 63)
+    black = _step(stripes + 0.12 * _noise(grid, (10, 40), 62), 0.0, 0.7)
+    fur = 1.0 + 0.06 * _clouds(grid, (30, 110), 2, 63)
     return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
 
 
 @pattern(0.5, roughness=0.4)
-def checker(at: Grid) -> Doubles:
-    x, y = at
+def checker(grid: Grid) -> Doubles:
+    x, y = grid
     odd = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
     return _mix(_color("f2f2f0"), _color("191919"), odd)
 
 
 @pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
-def rust(at: Grid) -> Doubles:
-    place = _warped(at, 4, 0.06, 71)
-    broad = 0.5 + 0.5 * _clouds(place, (3, 3), 5, 72)
-    grain = _clouds(at, (48, 48), 3, 73)
+def rust(grid: Grid) -> Doubles:
+    """Paint rust under flakes of paint."""
+    warped = _warped(grid, 4, 0.06, 71)
+    broad = 0.5 + 0.5 * _clouds(warped, (3, 3), 5, 72)
+    grain = _clouds(grid, (48, 48), 3, 73)
     tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
     oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
-    paint = _color("5d6668") + 0.05 * _clouds(at, (20, 20), 2, 74)[..., None]
+    paint = _color("5d6668") + 0.05 * _clouds(grid, (20, 20), 2, 74)[..., None]
     # paint that has not come off yet
-    left = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05)
+    paint_left = _step(
+        _clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05
+    )
     rim = (
-        _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10) - left
+        _step(_clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10)
+        - paint_left
     )
     surface = _mix(
-        _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)), paint, 0.85 * left
+        _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)),
+        paint,
+        0.85 * paint_left,
     )
-    pits = _step(_noise(at, (70, 70), 77), 0.5, 0.15)
+    pits = _step(_noise(grid, (70, 70), 77), 0.5, 0.15)
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
 @pattern(0.5, roughness=0.9, specular=0.1)
-def grass(at: Grid) -> Doubles:
-    """Blades drawn one over the other, bent and lighter towards the tip; later ones lie
-    on top.
+def grass(grid: Grid) -> Doubles:
+    """Paint blades over each other, bent and lighter towards the tip.
+
+    Later ones lie on top.
     """
     generator = np.random.Generator(np.random.PCG64(81))
-    count = 2600
-    samples = 64
-    broad = 5
-    root = generator.random((count, 1, 1, 2))
-    lean = generator.normal(-np.pi / 2, 0.55, (count, 1, 1))
-    bend = generator.normal(0.0, 0.9, (count, 1, 1))
-    length = generator.uniform(0.08, 0.17, (count, 1, 1))
-    along = np.linspace(0.0, 1.0, samples)[None, :, None]
-    side = (np.linspace(-1.0, 1.0, broad))[None, None, :] * 0.0042 * (1.0 - along**2)
+    n_blades = 2600
+    root = generator.random((n_blades, 1, 1, 2))
+    lean = generator.normal(-np.pi / 2, 0.55, (n_blades, 1, 1))
+    bend = generator.normal(0.0, 0.9, (n_blades, 1, 1))
+    length = generator.uniform(0.08, 0.17, (n_blades, 1, 1))
+    hue = generator.random((n_blades, 1, 1, 1)) ** 1.5
+    # of the samples of a blade: along it from 0 to 1, across it from -1 to 1
+    along = np.linspace(0.0, 1.0, 64)[None, :, None]
+    across = np.linspace(-1.0, 1.0, 5)[None, None, :]
+    offset = across * 0.0042 * (1.0 - along**2)
     heading = lean + bend * along
-    x = (
-        root[..., 0]
-        + length * along * np.cos(lean + 0.5 * bend * along)
-        - side * np.sin(heading)
-    )
-    y = (
-        root[..., 1]
-        + length * along * np.sin(lean + 0.5 * bend * along)
-        + side * np.cos(heading)
-    )
-    lit = 0.30 + 0.70 * along + 0.12 * np.linspace(-1.0, 1.0, broad)[None, None, :]
-    hue = generator.random((count, 1, 1, 1)) ** 1.5
-    blade = (_color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue) * lit[
-        ..., None
-    ]
+    middle = lean + 0.5 * bend * along
+    x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
+    y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
+    brightness = 0.30 + 0.70 * along + 0.12 * across
+    blade_color = _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue
+    colors = np.broadcast_to(blade_color * brightness[..., None], (*x.shape, 3))
+    return _draw_points(x.reshape(-1), y.reshape(-1), colors.reshape(-1, 3))
+
+
+def _draw_points(x: Doubles, y: Doubles, colors: Doubles) -> Doubles:
+    """Draw points (N,) of a torus with colors (N, 3) on dark soil, the last on top."""
     column = np.floor(x * SIDE).astype(np.int64) % SIDE
     row = np.floor(y * SIDE).astype(np.int64) % SIDE
     texels = np.broadcast_to(_color("14240b"), (SIDE * SIDE, 3)).copy()
-    cell = (row * SIDE + column).reshape(-1)
-    order = np.arange(cell.size)
-    top = np.full(SIDE * SIDE, -1)
-    np.maximum.at(top, cell, order)
-    drawn = top >= 0
-    texels[drawn] = np.broadcast_to(blade, (*x.shape, 3)).reshape(-1, 3)[top[drawn]]
+    topmost = np.full(SIDE * SIDE, -1)
+    np.maximum.at(topmost, row * SIDE + column, np.arange(len(x)))
+    is_covered = topmost >= 0
+    texels[is_covered] = colors[topmost[is_covered]]
     return np.asarray(texels.reshape(SIDE, SIDE, 3))
 
 
 @pattern(0.5, roughness=0.85, specular=0.2)
-def elephant(at: Grid) -> Doubles:
-    place = _warped(_warped(at, 3, 0.05, 91), 14, 0.012, 92)
+def elephant(grid: Grid) -> Doubles:
+    """Paint skin with folds."""
+    warped = _warped(_warped(grid, 3, 0.05, 91), 14, 0.012, 92)
     folds = np.zeros((SIDE, SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
-        stretched = _scattered(count, seed)
-        distance, _ = _cells(place, stretched)
+        points = _scattered(count, seed)
+        distance, _ = _cells(warped, points)
         folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
-    long = np.abs(_clouds(_warped(at, 5, 0.04, 95), (3, 14), 3, 96))
-    folds += 0.55 * np.exp(-((long / 0.035) ** 2))
+    long_folds = np.abs(_clouds(_warped(grid, 5, 0.04, 95), (3, 14), 3, 96))
+    folds += 0.55 * np.exp(-((long_folds / 0.035) ** 2))
     tone = (
         0.55
-        + 0.25 * _clouds(place, (3, 3), 3, 97)
-        + 0.16 * _clouds(at, (60, 60), 2, 98)
+        + 0.25 * _clouds(warped, (3, 3), 3, 97)
+        + 0.16 * _clouds(grid, (60, 60), 2, 98)
     )
     hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 
 
 @pattern(0.5, roughness=0.32, metallic=1.0)
-def steel(at: Grid) -> Doubles:
+def steel(grid: Grid) -> Doubles:
     scratches = (
-        _noise(at, (3, 240), 101)
-        + 0.6 * _noise(at, (7, 120), 102)
-        + 0.4 * _noise(at, (2, 256), 103)
+        _noise(grid, (3, 240), 101)
+        + 0.6 * _noise(grid, (7, 120), 102)
+        + 0.4 * _noise(grid, (2, 256), 103)
     )
-    tone = 0.72 + 0.09 * scratches + 0.03 * _noise(at, (2, 2), 104)
+    tone = 0.72 + 0.09 * scratches + 0.03 * _noise(grid, (2, 2), 104)
     return np.asarray(tone[..., None] * _color("fbfdff"))
 
 
 @cache
 def tile(name: str) -> Floats:
-    """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in
-    [0, 1]; do not change it.
+    """Return one tile of a pattern.
+
+    (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it.
     """
     line = (np.arange(SIDE) + 0.5) / SIDE
-    across, down = np.meshgrid(line, line)
-    painted = np.clip(PATTERNS[name].paint((across, down)), 0.0, 1.0).astype(np.float32)
+    x, y = np.meshgrid(line, line)
+    painted = np.clip(PATTERNS[name].paint((x, y)), 0.0, 1.0).astype(np.float32)
     painted.setflags(write=False)
     return painted
 
 
 # ---- on an object
-# ----------------------------------------------------------------------------------------------------
 
 
 def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
-    """Return the texture that covers a mesh with a pattern at one scale all over,
-    whatever its texture coordinates.
+    """Return the texture that covers a mesh with a pattern at one scale.
 
     Every texel of the texture looks up the tile at its place on the object, seen along
     the three axes, weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3,
@@ -488,21 +534,21 @@ def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
     Returns:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
     """
-    positions, normals = _places(mesh, side)
+    positions, normals = _texel_surface(mesh, side)
     scale = SIDE / PATTERNS[name].size
     weights = np.abs(normals) ** BLEND
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
-        seen = looked_up(
+        projected = looked_up(
             tile(name), positions[..., right] * scale, -positions[..., up] * scale
         )
-        texels += weights[..., axis : axis + 1] * seen
+        texels += weights[..., axis : axis + 1] * projected
     return texels
 
 
 @lru_cache(maxsize=2)
-def _places(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
+def _texel_surface(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
     """Positions and normals (side, side, 3) behind the texels of a mesh."""
     charts = rasterised(mesh, side)
     return charts.positions(), charts.normals()
@@ -518,17 +564,24 @@ class MaterialControl(Control):
     kind = "material"
     of_a_mesh = True
     parameters = (
-        Parameter.named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or "
-                                                        "a named material in its place.",
-                        estimators=("differences",)),
+        Parameter.named(
+            "which",
+            (OWN, *PATTERNS),
+            OWN,
+            "The object's own surface, or a named material in its place.",
+            estimators=("differences",),
+        ),
         *MATERIAL,
-        *Parameter.colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
-    )  # fmt: skip
+        *Parameter.colors(
+            "of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)
+        ),
+    )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        numbers = [name for name in NUMBERS if self._varies(name)]
+        """Check that the mesh has a principled surface. Raises InputError."""
+        varied = [name for name in NUMBERS if self._is_set(name)]
         if self.mesh_in(scene).surface is not None and (
-            numbers or self._names != (OWN,)
+            varied or self._material_names != (OWN,)
         ):
             raise InputError(
                 f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's "
@@ -542,35 +595,38 @@ class MaterialControl(Control):
         if parameter.name not in NUMBERS:
             return parameter
         # the fixed or first material
-        first = OWN if OWN in self._names else str(self._names[0])
+        first = OWN if OWN in self._material_names else str(self._material_names[0])
         return replace(
-            parameter, default=float(getattr(self._own(first), parameter.name))
+            parameter, default=float(getattr(self._get_material(first), parameter.name))
         )
 
     def unchanged(self, parameter: Parameter) -> Number:
-        given = self.setting(parameter) in self.scene.given
+        is_requested = self.setting(parameter) in self.scene.given
         return (
-            self.scene.number(self.setting(parameter)) if given else parameter.default
+            self.scene.number(self.setting(parameter))
+            if is_requested
+            else parameter.default
         )
 
     @property
     def refines(self) -> frozenset[str]:
-        return frozenset({self._base_color}) if self._colours() else frozenset()
+        return frozenset({self._base_color}) if self._changes_color() else frozenset()
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the numbers of the surface, and its tinted base color."""
         which = (OWN, *PATTERNS)[int(values["which"])]
-        material = self._own(which)
+        material = self._get_material(which)
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
-            if self._varies(name):
+            if self._is_set(name):
                 inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
-            elif self._names != (OWN,):
+            elif self._material_names != (OWN,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor(
                     [float(getattr(material, name))]
                 )
-        if self._colours():
+        if self._changes_color():
             mesh = self.mesh_in(self.scene)
             tint = color.combine_channels(values)
             # what the controls before made of the texture
@@ -585,7 +641,8 @@ class MaterialControl(Control):
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        if not self._colours():
+        """Return the texture, where the control changes it."""
+        if not self._changes_color():
             return {}
         return {
             self.name: linear_to_srgb(
@@ -598,19 +655,22 @@ class MaterialControl(Control):
         return f"{self.mesh}.base_color"
 
     @property
-    def _names(self) -> tuple[Number, ...]:
+    def _material_names(self) -> tuple[Number, ...]:
         return self.allowed("which", OWN)
 
-    def _varies(self, name: str) -> bool:
-        """Whether a parameter was set or is searched; otherwise it is the named
-        material's own.
+    def _is_set(self, name: str) -> bool:
+        """Return whether a parameter was set or is searched.
+
+        Otherwise it is the named material's own.
         """
         return name in self.specs or not self.asked
 
-    def _colours(self) -> bool:
-        return self._names != (OWN,) or any(self._varies(name) for name in CHANNELS)
+    def _changes_color(self) -> bool:
+        return self._material_names != (OWN,) or any(
+            self._is_set(name) for name in CHANNELS
+        )
 
-    def _own(self, which: str) -> Material:
+    def _get_material(self, which: str) -> Material:
         return (
             self.mesh_in(self.scene).material
             if which == OWN

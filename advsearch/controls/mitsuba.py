@@ -45,7 +45,7 @@ class MitsubaControl(Control):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        return tuple(_parameter(key) for key in settings)
+        return tuple(_make_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         return scene.with_part(
@@ -56,41 +56,52 @@ class MitsubaControl(Control):
         )
 
     def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
-        for number in self._numbers():
-            whole = self.specs.get(number.key)
-            if isinstance(whole, OneOf) and len(number.values) > 1:
+        """Yield one parameter for each number of what was set, with its spec.
+
+        Raises InputError: a color has a list of values.
+        """
+        for plugin_number in self._get_numbers():
+            color_spec = self.specs.get(plugin_number.key)
+            if isinstance(color_spec, OneOf) and len(plugin_number.values) > 1:
                 raise InputError(
-                    f"`controls` {self.name}:{number.key}: expected a range, because "
+                    f"`controls` {self.name}:{plugin_number.key}: expected a range, because "
                     "it is a colour; values one by one "
                     "are for one channel, such as "
-                    f"{self.name}:{number.key}.{color.CHANNELS[0]}"
+                    f"{self.name}:{plugin_number.key}.{color.CHANNELS[0]}"
                 )
-            for parameter, value in zip(_channels(number), number.values, strict=True):
-                spec = self.specs.get(parameter.name, whole or Fixed(value))
+            for parameter, value in zip(
+                _make_channel_parameters(plugin_number),
+                plugin_number.values,
+                strict=True,
+            ):
+                spec = self.specs.get(parameter.name, color_spec or Fixed(value))
                 yield replace(parameter, default=value), spec
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return {
-            number.input: torch.stack(
-                [values[channel.name] for channel in _channels(number)]
+        """Return the numbers and colors by the inputs that set them."""
+        inputs = {}
+        for plugin_number in self._get_numbers():
+            channels = _make_channel_parameters(plugin_number)
+            inputs[plugin_number.input] = torch.stack(
+                [values[channel.name] for channel in channels]
             )
-            for number in self._numbers()
-        }
+        return inputs
 
     def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
         return not isinstance(spec, Fixed)
 
-    def _numbers(self) -> tuple[parts.PluginNumber, ...]:
+    def _get_numbers(self) -> tuple[parts.PluginNumber, ...]:
         return next(
-            one.numbers
-            for one in self.scene.parts
-            if isinstance(one, parts.PluginNumbers) and one.name == self.name
+            part.numbers
+            for part in self.scene.parts
+            if isinstance(part, parts.PluginNumbers) and part.name == self.name
         )
 
 
-def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
+def _make_parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
+    """Return the parameter of a number by Mitsuba's name for it."""
     return Parameter(
         key,
         (),
@@ -103,11 +114,11 @@ def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter
     )
 
 
-def _channels(one: parts.PluginNumber) -> list[Parameter]:
-    """A parameter for each number."""
+def _make_channel_parameters(number: parts.PluginNumber) -> list[Parameter]:
+    """Return a parameter for each number."""
     names = (
-        [f"{one.key}.{channel}" for channel in color.CHANNELS]
-        if len(one.values) > 1
-        else [one.key]
+        [f"{number.key}.{channel}" for channel in color.CHANNELS]
+        if len(number.values) > 1
+        else [number.key]
     )
-    return [_parameter(name, one.valid) for name in names]
+    return [_make_parameter(name, number.valid) for name in names]

@@ -31,10 +31,19 @@ class PoseControl(Control):
     of_a_mesh = True
     parameters = (
         *POSE[:3],
-        Parameter("rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
-                  moves_silhouettes=True, estimators=Parameter.GEOMETRIC),
+        Parameter(
+            "rotation",
+            (3,),
+            "degrees",
+            -180.0,
+            180.0,
+            0.0,
+            "Rotation vector on top of the angles.",
+            moves_silhouettes=True,
+            estimators=Parameter.GEOMETRIC,
+        ),
         *POSE[3:],
-    )  # fmt: skip
+    )
     choices = (
         Choice(
             "on_ground",
@@ -45,17 +54,18 @@ class PoseControl(Control):
     )
 
     def check_choices(self) -> None:
-        given = self.chosen["on_ground"]
-        if given not in ("yes", "no", True, False):
+        choice = self.chosen["on_ground"]
+        if choice not in ("yes", "no", True, False):
             raise InputError(
-                f"{self.name}.on_ground: expected yes or no, got {given!r}"
+                f"{self.name}.on_ground: expected yes or no, got {choice!r}"
             )
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the pose of the mesh, scaled and turned about its middle."""
         mesh = self.mesh_in(self.scene)
-        base, vertices, floor = _standing(mesh, self.scene.around.get(mesh.name))
+        base, vertices, floor = _get_base_pose(mesh, self.scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(
@@ -74,16 +84,25 @@ class PoseControl(Control):
 
 
 @lru_cache(maxsize=16)
-def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
-    """Where a mesh stands before it is posed: from its own coordinates (4, 4), its
-    vertices (V, 3) there, their floor. `placed` is a mesh around the object as it came;
-    the object's own coordinates are those of the scene.
+def _get_base_pose(
+    mesh: MeshPart, placed: MeshPart | None
+) -> tuple[Tensor, Tensor, float]:
+    """Return where a mesh stands before it is posed.
+
+    Args:
+        mesh: that is posed.
+        placed: a mesh around the object as it came; None for the object, whose own
+            coordinates are those of the scene.
+
+    Returns:
+        The pose (4, 4) from its own coordinates, its vertices (V, 3) there, and
+            their lowest height.
     """
     if placed is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
-    places = standing(placed)
+    positions = standing(placed)
     return (
         torch.from_numpy(placed.to_world).float(),
-        torch.from_numpy(places).float(),
-        float(places[:, 2].min()),
+        torch.from_numpy(positions).float(),
+        float(positions[:, 2].min()),
     )

@@ -81,18 +81,16 @@ class OneOf:
         return f"one of {', '.join(map(shown, dict.fromkeys(self.values)))}"
 
     def at(self, u: Tensor) -> Number:
-        """Return the value that a coordinate () chooses: each has an equal share of [0,
-        1].
-        """
-        return self.values[
-            min(len(self.values) - 1, max(0, int(float(u.detach()) * len(self.values))))
-        ]
+        """Return the value at a coordinate (): each has an equal part of [0, 1]."""
+        index = int(float(u.detach()) * len(self.values))
+        return self.values[min(len(self.values) - 1, max(0, index))]
 
 
 @dataclass(frozen=True)
 class Range:
-    """Every value from `low` to `high`; as its methods are told, the unit interval runs
-    over their logarithms.
+    """Every value from `low` to `high`.
+
+    As its methods are told, the unit interval runs over their logarithms.
     """
 
     low: float
@@ -122,8 +120,9 @@ class Range:
 
 @dataclass(frozen=True)
 class DrawnRange(Range):
-    """Values from `low` to `high`, the shares `least` to `most` of a distribution: its
-    quantiles, and what it is.
+    """Values from `low` to `high`, the shares `least` to `most` of a distribution.
+
+    Its quantiles, and what it is.
     """
 
     quantiles: Quantiles
@@ -132,45 +131,45 @@ class DrawnRange(Range):
     text: str
 
     def at(self, u: Tensor, *, log: bool = False) -> Tensor:
-        """Return the values at coordinates in [0, 1]; differentiable, by the slope of
-        the quantiles.
+        """Return the values at coordinates in [0, 1].
+
+        Differentiable, by the slope of the quantiles.
         """
         values = self._values(u.detach())
         if u.requires_grad:
-            up = (u.detach() + NEAR).clamp(max=1.0)
-            down = (u.detach() - NEAR).clamp(min=0.0)
-            values = values + (self._values(up) - self._values(down)) / (up - down) * (
-                u - u.detach()
-            )
+            upper = (u.detach() + NEAR).clamp(max=1.0)
+            lower = (u.detach() - NEAR).clamp(min=0.0)
+            slope = (self._values(upper) - self._values(lower)) / (upper - lower)
+            values = values + slope * (u - u.detach())
         return values
 
     def _values(self, u: Tensor) -> Tensor:
-        shares = self.least + (self.most - self.least) * u.double().cpu().numpy()
+        probabilities = self.least + (self.most - self.least) * u.double().cpu().numpy()
         return torch.from_numpy(
-            np.clip(self.quantiles(np.asarray(shares)), self.low, self.high)
+            np.clip(self.quantiles(np.asarray(probabilities)), self.low, self.high)
         ).to(u)
 
     def coordinate(self, value: float, *, log: bool = False) -> float:
         """Return the coordinate of a value, by bisection."""
-        below = 0.0
-        above = 1.0
+        lower = 0.0
+        upper = 1.0
         for _ in range(60):
-            middle = 0.5 * (below + above)
-            share = self.least + (self.most - self.least) * middle
-            below, above = (
-                (middle, above)
-                if float(self.quantiles(np.asarray(share))) < value
-                else (below, middle)
-            )
-        return above if above < 1.0 else below
+            middle = 0.5 * (lower + upper)
+            probability = self.least + (self.most - self.least) * middle
+            if float(self.quantiles(np.asarray(probability))) < value:
+                lower = middle
+            else:
+                upper = middle
+        return upper if upper < 1.0 else lower
 
 
 Spec = Fixed | Range | OneOf
 
 
 def plain(given: object) -> object:
-    """Return numbers and arrays of numpy and torch, also in a list, as Python's, and
-    distributions as settings.
+    """Return numbers and arrays of numpy and torch, also in a list, as Python's.
+
+    Distributions are returned as settings.
     """
     given = as_setting(given)
     if isinstance(given, (list, tuple)):
@@ -183,7 +182,7 @@ def plain(given: object) -> object:
 
 
 def read(where: str, parameter: Parameter, given: object) -> Spec:
-    """Return the setting of a parameter from what was given for it.
+    """Parse what a parameter was set to.
 
     Args:
         where: how messages name it, e.g. "pose.yaw".
@@ -194,80 +193,91 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     Raises:
         InputError: not such a form, or a value outside the parameter's range.
     """
-    if isinstance(given, Mapping) and DISTRIBUTION in given and not parameter.options:
-        return read_drawn(where, parameter, given)
-    if (
-        isinstance(given, Mapping)
-        and set(given) == {"range"}
-        and _is_list(given["range"])
-        and len(given["range"]) == 2
-    ):
-        given = given["range"]
     if isinstance(given, Mapping):
-        if (
-            not {CHOICES} <= set(given) <= {CHOICES, WEIGHTS}
-            or not _is_list(given[CHOICES])
-            or not given[CHOICES]
-        ):
-            raise InputError(
-                f"{where}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
-                f"{{choices: [value, ...], "
-                "weights: [number, ...]}}"
-                + ("" if parameter.options else " or {distribution: NAME, ...}")
-                + f", got {dict(given)!r}"
-            )
-        choice = _choices(
-            where, [_value(where, parameter, value) for value in given[CHOICES]]
-        )
-        return (
-            _weighted(where, choice.values, given[WEIGHTS])
-            if WEIGHTS in given
-            else choice
-        )
+        if DISTRIBUTION in given and not parameter.options:
+            return read_drawn(where, parameter, given)
+        is_range = set(given) == {"range"} and _is_list(given["range"])
+        if not is_range or len(given["range"]) != 2:
+            return _read_choices(where, parameter, given)
+        given = given["range"]
     if not _is_list(given):
-        return Fixed(_value(where, parameter, given))
-    values = [_value(where, parameter, value) for value in given]
+        return Fixed(_check_value(where, parameter, given))
+    values = [_check_value(where, parameter, value) for value in given]
     if values and (parameter.options or len(values) > 2):
-        return _choices(where, values)
+        return _make_choice(where, values)
     if len(values) != 2:
         raise InputError(
             f"{where}: expected a value, [low, high] or a list of values, got {given!r}"
         )
     low, high = (float(value) for value in values)
+    _check_bounds(where, parameter, low, high)
+    return Range(low, high)
+
+
+def _read_choices(
+    label: str, parameter: Parameter, setting: Mapping[str, object]
+) -> OneOf:
+    """Parse {"choices": [...]}, perhaps with "weights"."""
+    values = setting.get(CHOICES)
+    if not set(setting) <= {CHOICES, WEIGHTS} or not _is_list(values) or not values:
+        distribution = "" if parameter.options else " or {distribution: NAME, ...}"
+        raise InputError(
+            f"{label}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
+            f"{{choices: [value, ...], "
+            f"weights: [number, ...]}}{distribution}, got {dict(setting)!r}"
+        )
+    choice = _make_choice(
+        label, [_check_value(label, parameter, value) for value in values]
+    )
+    if WEIGHTS in setting:
+        return _make_weighted_choice(label, choice.values, setting[WEIGHTS])
+    return choice
+
+
+def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> None:
+    """Check the bounds of a range. Raises InputError: they are equal, or reversed."""
     if low == high:
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] has no size; write "
             f"{low:g} to fix the value"
         )
     if low > high:
-        mend = f"write [{high:g}, {low:g}]"
+        remedy = f"write [{high:g}, {low:g}]"
         if parameter.periodic and low - high < TURN:
-            ends = (
-                (low - TURN, high)
-                if low - TURN >= parameter.low
-                else (low, high + TURN)
-            )
-            mend = (
-                f"write [{ends[0]:g}, {ends[1]:g}] for the {TURN - low + high:g} "
-                f"degrees from {low:g} through "
-                f"{0 if ends[0] <= 0 else TURN:g} to {high:g}, or [{high:g}, {low:g}] "
-                f"for the other {low - high:g}"
-            )
-        raise InputError(f"{where}: the range [{low:g}, {high:g}] is reversed; {mend}")
+            remedy = _explain_turn(parameter, low, high)
+        raise InputError(
+            f"{where}: the range [{low:g}, {high:g}] is reversed; {remedy}"
+        )
     if parameter.log and low <= 0.0:
         raise InputError(
             f"{where}: expected a range over 0 (it is searched on a "
             f"logarithmic scale), got {low:g}"
         )
-    return Range(low, high)
 
 
-def _choices(where: str, values: Sequence[Number]) -> OneOf:
+def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
+    """Return both ranges of angles that a reversed one may mean, for a message."""
+    begin = low
+    end = high + TURN
+    if low - TURN >= parameter.low:
+        begin = low - TURN
+        end = high
+    through = 0 if begin <= 0 else TURN
+    return (
+        f"write [{begin:g}, {end:g}] for the {TURN - low + high:g} "
+        f"degrees from {low:g} through "
+        f"{through:g} to {high:g}, or [{high:g}, {low:g}] "
+        f"for the other {low - high:g}"
+    )
+
+
+def _make_choice(where: str, values: Sequence[Number]) -> OneOf:
+    """Return a choice. Raises InputError: a value is there twice."""
     # it would be drawn twice as often
-    twice = [value for value, count in Counter(values).items() if count > 1]
-    if twice:
+    repeated = [value for value, count in Counter(values).items() if count > 1]
+    if repeated:
         raise InputError(
-            f"{where}: expected different choices, got {shown(twice[0])} "
+            f"{where}: expected different choices, got {shown(repeated[0])} "
             "twice; leave one of them out"
         )
     return OneOf(tuple(values))
@@ -276,49 +286,58 @@ def _choices(where: str, values: Sequence[Number]) -> OneOf:
 MOST_SHARES = 1000  # equal shares of probability that weights are rounded to, at most
 
 
-def _weighted(where: str, values: Sequence[Number], weights: object) -> OneOf:
-    """A choice that has each value as often as its weight says, so that equal shares of
-    u draw it so.
+def _make_weighted_choice(
+    where: str, values: Sequence[Number], weights: object
+) -> OneOf:
+    """Return a choice that has each value as often as its weight says.
+
+    So equal fractions of u draw it that often.
     """
-    given = list(weights) if isinstance(weights, (list, tuple)) else []
-    numbers = [
-        weight for weight in given if Parameter.is_number(weight) and weight >= 0.0
+    weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
+    valid_weights = [
+        weight
+        for weight in weight_list
+        if Parameter.is_number(weight) and weight >= 0.0
     ]
-    if not len(numbers) == len(given) == len(values) or not sum(numbers):
+    is_complete = len(valid_weights) == len(weight_list) == len(values)
+    if not is_complete or not sum(valid_weights):
         raise InputError(
             f"{where}: expected a weight of at least 0 for each of {len(values)} "
             "values, and one over 0, got "
             f"{weights!r:.80}"
         )
-    shares = [weight / sum(numbers) for weight in numbers]
-    exact = (
-        n
-        for n in range(1, MOST_SHARES)
-        if all(abs(n * share - round(n * share)) < 1e-9 for share in shares)
-    )
-    count = next(exact, MOST_SHARES)
+    total = sum(valid_weights)
+    probabilities = [weight / total for weight in valid_weights]
+    repeats = _count_repeats(probabilities)
+    repeated = list[Number]()
+    for value, probability, count in zip(values, probabilities, repeats, strict=True):
+        if probability and not count:
+            raise InputError(
+                f"{where}: {shown(value)} has less than a {MOST_SHARES}th "
+                "of the weight; leave it out"
+            )
+        repeated += [value] * count
+    return OneOf(tuple(repeated))
+
+
+def _count_repeats(probabilities: Sequence[float]) -> list[int]:
+    """Return how often each value is repeated so that it has its probability.
+
+    By the smallest exact number of repeats under `MOST_SHARES`, or rounded to that.
+    """
+    total = MOST_SHARES
+    for candidate in range(1, MOST_SHARES):
+        errors = [
+            abs(candidate * probability - round(candidate * probability))
+            for probability in probabilities
+        ]
+        if max(errors) < 1e-9:
+            total = candidate
+            break
     ends = [
-        0,
-        *(round(count * sum(shares[: number + 1])) for number in range(len(shares))),
+        round(total * sum(probabilities[:k])) for k in range(len(probabilities) + 1)
     ]
-    counts = [high - low for low, high in pairwise(ends)]
-    lost = [
-        value
-        for value, number, share in zip(values, counts, shares, strict=True)
-        if share and not number
-    ]
-    if lost:
-        raise InputError(
-            f"{where}: {shown(lost[0])} has less than a {MOST_SHARES}th "
-            "of the weight; leave it out"
-        )
-    return OneOf(
-        tuple(
-            value
-            for value, number in zip(values, counts, strict=True)
-            for _ in range(number)
-        )
-    )
+    return [end - begin for begin, end in pairwise(ends)]
 
 
 def by_distribution(spec: Spec) -> bool:
@@ -328,33 +347,34 @@ def by_distribution(spec: Spec) -> bool:
     )
 
 
-def _is_list(given: object) -> TypeGuard[Sequence[Any]]:
-    return isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
+    return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
-def _value(where: str, parameter: Parameter, given: object) -> Number:
+def _check_value(label: str, parameter: Parameter, value: object) -> Number:
+    """Return a value of a parameter. Raises InputError: it cannot have it."""
     if parameter.options:
-        if not isinstance(given, str):
+        if not isinstance(value, str):
             raise InputError(
-                f"{where}: expected one of "
-                f"{', '.join(parameter.options)}, got {given!r}"
+                f"{label}: expected one of "
+                f"{', '.join(parameter.options)}, got {value!r}"
             )
-        if given not in parameter.options:
-            raise UnknownNameError(where, given, parameter.options)
-        return given
-    if parameter.unit == "name" and isinstance(given, str) and given.strip():
-        return given
-    if isinstance(given, bool) or not isinstance(given, (int, float)):
+        if value not in parameter.options:
+            raise UnknownNameError(label, value, parameter.options)
+        return value
+    if parameter.unit == "name" and isinstance(value, str) and value.strip():
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(
-            f"{where}: expected a number in {parameter.unit}, got {given!r}"
+            f"{label}: expected a number in {parameter.unit}, got {value!r}"
         )
-    if not (Parameter.is_number(given) and parameter.low <= given <= parameter.high):
+    if not (Parameter.is_number(value) and parameter.low <= value <= parameter.high):
         raise InputError(
-            f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} "
+            f"{label}: expected a number from {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}), "
-            f"got {shown(given)}"
+            f"got {shown(value)}"
         )
-    return float(given)
+    return float(value)
 
 
 TURN = 360.0
@@ -362,8 +382,9 @@ CLOSE = 1e-6  # relative difference up to which two values are the same
 
 
 def same(one: Number, other: Number, *, turns: bool = False) -> bool:
-    """Whether two values are the same, up to a rounding error and, of an angle that
-    turns, up to whole turns.
+    """Return whether two values are the same, up to a rounding error.
+
+    Angles that turn are the same up to whole turns.
     """
     if isinstance(one, str) or isinstance(other, str):
         return one == other
@@ -371,15 +392,17 @@ def same(one: Number, other: Number, *, turns: bool = False) -> bool:
 
 
 def apart(one: float, other: float, *, turns: bool = False) -> float:
-    """How far two numbers are from each other; angles that turn, the nearer way
-    around.
+    """Return how far two numbers are from each other.
+
+    Angles that turn, the nearer way around.
     """
     return abs(math.remainder(one - other, TURN) if turns else one - other)
 
 
 def nearest(value: float, low: float, high: float, *, turns: bool = False) -> float:
-    """Return the value in a range that is nearest to one, of an angle that turns the
-    nearest way around.
+    """Return the value in a range that is nearest to a value.
+
+    Of an angle that turns it is the nearest way around.
     """
     if turns:
         value = low + (value - low) % TURN
@@ -389,7 +412,7 @@ def nearest(value: float, low: float, high: float, *, turns: bool = False) -> fl
 
 
 def shown(value: Number) -> str:
-    """A value as it is written."""
+    """Return a value as it is written."""
     if isinstance(value, int) and not Parameter.is_number(value):
         return f"a whole number of {value.bit_length()} bits"
     return value if isinstance(value, str) else f"{value:g}"
@@ -397,8 +420,9 @@ def shown(value: Number) -> str:
 
 @dataclass(frozen=True)
 class Slot:
-    """One parameter in a bound control: as the scene has it, what it is set to, and
-    where its coordinates begin.
+    """One parameter in a bound control.
+
+    As the scene has it, what it is set to, and where its coordinates begin.
     """
 
     parameter: Parameter
@@ -413,13 +437,11 @@ class Slot:
     @property
     def width(self) -> int:
         """Number of coordinates of u."""
-        return (
-            0
-            if isinstance(self.spec, Fixed)
-            else 1
-            if isinstance(self.spec, OneOf)
-            else self.size
-        )
+        if isinstance(self.spec, Fixed):
+            return 0
+        if isinstance(self.spec, OneOf):
+            return 1
+        return self.size
 
     @property
     def turns(self) -> bool:
@@ -437,8 +459,9 @@ class Slot:
         )
 
     def start_value(self) -> Number:
-        """The default, or the nearest value that is allowed; of names, the first one
-        that is allowed.
+        """Return the default, or the nearest value that is allowed.
+
+        Of names, the first one that is allowed.
         """
         spec = self.spec
         default = self.parameter.default
@@ -446,38 +469,43 @@ class Slot:
             return spec.value
         if isinstance(spec, Range):
             return nearest(float(default), spec.low, spec.high, turns=self.turns)
-        if default in spec.values or any(
-            isinstance(value, str) for value in (default, *spec.values)
-        ):
-            return default if default in spec.values else spec.values[0]
+        if default in spec.values:
+            return default
+        if any(isinstance(value, str) for value in (default, *spec.values)):
+            return spec.values[0]
         return min(
             spec.values,
             key=lambda value: apart(float(value), float(default), turns=self.turns),
         )
 
     def start(self) -> list[float]:
-        """Coordinates of that value."""
+        """Return the coordinates of that value."""
         spec = self.spec
         value = self.start_value()
         if isinstance(spec, Range):
             return [spec.coordinate(float(value), log=self.parameter.log)] * self.size
-        return (
-            [(spec.values.index(value) + 0.5) / len(spec.values)]
-            if isinstance(spec, OneOf)
-            else []
-        )
+        if isinstance(spec, OneOf):
+            return [(spec.values.index(value) + 0.5) / len(spec.values)]
+        return []
 
 
 def read_drawn(
     where: str, parameter: Parameter, given: Mapping[str, object]
 ) -> DrawnRange:
-    """Return the spec of a parameter from its distribution, `{distribution: NAME,
-    PARAMETER: NUMBER, ...}`. Raises InputError: there is none of that name, it has
-    other parameters, it was a function from Python, or more of it than `MOST_OUTSIDE`
-    lies outside of the parameter's bounds.
+    """Parse the distribution of a parameter, {distribution: NAME, PARAMETER: NUMBER}.
+
+    Args:
+        where: how messages name the parameter.
+        parameter: whose bounds cut the distribution off.
+        given: the setting.
+
+    Raises:
+        InputError: it has other parameters, it was a function from Python, or more of
+            it than `MOST_OUTSIDE` lies outside of the bounds.
+        UnknownNameError: there is none of that name.
     """
     if isinstance(given, OwnQuantiles):
-        return _own(where, parameter, given)
+        return _read_python_quantiles(where, parameter, given)
     name = given[DISTRIBUTION]
     if name == FROM_PYTHON:
         raise InputError(
@@ -485,7 +513,30 @@ def read_drawn(
             "which only the Python session that "
             "asked has; pass it again in the same call, with `resume=True` to go on"
         )
-    numbers = {key: value for key, value in given.items() if key != DISTRIBUTION}
+    arguments = {key: value for key, value in given.items() if key != DISTRIBUTION}
+    frozen, text = _freeze_distribution(where, name, arguments)
+    with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
+        lower_probability = float(frozen.cdf(parameter.low))
+        upper_probability = float(frozen.cdf(parameter.high))
+        outside = lower_probability + float(frozen.sf(parameter.high))
+        has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
+    if outside > MOST_OUTSIDE:
+        raise InputError(
+            f"{where}: {100.0 * outside:.3g} % of {text} lies outside of "
+            f"{parameter.low:g} to {parameter.high:g} "
+            f"({parameter.unit}), and at most {100.0 * MOST_OUTSIDE:g} % is cut off; "
+            "choose a narrower one, or cut it "
+            "yourself (truncnorm)"
+        )
+    lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL)
+    upper_probability = min(upper_probability, 1.0 if has_end[1] else 1.0 - TAIL)
+    return _make_range(where, frozen.ppf, lower_probability, upper_probability, text)
+
+
+def _freeze_distribution(
+    where: str, name: object, arguments: Mapping[str, Any]
+) -> tuple[Any, str]:
+    """Return a distribution of scipy with its arguments, and how messages write it."""
     # takes a quarter of a second, and few runs draw by a distribution
     from scipy import stats
 
@@ -497,80 +548,77 @@ def read_drawn(
             COMMON,
             "It is one of scipy.stats, of real numbers.",
         )
-    shown = (
-        f"{key}={value:g}" if Parameter.is_number(value) else f"{key}={value!r:.20}"
-        for key, value in numbers.items()
-    )
-    text = f"{name}({', '.join(shown)})"
+    written = []
+    for key, value in arguments.items():
+        is_number = Parameter.is_number(value)
+        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
+    text = f"{name}({', '.join(written)})"
     try:
-        if not all(map(Parameter.is_number, numbers.values())):
+        if not all(map(Parameter.is_number, arguments.values())):
             raise TypeError("expected numbers")
-        frozen = family(**numbers)
-        sound = np.isfinite(frozen.ppf(0.5))
+        frozen = family(**arguments)
+        is_valid = np.isfinite(frozen.ppf(0.5))
     except TypeError:
-        sound = False
-    if not sound:
+        is_valid = False
+    if not is_valid:
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(
             f"{where}: expected {{distribution: {name}}} with numbers for "
             f"{shapes}loc, scale, got {text}"
         )
-    with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
-        least = float(frozen.cdf(parameter.low))
-        most = float(frozen.cdf(parameter.high))
-        outside = least + float(frozen.sf(parameter.high))
-        ends = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
-    if outside > MOST_OUTSIDE:
-        raise InputError(
-            f"{where}: {100.0 * outside:.3g} % of {text} lies outside of "
-            f"{parameter.low:g} to {parameter.high:g} "
-            f"({parameter.unit}), and at most {100.0 * MOST_OUTSIDE:g} % is cut off; "
-            "choose a narrower one, or cut it "
-            "yourself (truncnorm)"
-        )
-    least = max(least, 0.0 if ends[0] else TAIL)
-    most = min(most, 1.0 if ends[1] else 1.0 - TAIL)
-    return _between(where, frozen.ppf, least, most, text)
+    return frozen, text
 
 
-def _own(where: str, parameter: Parameter, given: OwnQuantiles) -> DrawnRange:
-    """The spec of a function from Python."""
-    name = str(given["name"])
+def _read_python_quantiles(
+    label: str, parameter: Parameter, setting: OwnQuantiles
+) -> DrawnRange:
+    """Return the spec of a function from Python, an inverse CDF."""
+    name = str(setting["name"])
 
-    def quantiles(shares: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array(
-            [float(given.function(float(one))) for one in shares.flat]
-        ).reshape(shares.shape)
+    def quantiles(probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
+        values = [float(setting.function(float(p))) for p in probabilities.flat]
+        return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
-        ends = np.isfinite(quantiles(np.array([0.0, 1.0])))
-    shares = np.linspace(
-        0.0 if ends[0] else TAIL, 1.0 if ends[1] else 1.0 - TAIL, CHECKED
-    )
-    values = quantiles(shares)
-    wrong = values[~((values >= parameter.low) & (values <= parameter.high))]
-    if len(wrong):
+        has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
+    lower_probability = 0.0 if has_end[0] else TAIL
+    upper_probability = 1.0 if has_end[1] else 1.0 - TAIL
+    probabilities = np.linspace(lower_probability, upper_probability, CHECKED)
+    values = quantiles(probabilities)
+    is_inside = (values >= parameter.low) & (values <= parameter.high)
+    if not is_inside.all():
         raise InputError(
-            f"{where}: expected values from {parameter.low:g} to {parameter.high:g} "
+            f"{label}: expected values from {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}) of {name}, got "
-            f"{wrong[0]:g}"
+            f"{values[~is_inside][0]:g}"
         )
-    if (np.diff(values) < 0.0).any():
-        place = int((np.diff(values) < 0.0).argmax())
+    falls = np.diff(values) < 0.0
+    if falls.any():
+        index = int(falls.argmax())
         raise InputError(
-            f"{where}: expected an inverse CDF, whose values rise with the share, got "
-            f"{values[place]:g} and then "
-            f"{values[place + 1]:g} of {name}"
+            f"{label}: expected an inverse CDF, whose values rise with the share, got "
+            f"{values[index]:g} and then "
+            f"{values[index + 1]:g} of {name}"
         )
-    return _between(where, quantiles, float(shares[0]), float(shares[-1]), name)
+    return _make_range(
+        label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
+    )
 
 
-def _between(
-    where: str, quantiles: Quantiles, least: float, most: float, text: str
+def _make_range(
+    setting_name: str,
+    quantiles: Quantiles,
+    lower_probability: float,
+    upper_probability: float,
+    label: str,
 ) -> DrawnRange:
-    low, high = (float(one) for one in quantiles(np.array([least, most])))
+    """Return a range between two probabilities of a distribution."""
+    low, high = (
+        float(value)
+        for value in quantiles(np.array([lower_probability, upper_probability]))
+    )
     if not low < high:
         raise InputError(
-            f"{where}: {text} has only the value {low:g}; write that to fix it"
+            f"{setting_name}: {label} has only the value {low:g}; write that to fix it"
         )
-    return DrawnRange(low, high, quantiles, least, most, text)
+    return DrawnRange(low, high, quantiles, lower_probability, upper_probability, label)

@@ -1,12 +1,16 @@
 """The `sensor` control: what a camera's sensor and its processing do to the finished
 picture.
 
-    vignetting light / (1 + a r^2)^2,    r from the middle of the picture, 1 in its corners: cos^4 of the angle there
-    light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
-    noise      light + sqrt(shot^2 light + read^2) n,    n standard normal, one draw for each pixel and channel
-    mosaic     of each pixel one channel is kept, in the pattern RGGB, the others are interpolated between neighbours
-    balance    red and blue times 2^red, 2^blue
-    file       the tone curve, then JPEG
+    vignetting  light / (1 + a r^2)^2, with r from the middle of the image, 1 in its
+                corners: cos^4 of the angle there
+    aberration  the red and the blue image are a little larger or smaller than the green
+                one (lateral)
+    noise       light + sqrt(shot^2 light + read^2) n, with n standard normal, one draw
+                for each pixel and channel
+    mosaic      of each pixel one channel is stored, in the pattern RGGB; the others are
+                interpolated between neighbors
+    balance     red and blue times 2^red, 2^blue
+    file        the tone curve, then JPEG
 
 Noise: Foi, Trimeche, Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise
 modeling and fitting for single-image raw-data, section II. Pattern: Bayer 1976, US
@@ -39,25 +43,81 @@ class SensorControl(Control):
 
     kind = "sensor"
     parameters = (
-        _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing "
-                                                  "in the corners."),
-        _image("aberration", "1", -0.02, 0.02, 0.0,
-               "How much larger the red picture is than the green one; blue smaller.", (-0.005, 0.005)),
-        _image("shot", "1", 0.0, 0.5, 0.0,
-               "Standard deviation of the noise in white that grows with the root of "
-               "light.", (0.0, 0.1)),
-        _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is "
-                                           "there in the dark.", (0.0, 0.02)),
-        _image("mosaic", "1", 0.0, 1.0, 0.0,
-               "Share of the picture that goes through a Bayer mosaic; 1 is a real "
-               "camera.", (0.0, 1.0)),
-        _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much "
-                                               "brighter.", (-0.5, 0.5)),
-        _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much "
-                                                "brighter.", (-0.5, 0.5)),
-        Parameter.number((), "compression", "1", 0.0, 95.0, 0.0,
-                         "0 is no file; above, a JPEG file of quality 100 less this.", (0.0, 60.0)),
-    )  # fmt: skip
+        _image(
+            "vignetting",
+            "1",
+            0.0,
+            0.95,
+            0.0,
+            "Share of the light that is missing in the corners.",
+        ),
+        _image(
+            "aberration",
+            "1",
+            -0.02,
+            0.02,
+            0.0,
+            "How much larger the red picture is than the green one; blue smaller.",
+            (-0.005, 0.005),
+        ),
+        _image(
+            "shot",
+            "1",
+            0.0,
+            0.5,
+            0.0,
+            "Standard deviation of the noise in white that grows with the root of "
+            "light.",
+            (0.0, 0.1),
+        ),
+        _image(
+            "read",
+            "1",
+            0.0,
+            0.2,
+            0.0,
+            "Standard deviation of the noise that is there in the dark.",
+            (0.0, 0.02),
+        ),
+        _image(
+            "mosaic",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Share of the picture that goes through a Bayer mosaic; 1 is a real "
+            "camera.",
+            (0.0, 1.0),
+        ),
+        _image(
+            "red",
+            "stops",
+            -1.0,
+            1.0,
+            0.0,
+            "White balance: red is this much brighter.",
+            (-0.5, 0.5),
+        ),
+        _image(
+            "blue",
+            "stops",
+            -1.0,
+            1.0,
+            0.0,
+            "White balance: blue is this much brighter.",
+            (-0.5, 0.5),
+        ),
+        Parameter.number(
+            (),
+            "compression",
+            "1",
+            0.0,
+            95.0,
+            0.0,
+            "0 is no file; above, a JPEG file of quality 100 less this.",
+            (0.0, 60.0),
+        ),
+    )
     choices = (
         Choice(
             "seed",
@@ -97,34 +157,38 @@ def through_sensor(
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
-    seen = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
+    display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     return (
-        images.coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+        images.coded(display, 100 - compression).clamp(0.0, 1.0)
+        if compression
+        else display
     )
 
 
 def vignette(height: int, width: int, amount: Tensor) -> Tensor:
-    """Return the share of the light (H, W, 1) that comes through a lens, with `amount`
-    () missing in the corners.
+    """Return the fraction of the light (H, W, 1) that comes through a lens.
+
+    `amount` () is missing in the corners.
     """
-    down, across = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
+    down, right = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
     corner = (height**2 + width**2) / 4.0
-    square = (down[:, None] ** 2 + across[None, :] ** 2) / corner
+    square = (down[:, None] ** 2 + right[None, :] ** 2) / corner
     return ((1.0 + ((1.0 - amount) ** -0.5 - 1.0) * square.to(amount)) ** -2)[..., None]
 
 
 def aberrated(image: Tensor, amount: Tensor) -> Tensor:
-    """Return (H, W, 3) whose red is larger by a factor 1 + amount about the middle, and
-    whose blue is smaller.
+    """Return an image (H, W, 3) with lateral chromatic aberration.
+
+    Red is larger by a factor 1 + amount about the middle, blue is smaller.
     """
     height, width = image.shape[:2]
-    down, across = torch.meshgrid(
+    down, right = torch.meshgrid(
         torch.arange(height) + 0.5 - height / 2,
         torch.arange(width) + 0.5 - width / 2,
         indexing="ij",
     )
-    outwards = torch.stack([across, down], dim=-1).to(image)
+    outwards = torch.stack([right, down], dim=-1).to(image)
     red, blue = (
         images.warped(
             image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)
@@ -135,20 +199,21 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
 
 
 def demosaiced(light: Tensor) -> Tensor:
-    """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others
-    from neighbours, bilinearly.
+    """Return an image (H, W, 3) after a Bayer mosaic (RGGB).
+
+    Each pixel keeps one channel, and gets the others from neighbors, bilinearly.
     """
     height, width = light.shape[:2]
     rows = torch.arange(height)[:, None] % 2
     columns = torch.arange(width)[None, :] % 2
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
-    kept = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
+    is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
     kernel = light.new_tensor(
         [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
     ).expand(3, 1, 3, 3)
-    total = F.conv2d(images.planes(light * kept), kernel, padding=1, groups=3)
-    weight = F.conv2d(images.planes(kept), kernel, padding=1, groups=3)
+    total = F.conv2d(images.planes(light * is_measured), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.planes(is_measured), kernel, padding=1, groups=3)
     return torch.where(
-        kept > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
+        is_measured > 0.0, light, images.picture(total / weight.clamp_min(1e-6))
     )

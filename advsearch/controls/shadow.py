@@ -1,9 +1,10 @@
 """The `shadow` control: a dark card between the strongest light and the object, out of
 the camera's sight.
 
-The card is a polygon around a place in the plane across the way to the light:
+The card is a polygon around a center, in the plane at a right angle to the light:
 
-    place = middle of the object + distance towards the light + size (x, y),     corner k = size radius_k at k / n turns
+    center = middle of the object + distance towards the light + size (x, y)
+    corner k = size radius_k at k / n turns
 
 It is a real card: how soft its shadow is follows from the light's size and its own
 distance. Where the camera would see it, it goes farther from the object, up to
@@ -55,40 +56,103 @@ class ShadowControl(Control):
     # none is changed; but it comes after whatever moves the camera
     refines = frozenset(geometry.SURROUNDINGS)
     parameters = (
-        _moving("x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the "
-                                                       "right, seen from the light.",
-                (-0.5, 0.5)),
-        _moving("y", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow upwards.", (-0.5, 0.5)),
-        _moving("size", "object sizes", 0.0, 10.0, 0.0, "Radius of the card; at 0 "
-                                                        "there is none.", (0.0, 0.6)),
-        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.", (0.0, 360.0),
-                periodic=True),
-        Parameter("radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a "
-                                                         "share of the size.",
-                  moves_silhouettes=True, search=(0.2, 1.0)),
-        _moving("azimuth", "degrees", -3600.0, 3600.0, "the strongest light's",
-                "Direction from the object to the card.", periodic=True),
-        _moving("elevation", "degrees", LOW, 90.0, "the strongest light's",
-                "Height of that direction above the ground plane."),
-        _moving("distance", "object sizes", 0.1, 1000.0, 2.0,
-                "From the object's middle to the card; farther where the camera would "
-                "see it.", log=True),
-    )  # fmt: skip
+        _moving(
+            "x",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of the shadow to the right, seen from the light.",
+            (-0.5, 0.5),
+        ),
+        _moving(
+            "y",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of the shadow upwards.",
+            (-0.5, 0.5),
+        ),
+        _moving(
+            "size",
+            "object sizes",
+            0.0,
+            10.0,
+            0.0,
+            "Radius of the card; at 0 there is none.",
+            (0.0, 0.6),
+        ),
+        _moving(
+            "turn",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Turn of the card, counter-clockwise.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
+        Parameter(
+            "radii",
+            (None,),
+            "1",
+            0.05,
+            1.0,
+            1.0,
+            "Radius at each corner, as a share of the size.",
+            moves_silhouettes=True,
+            search=(0.2, 1.0),
+        ),
+        _moving(
+            "azimuth",
+            "degrees",
+            -3600.0,
+            3600.0,
+            "the strongest light's",
+            "Direction from the object to the card.",
+            periodic=True,
+        ),
+        _moving(
+            "elevation",
+            "degrees",
+            LOW,
+            90.0,
+            "the strongest light's",
+            "Height of that direction above the ground plane.",
+        ),
+        _moving(
+            "distance",
+            "object sizes",
+            0.1,
+            1000.0,
+            2.0,
+            "From the object's middle to the card; farther where the camera would "
+            "see it.",
+            log=True,
+        ),
+    )
     choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add the card, out of sight."""
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        away = geometry.put_away(
+        hidden_pose = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
         card = parts.polygon(int(self.chosen["corners"]))
         return scene.with_part(
             parts.MeshPart(
-                self.name, card, texel, assets.Material(roughness=1.0), to_world=away
+                self.name,
+                card,
+                texel,
+                assets.Material(roughness=1.0),
+                to_world=hidden_pose,
             )
         )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter, with the direction of the strongest light as the default."""
         x, y, z = strongest_light(self.scene)[0]
         match parameter.name:
             case "radii":
@@ -104,34 +168,38 @@ class ShadowControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the card's pose and the offsets of its corners."""
         radii = values["radii"]
         rim = torch.from_numpy(parts.polygon(len(radii)).vertices[1:].copy()).to(radii)
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
-        far = self._distance(values, so_far)
-        if far is None:
+        distance = self._find_distance(values, so_far)
+        if distance is None:
             pose = geometry.put_away(geometry.camera_in(self.scene, so_far).to(radii))
         else:
-            right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
-            turn = torch.deg2rad(values["turn"])
-            size = values["size"].clamp_min(SMALLEST)
-            along = torch.cos(turn) * right + torch.sin(turn) * up
-            across = torch.cos(turn) * up - torch.sin(turn) * right
-            place = (
-                torch.from_numpy(geometry.middle(self.scene)).to(right) + far * outwards
-            )
-            place = place + values["x"] * right + values["y"] * up
-            pose = geometry.affine(
-                size * torch.stack([along, -across, -outwards], dim=1), place
-            )
+            pose = self._pose(values, distance)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
+
+    def _pose(self, values: Values, distance: float) -> Tensor:
+        """Return the card's pose (4, 4) at a distance from the object's middle."""
+        right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
+        turn = torch.deg2rad(values["turn"])
+        size = values["size"].clamp_min(SMALLEST)
+        first_axis = torch.cos(turn) * right + torch.sin(turn) * up
+        second_axis = torch.cos(turn) * up - torch.sin(turn) * right
+        middle = torch.from_numpy(geometry.middle(self.scene)).to(right)
+        center = middle + distance * outwards
+        center = center + values["x"] * right + values["y"] * up
+        axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
+        return geometry.affine(size * axes, center)
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        far = self._distance(values, so_far)
+        """Return the distance at which the card really is."""
+        distance = self._find_distance(values, so_far)
         return {
             "true_distance": Value(
-                value=float(0.0 if far is None else far),
+                value=0.0 if distance is None else float(distance),
                 unit="object sizes, 0 where it is put away",
             )
         }
@@ -143,69 +211,89 @@ class ShadowControl(Control):
         )
         return np.stack([-left, up, outwards])
 
-    def _distance(self, values: Values, so_far: Mapping[str, Tensor]) -> float | None:
-        """How far it is, so that a ball around it is not in the picture: outside of the
-        cone around its corners; None where it is put away.
+    def _find_distance(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> float | None:
+        """Find the distance from which the camera does not see the card.
+
+        A ball around the card is outside of the cone around the corners of the image.
+
+        Returns:
+            The distance in object sizes; None where the card is put away.
         """
-        size, asked, x, y = (
-            float(values[name].detach()) for name in ("size", "distance", "x", "y")
-        )
+        size = float(values["size"].detach())
+        requested = float(values["distance"].detach())
         if size < SMALLEST:
             return None
         right, up, outwards = self._axes(values)
-        aside = x * right + y * up
+        offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
         camera = geometry.camera_in(self.scene, so_far).detach().double().cpu().numpy()
+        cone_angle = self._image_cone_angle(so_far)
+        max_distance = BELOW_LAMP * strongest_light(self.scene)[1]
+        for factor in np.geomspace(1.0, FARTHEST, STEPS):
+            distance = min(requested * factor, max_distance)
+            card = geometry.middle(self.scene) + distance * outwards + offset
+            in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
+            if _is_outside_cone(in_camera, size, cone_angle):
+                return float(distance)
+        return None
+
+    def _image_cone_angle(self, so_far: Mapping[str, Tensor]) -> float:
+        """Return the angle of the image's corners from the camera's axis, radians."""
         model = self.scene.camera_model
         aspect = self.scene.aspect
         fov = so_far.get("camera.fov")
-        shift = so_far.get("camera.shift")
         if model is not None:
             widest = 2.0 * math.atan(math.hypot(*model.tangents))
+        elif fov is not None:
+            widest = math.radians(float(fov.detach()))
         else:
-            widest = math.radians(
-                self.scene.number("camera.fov") if fov is None else float(fov.detach())
-            )
-        corner = math.atan(
-            math.tan(min(widest, 3.0) / 2.0)
-            * math.hypot(1.0, min(aspect, 1.0 / aspect))
-        )
-        corner += 0.0 if shift is None else 2.0 * float(shift.detach().abs().max())
-        _, lamp = strongest_light(self.scene)
-        for share in np.geomspace(1.0, FARTHEST, STEPS):
-            far = min(asked * share, BELOW_LAMP * lamp)
-            way = (
-                geometry.middle(self.scene) + far * outwards + aside - camera[:3, 3]
-            ) @ camera[:3, :3]
-            away = float(np.linalg.norm(way))
-            if (
-                away > size
-                and math.acos(min(max(way[2] / away, -1.0), 1.0))
-                - math.asin(size / away)
-                >= corner
-            ):
-                return float(far)
-        return None
+            widest = math.radians(self.scene.number("camera.fov"))
+        half_tangent = math.tan(min(widest, 3.0) / 2.0)
+        corner = math.atan(half_tangent * math.hypot(1.0, min(aspect, 1.0 / aspect)))
+        shift = so_far.get("camera.shift")
+        if shift is not None:
+            corner += 2.0 * float(shift.detach().abs().max())
+        return corner
+
+
+def _is_outside_cone(center: assets.Doubles, radius: float, angle: float) -> bool:
+    """Return whether a ball is outside of a cone about the camera's axis.
+
+    Args:
+        center: (3,) of the ball, in the camera's coordinates.
+        radius: of the ball.
+        angle: of the cone, radians.
+    """
+    distance = float(np.linalg.norm(center))
+    if distance <= radius:
+        return False
+    center_angle = math.acos(min(max(center[2] / distance, -1.0), 1.0))
+    return center_angle - math.asin(radius / distance) >= angle
 
 
 @lru_cache(maxsize=8)
 def strongest_light(scene: SceneDescription) -> tuple[assets.Doubles, float]:
-    """Return the unit way (3,) from the object's middle to what puts most light on a
-    surface that faces it, and how far that is: a lamp, or the brightest place of the
-    environment above the ground, infinitely far.
+    """Find what puts most light on a surface that faces it.
+
+    Returns:
+        The unit direction (3,) from the object's middle to a lamp, or to the brightest
+        part of the environment above the ground; and its distance, infinite for the
+        environment.
     """
-    found = np.array([0.0, 0.0, 1.0])
-    far = math.inf
-    most = 0.0
+    strongest_direction = np.array([0.0, 0.0, 1.0])
+    strongest_distance = math.inf
+    max_irradiance = 0.0
     directions, _, power = scene.list_environment_light()
-    above = directions[:, 2] >= math.sin(math.radians(LOW))
-    if above.any():
-        strength = np.where(above, power.mean(axis=1), 0.0)
-        found = directions[int(strength.argmax())]
-        most = float(strength.max())
+    is_above = directions[:, 2] >= math.sin(math.radians(LOW))
+    if is_above.any():
+        irradiance = np.where(is_above, power.mean(axis=1), 0.0)
+        strongest_direction = directions[int(irradiance.argmax())]
+        max_irradiance = float(irradiance.max())
     for lamp in scene.lamps.values():
-        way, lit = lamp.lighting(geometry.middle(scene))
-        if float(lit.mean()) > most and way[2] > 0.0:
-            far = float(np.linalg.norm(way))
-            found = way / far
-            most = float(lit.mean())
-    return found, far
+        to_lamp, lamp_irradiance = lamp.lighting(geometry.middle(scene))
+        if float(lamp_irradiance.mean()) > max_irradiance and to_lamp[2] > 0.0:
+            strongest_distance = float(np.linalg.norm(to_lamp))
+            strongest_direction = to_lamp / strongest_distance
+            max_irradiance = float(lamp_irradiance.mean())
+    return strongest_direction, strongest_distance

@@ -52,16 +52,18 @@ NEARLY_NOTHING = 1e-12
 
 @cache
 def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the two models interpolate, see `sunsky_tables`; read once per
-    process and device.
+    """Return the tables that the two models interpolate, see `sunsky_tables`.
+
+    They are read once per process and device.
     """
     radiance, level, sun = mitsuba_data.sunsky_tables()
     return radiance.to(device), level.to(device), sun.to(device)
 
 
 def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
-    """Return the unit vector (3,) towards an azimuth and an elevation () in degrees; z
-    is up, azimuth 0 is +x.
+    """Return the unit vector (3,) towards an azimuth and an elevation, () in degrees.
+
+    z is up; azimuth 0 is +x.
     """
     phi = torch.deg2rad(azimuth)
     theta = torch.deg2rad(elevation)
@@ -75,10 +77,12 @@ def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) between whole turbidities by cubics with a
-    continuous derivative. The slope at a whole turbidity is that between its neighbours
-    (Catmull and Rom 1974), one-sided at the ends. The authors interpolate linearly, so
-    that the derivative jumps at whole turbidities, the default of 3 among them.
+    """Interpolate a table (10, ...) between whole turbidities.
+
+    By cubics with a continuous derivative: the slope at a whole turbidity is that
+    between its neighbors (Catmull and Rom 1974), one-sided at the ends. The authors
+    interpolate linearly, so that the derivative jumps at whole turbidities, the default
+    of 3 among them.
     """
     below = min(8, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below
@@ -95,15 +99,16 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 
 
 def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
-    """Return the sun's irradiance (3,) on a surface that faces it, in the unit of the
-    sky's radiance times steradian.
+    """Return the sun's irradiance (3,) on a surface that faces it.
+
+    In the unit of the sky's radiance times steradian.
 
     A piece of the model is a cubic in the elevation above the piece's beginning. A term
     `cos(psi)^j` of the limb's darkening has the mean `2 / (j + 2)` over the disk.
     """
     radians = torch.deg2rad(elevation)
-    share = float(radians.detach()) / (math.pi / 2.0)
-    piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
+    fraction = float(radians.detach()) / (math.pi / 2.0)
+    piece = min(44, int(45.0 * max(0.0, fraction) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
     terms = _at_turbidity(tables(radians.device)[2], turbidity)[piece]
     limb = torch.tensor(
@@ -117,11 +122,13 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1]; its device is
-    the maps'.
+    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1].
+
+    Its device is the maps'.
     """
 
     def __init__(self, ground: Tensor) -> None:
+        """Compute the directions and solid angles of the texels above the horizon."""
         self.ground = ground
         upper = ROWS // 2
         elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
@@ -139,9 +146,15 @@ class Sky:
         self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
 
     def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
-        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon
-        without the sun's disk. The sun is a unit vector (3,) towards it, its elevation
-        () in degrees, over 0, and the turbidity () in `TURBIDITIES`.
+        """Return the radiance of the sky above the horizon, without the sun's disk.
+
+        Args:
+            sun: unit vector (3,) towards the sun.
+            elevation: () of the sun in degrees, over 0.
+            turbidity: () in `TURBIDITIES`.
+
+        Returns:
+            (ROWS / 2, COLUMNS, 3).
         """
         a, b, c, d, e, f, g, i, h = self._interpolated(
             tables(sun.device)[0], elevation, turbidity
@@ -165,8 +178,9 @@ class Sky:
     def _interpolated(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...): quintic Bezier in the elevation's
-        cube root, linear in the others.
+        """Interpolate a table (10, 2, 6, 3, ...).
+
+        Quintic Bezier in the elevation's cube root, linear in the others.
         """
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
         weights = torch.stack(
@@ -179,8 +193,9 @@ class Sky:
         return torch.lerp(curves[0], curves[1], albedo)
 
     def disk(self, sun: Tensor) -> Tensor:
-        """Return the sun's shape (ROWS / 2, COLUMNS, 1): a smooth bump whose integral
-        over solid angle is 1.
+        """Return the sun's shape (ROWS / 2, COLUMNS, 1).
+
+        A smooth bump whose integral over solid angle is 1.
 
         `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that
         an adjoint that samples by radiance sees its whole motion.
@@ -194,9 +209,16 @@ class Sky:
     def __call__(
         self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the map (ROWS, COLUMNS, 3) of linear radiance, and the mean channel ()
-        of the irradiance on a surface that faces the sun, which stands at an azimuth ()
-        and an elevation (), over 0 and at most 90 degrees.
+        """Return the map of a sky, and the irradiance towards its sun.
+
+        Args:
+            azimuth: () of the sun, degrees.
+            elevation: () of the sun, over 0 and at most 90 degrees.
+            turbidity: () in `TURBIDITIES`.
+
+        Returns:
+            Linear radiance (ROWS, COLUMNS, 3); the mean channel () of the
+                irradiance on a surface that faces the sun.
         """
         sun = direction(azimuth, elevation)
         upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(
@@ -210,8 +232,9 @@ class Sky:
 
 
 def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
-    """Return the angle (...) in radians between unit vectors (..., 3) and (3,);
-    differentiable at 0 and 180 degrees.
+    """Return the angle (...) in radians between unit vectors (..., 3) and (3,).
+
+    Differentiable at 0 and 180 degrees.
     """
     half_sine = ((directions - towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
     half_cosine = (
@@ -232,18 +255,45 @@ class SkyControl(Control):
 
     kind = "sky"
     parameters = (
-        _by_differences("azimuth", "degrees", -3600.0, 3600.0, 90.0,
-                        "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
-        _by_differences("elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
-                        (5.0, 85.0)),
-        Parameter.number(Parameter.LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-                         "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
-                         "and moist, 10 hazy.", (2.0, 8.0)),
-    )  # fmt: skip
-    choices = (Choice("exposure", "metered",
-                      "metered (each sky anew, as an automatic camera does) or fixed "
-                      "(at the start).",
-                      options=("metered", "fixed")),)  # fmt: skip
+        _by_differences(
+            "azimuth",
+            "degrees",
+            -3600.0,
+            3600.0,
+            90.0,
+            "Direction of the sun about the vertical; 0 is +x.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
+        _by_differences(
+            "elevation",
+            "degrees",
+            2.0,
+            90.0,
+            45.0,
+            "Height of the sun above the horizon.",
+            (5.0, 85.0),
+        ),
+        Parameter.number(
+            Parameter.LIT,
+            "turbidity",
+            "1",
+            *TURBIDITIES,
+            3.0,
+            "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
+            "and moist, 10 hazy.",
+            (2.0, 8.0),
+        ),
+    )
+    choices = (
+        Choice(
+            "exposure",
+            "metered",
+            "metered (each sky anew, as an automatic camera does) or fixed "
+            "(at the start).",
+            options=("metered", "fixed"),
+        ),
+    )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
@@ -257,9 +307,9 @@ class SkyControl(Control):
         super().fit()
         start = self.values(self.start)
         # the sun's azimuth does not matter
-        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]
+        arguments = torch.tensor(0.0), start["elevation"], start["turbidity"]
         self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(
-            *numbers
+            *arguments
         )[1]
 
     def scene_inputs(
@@ -268,23 +318,25 @@ class SkyControl(Control):
         return {"environment.data": self.radiance(values)}
 
     def radiance(self, values: Values) -> Tensor:
-        """Return the map (H, W, 3) of linear radiance at some values;
-        differentiable.
+        """Return the map (H, W, 3) of linear radiance at some values.
+
+        Differentiable.
         """
-        numbers = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(
-            *numbers
+        arguments = values["azimuth"], values["elevation"], values["turbidity"]
+        radiance, metered = sky_over(self.scene.ground_color, arguments[0].device)(
+            *arguments
         )
-        fixed = self.chosen["exposure"] == "fixed"
+        is_fixed = self.chosen["exposure"] == "fixed"
         return radiance * (
             METERED_IRRADIANCE
-            / (self._metered.to(radiance.device) if fixed else metered)
+            / (self._metered.to(radiance.device) if is_fixed else metered)
         )
 
 
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
-    """Return the sky over a ground of an sRGB colour: far away it is made of the same
-    as the ground plane.
+    """Return the sky over a ground of an sRGB colour.
+
+    Far away it is made of the same as the ground plane.
     """
     return Sky(color.srgb_to_linear(torch.tensor(ground)).to(device))

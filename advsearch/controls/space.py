@@ -26,8 +26,9 @@ VIEWS = 256
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Bound controls in the order of their slices. InputError: two instances have one
-    name.
+    """Bound controls in the order of their slices.
+
+    InputError: two instances have one name.
     """
 
     # at least none; an empty space renders the scene as it is
@@ -58,38 +59,41 @@ class Space:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Every group of coordinates in the order of u, without an estimator yet.
-
-        The material form knows neither a medium nor a backdrop nor a lens nor the edges
-        of cut-outs, nor where a normal of a normal map turns away from the camera, nor
-        meshes that emit light, so that it is not valid beside these.
-        """
-        scene = self.scene
-        unknown = scene is not None and (
-            any(
-                (
-                    scene.backdrop,
-                    scene.thin_lens,
-                    scene.camera_model,
-                    scene.cut_out,
-                    scene.normal_mapped,
-                    scene.emits,
-                )
-            )
-            or any(part.volumetric for part in scene.parts)
-        )
+        """Every group of coordinates in the order of u, without an estimator yet."""
+        lacks_material_form = not self._has_material_form()
         groups = []
         begin = 0
         for control in self.controls:
             for group in control.groups:
-                valid = tuple(
-                    name for name in group.valid if not (unknown and name == "material")
-                )
+                valid = group.valid
+                if lacks_material_form:
+                    valid = tuple(name for name in valid if name != "material")
                 groups.append(
                     replace(group, control=control.name, begin=begin, valid=valid)
                 )
                 begin += group.size
         return tuple(groups)
+
+    def _has_material_form(self) -> bool:
+        """Return whether the material form of derivatives is valid in the scene.
+
+        It knows neither a medium nor a backdrop nor a lens nor the edges of cut-outs, nor
+        where a normal of a normal map turns away from the camera, nor meshes that emit
+        light.
+        """
+        scene = self.scene
+        if scene is None:
+            return True
+        unsupported = (
+            scene.backdrop,
+            scene.thin_lens,
+            scene.camera_model,
+            scene.cut_out,
+            scene.normal_mapped,
+            scene.emits,
+        )
+        has_medium = any(part.volumetric for part in scene.parts)
+        return not (any(unsupported) or has_medium)
 
     @cached_property
     def sizes(self) -> list[int]:
@@ -101,73 +105,71 @@ class Space:
         return list(zip(self.controls, u.split(self.sizes), strict=True))
 
     @cached_property
-    def _turns(self) -> tuple[int, ...]:
-        """The numbers of the controls: those later that refine what others set, and
-        last those that lie on top.
+    def _evaluation_order(self) -> tuple[int, ...]:
+        """Indices of the controls in the order in which they are evaluated.
+
+        Those later that refine what others set, and last those that lie on top.
         """
         kinds = [(bool(control.refines), control.on_top) for control in self.controls]
         return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map u to scene inputs, by differentiable torch operations. Controls that
-        refine what others set come later, and those that lie on top last, whatever the
-        order in which they were asked for. Raises InputError: two controls set one
-        input.
+        """Map u to scene inputs, by differentiable torch operations.
+
+        Controls that refine what others set come later, and those that lie on top last,
+        whatever the order in which they were requested. Raises InputError: two controls set
+        one input.
         """
-        parts = u.split(self.sizes)
+        slices = u.split(self.sizes)
         merged = dict[str, Tensor]()
         set_by = dict[str, str]()
-        for number in self._turns:
-            control = self.controls[number]
-            more = control.inputs(parts[number], merged)
+        for index in self._evaluation_order:
+            control = self.controls[index]
+            new_inputs = control.inputs(slices[index], merged)
             if not is_ours(type(control)):
-                _check_inputs(control.name, more)
-            for name in more:
+                _check_inputs(control.name, new_inputs)
+            for name in new_inputs:
                 if name in merged and name not in control.refines:
-                    both = f"{set_by[name]} and {control.name}"
-                    hint = (
-                        "; one `texture` takes several materials"
-                        if name.endswith(".base_color")
-                        else ""
-                    )
+                    hint = ""
+                    if name.endswith(".base_color"):
+                        hint = "; one `texture` takes several materials"
                     raise InputError(
-                        f"controls: two controls set {name}, {both}; "
-                        f"leave one of them out{hint}"
+                        f"controls: two controls set {name}, {set_by[name]} and "
+                        f"{control.name}; leave one of them out{hint}"
                     )
                 set_by.setdefault(name, control.name)
-            merged = {**merged, **more}
+            merged = {**merged, **new_inputs}
         return merged
 
-    def _among_others(
+    def _with_previous_inputs(
         self, u: Tensor
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
-        """Each control with its slice of u and the inputs of those before it, if it
-        takes any.
+        """Return each control with its slice of u and the inputs of those before it.
+
+        Without these inputs where it takes none.
         """
-        parts = u.detach().split(self.sizes)
+        slices = u.detach().split(self.sizes)
+        order = self._evaluation_order
+        refining = [
+            rank for rank, index in enumerate(order) if self.controls[index].refines
+        ]
+        last_refining = max(refining, default=0)
         so_far = NOTHING
         inputs_before = dict[int, Mapping[str, Tensor]]()
-        last = max(
-            (
-                turn
-                for turn, number in enumerate(self._turns)
-                if self.controls[number].refines
-            ),
-            default=0,
-        )
-        for turn, number in enumerate(self._turns):
-            control = self.controls[number]
-            inputs_before[number] = so_far if control.refines else NOTHING
-            if turn < last:
-                so_far = {**so_far, **control.inputs(parts[number], so_far)}
+        for rank, index in enumerate(order):
+            control = self.controls[index]
+            inputs_before[index] = so_far if control.refines else NOTHING
+            if rank < last_refining:
+                so_far = {**so_far, **control.inputs(slices[index], so_far)}
         return [
-            (control, parts[number], inputs_before[number])
-            for number, control in enumerate(self.controls)
+            (control, slices[index], inputs_before[index])
+            for index, control in enumerate(self.controls)
         ]
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        """Apply what controls do to the finished picture (H, W, 3) sRGB, in their
-        order; differentiable in both.
+        """Apply what controls do to the finished image (H, W, 3) sRGB, in their order.
+
+        Differentiable in both.
         """
         for control, part in zip(self.controls, u.split(self.sizes), strict=True):
             image = control.picture(part, image)
@@ -176,28 +178,34 @@ class Space:
     def describe(
         self, u: Tensor, controls: Sequence[Control] | None = None
     ) -> dict[str, Value]:
-        """Say a configuration in a few named values with units: what some of the
-        controls say of it, or else all.
+        """Describe a configuration by a few named values with units.
+
+        Args:
+            u: (d,) the configuration.
+            controls: whose values are returned; None for all.
         """
-        return {
-            name: value
-            for control, part, so_far in self._among_others(u)
-            if controls is None or control in controls
-            for name, value in control.describe(part, so_far).items()
-        }
+        described = dict[str, Value]()
+        for control, part, so_far in self._with_previous_inputs(u):
+            if controls is None or control in controls:
+                described |= control.describe(part, so_far)
+        return described
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the searched colours that a printer would print, by control; see
-        `Control.printed`.
+        """Return the searched colours that a printer would print, by control.
+
+        See `Control.printed`.
         """
-        printed = (
+        colors_by_control = (
             (control.name, control.printed(part)) for control, part in self.slices(u)
         )
-        return {name: colors for name, colors in printed if colors is not None}
+        return {
+            name: colors for name, colors in colors_by_control if colors is not None
+        }
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the numbers of a configuration by parameter ("pose.yaw"); see
-        `Control.numbers`.
+        """Return the numbers of a configuration by parameter ("pose.yaw").
+
+        See `Control.numbers`.
         """
         return {
             f"{control.name}.{parameter}": value
@@ -207,8 +215,9 @@ class Space:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Seconds that the shutter is open, and that rows are read in, below 0 from the
-        bottom.
+        """Seconds that the shutter is open, and in which rows are read.
+
+        The latter are below 0 where rows are read from the bottom.
         """
         exposures = (control.exposure for control in self.controls)
         return max(
@@ -224,106 +233,122 @@ class Space:
         )
 
     def holding(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay where a configuration u (d,) of as
-        many has them, so that the others vary. Raises InputError: no number of controls
-        has so many coordinates.
+        """Return the space whose first controls stay at a configuration.
+
+        The others vary.
+
+        Args:
+            u: (k,) coordinates of the first controls.
+
+        Raises:
+            InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        count = next(
-            (k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None
-        )
-        if count is None:
+        counts = [k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)]
+        if not counts:
             raise InputError(
                 "controls: expected the coordinates of whole controls, "
                 f"of {sizes} each, got {len(u)}"
             )
-        held = [
-            _Held(control, part)
-            for control, part in zip(
-                self.controls, u.split(sizes[:count]), strict=False
-            )
+        count = counts[0]
+        slices = u.split(sizes[:count])
+        fixed = [
+            _FixedControl(control, part)
+            for control, part in zip(self.controls, slices, strict=False)
         ]
-        chosen = Space(self.controls[:count], self.scene)
-        lit_by = chosen.lit_by(chosen.describe(u)) or self.environment
+        first = Space(self.controls[:count], self.scene)
+        lit_by = first.lit_by(first.describe(u)) or self.environment
         return replace(
-            self, controls=(*held, *self.controls[count:]), environment=lit_by
+            self, controls=(*fixed, *self.controls[count:]), environment=lit_by
         )
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a configuration, by the values that describe it, in the
-        place of the scene's environment; None if nothing does.
+        """Return the environment that lights a configuration in place of the scene's.
+
+        None if none does. `values` are those that describe the configuration.
         """
         for group in self.groups:
             if group.setting == ENVIRONMENT:
-                chosen = str(values[group.name]["value"])
-                return None if chosen == OWN_MAP else chosen
+                name = str(values[group.name]["value"])
+                return None if name == OWN_MAP else name
         return self.environment
 
     def notes(self, scene: SceneDescription) -> tuple[str, ...]:
-        """Return what a user should know of the scene (without one of its own, of
-        `scene`), and of how far the camera goes in it: see `advsearch.scene.grounds`.
+        """Return what a user should know of the scene, and of how far the camera goes.
+
+        See `advsearch.scene.grounds`.
+
+        Args:
+            scene: of a space without a scene of its own.
         """
         scene = self.scene or scene
-        views = list[CameraView]()
-        turns = any(group.setting == "environment.rotation" for group in self.groups)
+        rotates_map = any(
+            group.setting == "environment.rotation" for group in self.groups
+        )
         has_solids = any(part.solids for part in scene.around.values())
+        views = list[CameraView]()
         if has_solids or surroundings_of(scene) is not None:
-            views = [view_of(scene)]
-            for control, start in self.slices(self.start):
-                if not (
-                    control.slots or isinstance(control, _Held)
-                ) or "camera.to_world" not in control.inputs(start):
-                    continue
-                size = len(start)
-                spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
-                # of each coordinate
-                ends = [
-                    torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)
-                ]
-                inputs = [control.inputs(u) for u in torch.cat([spread, *ends])]
-                views = [
-                    view_of(
-                        scene,
-                        seen["camera.to_world"].detach().double().numpy(),
-                        float(seen["camera.fov"]) if "camera.fov" in seen else None,
-                    )
-                    for seen in inputs
-                ]
-                break
+            views = self._sample_camera_views(scene)
         eyes = [place_of(view) for view in views] if has_solids else []
         return (
             *scene.notes,
-            *past(scene, views, turns=turns),
+            *past(scene, views, turns=rotates_map),
             *camera_remarks(scene, eyes),
         )
 
+    def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
+        """Return views of the camera over the box of the control that moves it.
+
+        Without such a control it is the one view of the scene.
+        """
+        for control, start in self.slices(self.start):
+            has_coordinates = bool(control.slots) or isinstance(control, _FixedControl)
+            if has_coordinates and "camera.to_world" in control.inputs(start):
+                return [
+                    _view_of_inputs(scene, control.inputs(u))
+                    for u in _spread_over_box(len(start))
+                ]
+        return [view_of(scene)]
+
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the pictures worth keeping of a configuration, by file stem."""
-        kept = (
-            control.artifacts(part, so_far)
-            for control, part, so_far in self._among_others(u)
-        )
-        return {
-            file_name(name): image
-            for pictures in kept
-            for name, image in pictures.items()
-        }
+        """Return the images worth storing with a configuration, by file stem."""
+        artifacts = dict[str, Tensor]()
+        for control, part, so_far in self._with_previous_inputs(u):
+            for name, image in control.artifacts(part, so_far).items():
+                artifacts[file_name(name)] = image
+        return artifacts
 
     def files(self, u: Tensor) -> dict[str, bytes]:
-        """Return the other files worth keeping of a configuration, by name."""
-        kept = (
-            control.files(part, so_far)
-            for control, part, so_far in self._among_others(u)
-        )
-        return {file_name(name): data for files in kept for name, data in files.items()}
+        """Return the other files worth storing with a configuration, by name."""
+        files = dict[str, bytes]()
+        for control, part, so_far in self._with_previous_inputs(u):
+            for name, content in control.files(part, so_far).items():
+                files[file_name(name)] = content
+        return files
 
 
-class _Held(Control):
+def _spread_over_box(size: int) -> Tensor:
+    """Return points (n, size) spread over the unit box, and both ends of each axis."""
+    spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
+    ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
+    return torch.cat([spread, *ends])
+
+
+def _view_of_inputs(
+    scene: SceneDescription, inputs: Mapping[str, Tensor]
+) -> CameraView:
+    """Return how a scene is looked at by the camera of scene inputs."""
+    to_world = inputs["camera.to_world"].detach().double().numpy()
+    fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else None
+    return view_of(scene, to_world, fov)
+
+
+class _FixedControl(Control):
     """A bound control that stays at one configuration, and takes no coordinates."""
 
-    def __init__(self, control: Control, at: Tensor) -> None:
+    def __init__(self, control: Control, u: Tensor) -> None:
         self._control = control
-        self._at = at
+        self._u = u
         self.name = control.name
         self.moved = control.moved
         self.on_top = control.on_top
@@ -342,30 +367,36 @@ class _Held(Control):
     def inputs(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        return self._control.inputs(self._at, so_far)
+        return self._control.inputs(self._u, so_far)
 
     def later(self, seconds: float) -> Control:
-        return _Held(self._control.later(seconds), self._at)
+        return _FixedControl(self._control.later(seconds), self._u)
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        return self._control.picture(self._at, image)
+        return self._control.picture(self._u, image)
 
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
-        return self._control.describe(self._at, so_far)
+        return self._control.describe(self._u, so_far)
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        return self._control.numbers(self._at)
+        return self._control.numbers(self._u)
 
 
 COLOR = (None, None, 3)
 EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
-    "base_color": (COLOR, 0.0, 1.0), "color": ((3,), 0.0, 1.0), "data": (COLOR, 0.0, math.inf),
-    "to_world": ((4, 4), -math.inf, math.inf), "offsets": ((None, 3), -math.inf, math.inf),
-    "exposure": ((), -math.inf, math.inf), "shift": ((2,), -math.inf, math.inf),
-    **dict.fromkeys(("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)),
-}  # fmt: skip
+    "base_color": (COLOR, 0.0, 1.0),
+    "color": ((3,), 0.0, 1.0),
+    "data": (COLOR, 0.0, math.inf),
+    "to_world": ((4, 4), -math.inf, math.inf),
+    "offsets": ((None, 3), -math.inf, math.inf),
+    "exposure": ((), -math.inf, math.inf),
+    "shift": ((2,), -math.inf, math.inf),
+    **dict.fromkeys(
+        ("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)
+    ),
+}
 """Shape and range of the inputs that a control of another package may set, by the last
 part of their names; None for any number or any shape.
 """
@@ -374,7 +405,11 @@ SLACK = 1e-4  # how far past its range rounding may put a colour
 
 
 def _check_inputs(control: str, inputs: object) -> None:
-    """Refuse what a control of another package sets, where that can't be."""
+    """Check the inputs that a control of another package sets.
+
+    Raises:
+        InputError: they are no tensors by name, or have a wrong shape or range.
+    """
     if not isinstance(inputs, Mapping):
         raise InputError(
             f"`controls` {control}: expected scene inputs by name, got "
@@ -387,39 +422,43 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"`controls` {control}: {name}: expected a tensor of real "
                 f"numbers, got {got}"
             )
-        shape, low, high = EXPECTED.get(
-            name.rpartition(".")[2], (None, -math.inf, math.inf)
-        )
-        if shape is not None and not (
-            value.ndim == len(shape)
-            and all(
-                want in (None, side)
-                for want, side in zip(shape, value.shape, strict=True)
-            )
-        ):
-            wanted = ", ".join("N" if one is None else str(one) for one in shape) + (
-                "," if len(shape) == 1 else ""
-            )
+        anything = (None, -math.inf, math.inf)
+        shape, low, high = EXPECTED.get(name.rpartition(".")[2], anything)
+        if shape is not None and not _has_shape(value, shape):
+            sides = ", ".join("N" if side is None else str(side) for side in shape)
+            if len(shape) == 1:
+                sides += ","
             raise InputError(
                 f"`controls` {control}: {name}: expected shape "
-                f"({wanted}), got {tuple(value.shape)}"
+                f"({sides}), got {tuple(value.shape)}"
             )
-        least, most = (
-            (float(one) for one in value.detach().aminmax())
-            if value.numel()
-            else (low, high)
-        )
-        if not (low - SLACK <= least and most <= high + SLACK):
-            wanted = (
-                f"values from {low:g} to {high:g}" if high < math.inf else "numbers"
-            )
-            hint = (
-                f"; keep it inside, as by .clamp({low:g}, {high:g})"
-                if high < math.inf
-                else ""
-            )
-            raise InputError(
-                f"`controls` {control}: {name}: expected {wanted} (linear, for a "
-                f"colour), got {least:.4g} to {most:.4g}"
-                f"{hint}"
-            )
+        _check_range(f"`controls` {control}: {name}", value, low, high)
+
+
+def _has_shape(value: Tensor, shape: tuple[int | None, ...]) -> bool:
+    """Return whether a tensor has a shape; None stands for any size."""
+    if value.ndim != len(shape):
+        return False
+    return all(
+        expected in (None, size)
+        for expected, size in zip(shape, value.shape, strict=True)
+    )
+
+
+def _check_range(label: str, value: Tensor, low: float, high: float) -> None:
+    """Check that a tensor is in a range. Raises InputError: it is not, or has NaN."""
+    if not value.numel():
+        return
+    smallest, largest = (float(bound) for bound in value.detach().aminmax())
+    if low - SLACK <= smallest and largest <= high + SLACK:
+        return
+    expected = "numbers"
+    hint = ""
+    if high < math.inf:
+        expected = f"values from {low:g} to {high:g}"
+        hint = f"; keep it inside, as by .clamp({low:g}, {high:g})"
+    raise InputError(
+        f"{label}: expected {expected} (linear, for a "
+        f"colour), got {smallest:.4g} to {largest:.4g}"
+        f"{hint}"
+    )

@@ -2,8 +2,10 @@
 ball around the original.
 
     texels     u = texel values, display-referred sRGB in [0, 1];   ||u - original||_p <= epsilon
-    palette    u = k colours in a ball around those of the original;   texel = original + sum_i w_i(texel) (u_i - c_i)
-    waves      u = (a + 1) / 2 per wave and channel;   texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
+    palette    u = k colors in a ball around those of the original
+               texel = original + sum_i w_i(texel) (u_i - c_i)
+    waves      u = (a + 1) / 2 per wave and channel
+               texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
 and reflectance = linear(texel). A bounded change of texture is REVAMP's and Athalye et
 al.'s (2018, arXiv 1707.07397, section 3). L2 is the plain Euclidean norm over all texel
@@ -36,7 +38,7 @@ from advsearch.controls.base import (
 from advsearch.controls.support.images import resampled
 from advsearch.controls.support.norms import DEFAULT_EPSILON, NORMS, radius
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Bools, Floats
+from advsearch.scene.assets import Bools, Doubles, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients import Budget, Group
@@ -66,51 +68,110 @@ class TextureControl(Control):
     kind = "texture"
     of_a_mesh = True
     parameters = (
-        Parameter("texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture",
-                  "Display-referred texel values.", search=(0.0, 1.0), estimators=("adjoint",)),
-        Parameter("palette", (None, 3), "sRGB", 0.0, 1.0, "the texture's own colours",
-                  "Colours that the texture is repainted with (form palette).", search=(0.0, 1.0),
-                  estimators=("adjoint", "differences")),
-        Parameter("amplitudes", (None, None, 3), "1", -1.0, 1.0, 0.0,
-                  "Strength of each wave in each colour channel (form waves).", search=(-1.0, 1.0),
-                  estimators=("adjoint",)),
-    )  # fmt: skip
+        Parameter(
+            "texels",
+            (None, None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "the object's own texture",
+            "Display-referred texel values.",
+            search=(0.0, 1.0),
+            estimators=("adjoint",),
+        ),
+        Parameter(
+            "palette",
+            (None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "the texture's own colours",
+            "Colours that the texture is repainted with (form palette).",
+            search=(0.0, 1.0),
+            estimators=("adjoint", "differences"),
+        ),
+        Parameter(
+            "amplitudes",
+            (None, None, 3),
+            "1",
+            -1.0,
+            1.0,
+            0.0,
+            "Strength of each wave in each colour channel (form waves).",
+            search=(-1.0, 1.0),
+            estimators=("adjoint",),
+        ),
+    )
     choices = (
-        Choice("epsilon", DEFAULT_EPSILON, "Radius of the ball around the original "
-                                           "texture, display-referred.",
-               "epsilon", most=LARGEST_EPSILON),
-        Choice("norm", "linf", "Norm of the ball: linf (per texel value) or l2 "
-                               "(Euclidean, over all texel values).",
-               "norm", options=NORMS),
-        Choice("resolution", None, "Side of the searched texture in texels; by default "
-                                   "the object's own, 256 to 512.",
-               "texture_resolution", whole=(2, 4096)),
-        Choice("form", "texels", "What is searched: texels, palette (a few colours) or "
-                                 "waves (smooth patterns)."),
-        Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
-        Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
-        Choice("materials", None, "Materials of the mesh's file that are painted, by "
-                                  "name; by default all of it."),
-    )  # fmt: skip
+        Choice(
+            "epsilon",
+            DEFAULT_EPSILON,
+            "Radius of the ball around the original texture, display-referred.",
+            "epsilon",
+            most=LARGEST_EPSILON,
+        ),
+        Choice(
+            "norm",
+            "linf",
+            "Norm of the ball: linf (per texel value) or l2 "
+            "(Euclidean, over all texel values).",
+            "norm",
+            options=NORMS,
+        ),
+        Choice(
+            "resolution",
+            None,
+            "Side of the searched texture in texels; by default "
+            "the object's own, 256 to 512.",
+            "texture_resolution",
+            whole=(2, 4096),
+        ),
+        Choice(
+            "form",
+            "texels",
+            "What is searched: texels, palette (a few colours) or "
+            "waves (smooth patterns).",
+        ),
+        Choice(
+            "colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)
+        ),
+        Choice(
+            "waves",
+            8,
+            "Number of waves along each side of the texture.",
+            whole=(1, LARGEST_WAVES),
+        ),
+        Choice(
+            "materials",
+            None,
+            "Materials of the mesh's file that are painted, by "
+            "name; by default all of it.",
+        ),
+    )
 
     def check_choices(self) -> None:
+        """Check the form and the names of materials."""
         self.form = self.chosen_form(FORMS)
         names = self.chosen["materials"]
-        if names is not None:
-            names = [names] if isinstance(names, str) else names
-            if not (
-                isinstance(names, Sequence)
-                and names
-                and all(isinstance(one, str) for one in names)
-            ):
-                raise InputError(
-                    f"{self.name}.materials: expected names of materials, got "
-                    f"{names!r}; put quotes around a "
-                    "name that reads as a number"
-                )
-            self.chosen["materials"] = list(dict.fromkeys(names))
+        if names is None:
+            return
+        if isinstance(names, str):
+            names = [names]
+        is_list_of_names = (
+            isinstance(names, Sequence)
+            and len(names) > 0
+            and all(isinstance(name, str) for name in names)
+        )
+        if not is_list_of_names:
+            raise InputError(
+                f"{self.name}.materials: expected names of materials, got "
+                f"{names!r}; put quotes around a "
+                "name that reads as a number"
+            )
+        self.chosen["materials"] = list(dict.fromkeys(names))
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
+        """Return the mesh that it paints, which a material of the object may name."""
         if self._named_material(scene):
             return scene.meshes[OBJECT]
         try:
@@ -118,16 +179,16 @@ class TextureControl(Control):
         except UnknownNameError:
             materials = scene.object.mesh.materials
             hint = f"It stands in `controls` {self.name}."
-            kind = "mesh of the scene" + (
-                " or material of the object" if materials else ""
-            )
-            raise UnknownNameError(
-                kind, self.mesh, [*scene.meshes, *materials], hint
-            ) from None
+            kind = "mesh of the scene"
+            if materials:
+                kind += " or material of the object"
+            known = [*scene.meshes, *materials]
+            raise UnknownNameError(kind, self.mesh, known, hint) from None
 
     def _named_material(self, scene: SceneDescription) -> list[str]:
-        """The materials of the object that its name means, as in `texture:paint`, where
-        no mesh is called so.
+        """Return the materials of the object that its name means, as in `texture:paint`.
+
+        None where a mesh has that name.
         """
         # takes time, and most do without
         from advsearch.scene.importing.files import clean
@@ -135,7 +196,9 @@ class TextureControl(Control):
         if self.mesh in scene.meshes:
             return []
         return [
-            one for one in scene.object.mesh.materials if self.mesh in (one, clean(one))
+            material
+            for material in scene.object.mesh.materials
+            if self.mesh in (material, clean(material))
         ]
 
     def materials_in(self, scene: SceneDescription) -> list[str] | None:
@@ -143,111 +206,127 @@ class TextureControl(Control):
         return self._named_material(scene) or self.chosen["materials"]
 
     def fit(self) -> None:
+        """Make the painter of the form, and the texels that it paints.
+
+        Raises:
+            InputError, UnknownNameError: materials cannot be painted, or are unknown.
+        """
         part = self.mesh_in(self.scene)
         names = self.materials_in(self.scene)
+        self._original = self._resample_original(part, names)
+        shape = (self._original.shape[0], self._original.shape[1])
+        if names is None:
+            self._painted_mask = None
+            mask = torch.ones(shape, dtype=torch.bool)
+        else:
+            self._painted_mask = torch.from_numpy(self._texels_of(part, names, shape))
+            mask = self._painted_mask
+        self._mesh_name = part.name
+        self._materials = ", ".join(names or ())
+        self._painter = self._make_painter(part, mask)
+        self._unchanged_texels = self._painter.texels(self._painter.start)
+        self.start = self._painter.start
+        self.groups = (self._painter.group,)
+
+    def _resample_original(
+        self, part: MeshPart, materials: Sequence[str] | None
+    ) -> Tensor:
+        """Return the original texture (h, w, 3) sRGB at the resolution of the search."""
         original = torch.from_numpy(part.base_color.copy())
-        longer = max(original.shape[:2])
-        side = self.chosen["resolution"]
-        if side or names is None or longer < RESOLUTIONS[0]:
-            original = resampled(
-                original, int(side or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1]))
-            )
-        shape = original.shape[0], original.shape[1]
-        where = (
-            None
-            if names is None
-            else torch.from_numpy(self._texels_of(part, names, shape))
-        )
-        mask = torch.ones(shape, dtype=torch.bool) if where is None else where
-        texels = original[mask]
+        longer_side = max(original.shape[:2])
+        resolution = self.chosen["resolution"]
+        smallest, largest = RESOLUTIONS
+        if not (resolution or materials is None or longer_side < smallest):
+            return original
+        default = min(max(longer_side, smallest), largest)
+        return resampled(original, int(resolution or default))
+
+    def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
+        """Return what paints the texels of a mask (h, w) bool, in the form chosen."""
+        texels = self._original[mask]
         norm = self.chosen["norm"]
         epsilon = self._given.get("epsilon")
         if self.form == "palette":
-            area = np.where(
-                mask.numpy(), rasterised(part.mesh, shape).areas(), 0.0
-            ).astype(np.float32)
-            weight = area if area.any() else mask.numpy().astype(np.float32)
-            centres = palette(original, weight, int(self.chosen["colors"]))
-            painter = recoloured(
-                texels, centres, Budget(norm, radius(norm, epsilon, centres.numel()))
-            )
-        elif self.form == "waves":
-            flat = radius(norm, epsilon, texels.numel()) / (
-                math.sqrt(texels.numel()) if norm == "l2" else 1.0
-            )
-            painter = waved(texels, mask, int(self.chosen["waves"]), flat)
-        else:  # each texel value on its own
-            budget = Budget(norm, radius(norm, epsilon, texels.numel()))
-            group = Group("texels", texels.numel(), ("adjoint",), budget)
-            painter = Painter(texels.reshape(-1), group, as_texels)
-        self._on, self._original, self._materials, self._where = (
-            part.name,
-            original,
-            ", ".join(names or ()),
-            where,
-        )
-        self._painter, self._unchanged = painter, painter.texels(painter.start)
-        self.start = painter.start
-        self.groups = (painter.group,)
+            weight = _texel_areas(part, mask)
+            centers = palette(self._original, weight, int(self.chosen["colors"]))
+            budget = Budget(norm, radius(norm, epsilon, centers.numel()))
+            return recoloured(texels, centers, budget)
+        if self.form == "waves":
+            reach = radius(norm, epsilon, texels.numel())
+            if norm == "l2":
+                reach = reach / math.sqrt(texels.numel())
+            return waved(texels, mask, int(self.chosen["waves"]), reach)
+        # each texel value on its own
+        budget = Budget(norm, radius(norm, epsilon, texels.numel()))
+        group = Group("texels", texels.numel(), ("adjoint",), budget)
+        return Painter(texels.reshape(-1), group, as_texels)
 
     def _texels_of(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
     ) -> Bools:
-        """Which texels (h, w) only lookups on some materials read."""
+        """Return which texels (h, w) only lookups on some materials read.
+
+        Raises:
+            InputError: the mesh has no materials, or too many of the texels are shared.
+            UnknownNameError: it has no such material.
+        """
         known = part.mesh.materials
-        whose = "the object" if part.name == OBJECT else part.name
+        owner = "the object" if part.name == OBJECT else part.name
         if not known:
             raise InputError(
-                f"{self.name}.materials: {whose} has no materials with "
+                f"{self.name}.materials: {owner} has no materials with "
                 "names; leave materials out"
             )
         for name in names:
             if name not in known:
-                raise UnknownNameError(f"material of {whose}", name, known)
-        where, share = texels_of_faces(
-            part.mesh, np.concatenate([known[name] for name in names]), shape
-        )
-        if share < LEAST_ALONE:
+                raise UnknownNameError(f"material of {owner}", name, known)
+        faces = np.concatenate([known[name] for name in names])
+        mask, fraction = texels_of_faces(part.mesh, faces, shape)
+        if fraction < LEAST_ALONE:
+            shared = f"{100 * (1 - fraction):.0f}"
+            remedy = ""
+            if self.chosen["resolution"]:
+                remedy = "take a higher resolution, "
             raise InputError(
-                f"{self.name}.materials: other materials read {100 * (1 - share):.0f} "
-                "% of the texels of "
+                f"{self.name}.materials: other materials read {shared} % of the texels of "
                 f"{', '.join(names)} too, so that it cannot be painted alone; give "
                 "each material texels of its own in "
-                f"the file, {'take a higher resolution, ' if self.chosen['resolution'] else ''}or leave materials out"
+                f"the file, {remedy}or leave materials out"
             )
-        return where
+        return mask
 
     def inputs(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Tensor]:
-        return {f"{self._on}.base_color": srgb_to_linear(self._texels(u))}
+        return {f"{self._mesh_name}.base_color": srgb_to_linear(self._texels(u))}
 
     def _texels(self, u: Tensor) -> Tensor:
-        """All texels (h, w, 3) of a slice of u."""
+        """Return all texels (h, w, 3) of a slice of u."""
         painted = self._painter.texels(u)
         original = self._original.to(u.device)
-        if self._where is None:
+        if self._painted_mask is None:
             return painted.reshape(original.shape)
-        return original.index_put(
-            self._where.to(u.device).nonzero(as_tuple=True), painted
-        )
+        indices = self._painted_mask.to(u.device).nonzero(as_tuple=True)
+        return original.index_put(indices, painted)
 
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
-        named: dict[str, Value] = {
-            f"{self.name}.materials": {"value": self._materials, "unit": "name"}
-        }
-        return (named if self._materials else {}) | changed(self.name, change)
+        """Return how much the texels change, and which materials are painted."""
+        change = self._painter.texels(u.detach()) - self._unchanged_texels.to(u.device)
+        described: dict[str, Value] = {}
+        if self._materials:
+            described[f"{self.name}.materials"] = {
+                "value": self._materials,
+                "unit": "name",
+            }
+        return described | changed(self.name, change)
 
     def printed(self, u: Tensor) -> Tensor | None:
         texels = self._texels(u)
-        return (
-            texels
-            if self._where is None
-            else torch.cat([texels, self._where.to(texels)[..., None]], dim=-1)
-        )
+        if self._painted_mask is None:
+            return texels
+        return torch.cat([texels, self._painted_mask.to(texels)[..., None]], dim=-1)
 
     def artifacts(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
@@ -259,8 +338,9 @@ class TextureControl(Control):
 
 
 class Painter(NamedTuple):
-    """One form of the control: a map from its slice of u to the n texels that it
-    paints, row by row.
+    """One form of the control.
+
+    A map from its slice of u to the n texels that it paints, row by row.
     """
 
     start: Tensor  # (d,) float32, the slice that gives the original
@@ -270,32 +350,42 @@ class Painter(NamedTuple):
     texels: Callable[[Tensor], Tensor]
 
 
+def _texel_areas(part: MeshPart, mask: Tensor) -> Floats:
+    """Return the area (h, w) that each texel of a mask covers on the surface.
+
+    Without any area, each texel of the mask counts 1.
+    """
+    is_painted = mask.numpy()
+    charts = rasterised(part.mesh, (mask.shape[0], mask.shape[1]))
+    areas = np.where(is_painted, charts.areas(), 0.0).astype(np.float32)
+    return areas if areas.any() else is_painted.astype(np.float32)
+
+
 def as_texels(u: Tensor) -> Tensor:
     """Return the texels (n, 3) that coordinates (3 n,) are."""
     return u.reshape(-1, 3)
 
 
 def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
-    """Return a few colours, from which each texel of the original (n, 3) sRGB takes its
-    change by how much it resembles them: within a ball around the original's palette,
-    the centres (k, 3).
+    """Return a painter that changes a few colors, and all texels that resemble them.
+
+    Args:
+        original: (n, 3) sRGB, the texels.
+        centres: (k, 3) sRGB, the original's palette.
+        budget: the ball around the palette.
     """
     squared = (original[..., None, :] - centres).square().sum(dim=-1)
-    # over which a colour's influence falls off: half the mean distance to the nearest
-    # other one
+    # over which a color's influence falls off: half the mean distance to the nearest
+    # other color
     spread = 1.0
     if len(centres) > 1:
-        apart = torch.cdist(centres, centres) + torch.diag(
-            torch.full((len(centres),), 10.0)
-        )
-        spread = max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
+        no_self = torch.diag(torch.full((len(centres),), 10.0))
+        distances = torch.cdist(centres, centres) + no_self
+        spread = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
     weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
+    group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
     texels = partial(_paint_palette, original, weights, centres)
-    return Painter(
-        centres.reshape(-1),
-        Group("palette", centres.numel(), ("adjoint", "differences"), budget),
-        texels,
-    )
+    return Painter(centres.reshape(-1), group, texels)
 
 
 def _paint_palette(
@@ -306,8 +396,9 @@ def _paint_palette(
 
 
 def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter:
-    """Return cosine waves along both sides of the texture, added up and held inside a
-    radius by a tanh.
+    """Return a painter of cosine waves along both sides of the texture.
+
+    Their sum is held inside a radius by a tanh.
 
     Args:
         original: (n, 3) sRGB.
@@ -317,17 +408,15 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
             the wave's frequency).
         radius: largest change of a texel value.
     """
-    number = torch.arange(count)
-    down, across = (
-        torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * number / side)
+    index = torch.arange(count)
+    down, right = (
+        torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * index / side)
         for side in where.shape
     )
-    reach = (
-        WAVE_REACH
-        / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float()))
-    )[..., None]
+    frequency = torch.hypot(index[:, None].float(), index[None, :].float())
+    reach = (WAVE_REACH / (1.0 + frequency))[..., None]
     start = torch.full((count * count * 3,), 0.5)
-    texels = partial(_paint_waves, original, where, radius, (down, across, reach))
+    texels = partial(_paint_waves, original, where, radius, (down, right, reach))
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
 
 
@@ -338,59 +427,72 @@ def _paint_waves(
     waves: tuple[Tensor, Tensor, Tensor],
     u: Tensor,
 ) -> Tensor:
-    down, across, reach = (part.to(u.device) for part in waves)
+    """Return the texels (n, 3) with the waves of a slice u; see `waved`."""
+    down, right, reach = (wave.to(u.device) for wave in waves)
     amplitudes = (2.0 * u - 1.0).reshape(*reach.shape[:2], 3) * reach
-    summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)[
-        where.to(u.device)
-    ]
-    return (original.to(u.device) + radius * torch.tanh(summed)).clamp(0.0, 1.0)
+    summed = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
+    change = radius * torch.tanh(summed[where.to(u.device)])
+    return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
 def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
-    """Return the colours of an image by weighted k-means, heaviest first; fewer if it
-    has fewer.
+    """Return the colors of an image by weighted k-means, heaviest first.
 
-    Lloyd's algorithm on the image's 5-bit colours from a start without chance: the
-    heaviest colour, then each time the one with the largest weight times squared
+    Lloyd's algorithm on the image's 5-bit colors from a start without chance: the
+    heaviest color, then each time the one with the largest weight times squared
     distance from those chosen (k-means++ of Arthur and Vassilvitskii 2007 with its draw
     replaced by the most likely outcome).
 
     Args:
         image: (h, w, 3) sRGB in [0, 1].
         weight: (h, w) how much each texel counts, e.g. its area on the surface.
-        count: number of colours, at least 1.
+        count: number of colors, at least 1.
+
+    Returns:
+        (k, 3) float32 with k <= count: fewer if the image has fewer colors.
+    """
+    points, mass = _quantise_colors(image, weight)
+    centers = points[_choose_first_centers(points, mass, count)]
+    for _ in range(LLOYD_STEPS):
+        nearest = ((points[:, None] - centers) ** 2).sum(axis=-1).argmin(axis=1)
+        center_mass = np.bincount(nearest, weights=mass, minlength=len(centers))
+        sums = [
+            np.bincount(nearest, mass * points[:, channel], len(centers))
+            for channel in range(3)
+        ]
+        means = np.stack(sums, axis=1) / np.maximum(center_mass[:, None], 1e-12)
+        centers = np.where(center_mass[:, None] > 0.0, means, centers)
+    order = np.argsort(-center_mass, kind="stable")
+    return torch.from_numpy(centers[order].clip(0.0, 1.0).astype(np.float32))
+
+
+def _quantise_colors(image: Tensor, weight: Floats) -> tuple[Doubles, Doubles]:
+    """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass (N,).
+
+    The mass is the root of the summed weight, or else the shades of the largest surface
+    take all centers.
     """
     colors = image.reshape(-1, 3).double().numpy()
     weights = weight.reshape(-1).astype(np.float64)
-    keys, index = np.unique(
-        (colors * 31.0).round().astype(np.int64), axis=0, return_inverse=True
-    )
-    mass = np.bincount(index.reshape(-1), weights=weights, minlength=len(keys))
+    levels = (colors * 31.0).round().astype(np.int64)
+    cells, cell_of = np.unique(levels, axis=0, return_inverse=True)
+    cell_of = cell_of.reshape(-1)
+    total = np.bincount(cell_of, weights=weights, minlength=len(cells))
     sums = [
-        np.bincount(
-            index.reshape(-1), weights=weights * colors[:, c], minlength=len(keys)
-        )
-        for c in range(3)
+        np.bincount(cell_of, weights=weights * colors[:, channel], minlength=len(cells))
+        for channel in range(3)
     ]
-    points = np.stack(sums, axis=1)[mass > 0.0] / mass[mass > 0.0, None]
-    # or else the shades of the largest surface take all centres
-    mass = np.sqrt(mass[mass > 0.0])
+    has_weight = total > 0.0
+    points = np.stack(sums, axis=1)[has_weight] / total[has_weight, None]
+    return points, np.sqrt(total[has_weight])
+
+
+def _choose_first_centers(points: Doubles, mass: Doubles, count: int) -> list[int]:
+    """Choose the indices of up to `count` points (N, 3) that k-means starts from."""
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):
         squared = ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)
         if not squared.max() > 0.0:
             break
         chosen.append(int((mass * squared).argmax()))
-    centres = points[chosen]
-    for _ in range(LLOYD_STEPS):
-        nearest = ((points[:, None] - centres) ** 2).sum(axis=-1).argmin(axis=1)
-        share = np.bincount(nearest, weights=mass, minlength=len(centres))
-        means = np.stack(
-            [np.bincount(nearest, mass * points[:, c], len(centres)) for c in range(3)],
-            axis=1,
-        )
-        centres = np.where(
-            share[:, None] > 0.0, means / np.maximum(share[:, None], 1e-12), centres
-        )
-    order = np.argsort(-share, kind="stable")
-    return torch.from_numpy(centres[order].clip(0.0, 1.0).astype(np.float32))
+    return chosen

@@ -13,10 +13,9 @@ of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -54,7 +53,7 @@ _moving = partial(Parameter.moving, Parameter.ORBIT)
 class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
-    place: assets.Doubles  # (2,) of its middle
+    position: assets.Doubles  # (2,) of its center
     height: float  # of the ground there
     pushed: float  # how far it was moved away from the object
 
@@ -66,49 +65,85 @@ class ThingsControl(Control):
 
     kind = "things"
     parameters = (
-        _moving("x", "metres", -1000.0, 1000.0, 0.0, "Forwards from where it was put.", (-2.0, 2.0)),
-        _moving("y", "metres", -1000.0, 1000.0, 0.0, "To the left of where it was put.", (-2.0, 2.0)),
-        _moving("heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, "
-                                                            "counter-clockwise.",
-                (-180.0, 180.0), periodic=True),
-        Parameter.named("presence", ("there", "away"), "there", "Whether it is there.", estimators=("differences",),
-                        moves_silhouettes=True),
-    )  # fmt: skip
+        _moving(
+            "x",
+            "metres",
+            -1000.0,
+            1000.0,
+            0.0,
+            "Forwards from where it was put.",
+            (-2.0, 2.0),
+        ),
+        _moving(
+            "y",
+            "metres",
+            -1000.0,
+            1000.0,
+            0.0,
+            "To the left of where it was put.",
+            (-2.0, 2.0),
+        ),
+        _moving(
+            "heading",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Turn from how it was put, counter-clockwise.",
+            (-180.0, 180.0),
+            periodic=True,
+        ),
+        Parameter.named(
+            "presence",
+            ("there", "away"),
+            "there",
+            "Whether it is there.",
+            estimators=("differences",),
+            moves_silhouettes=True,
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters for all things, and those that are set for one, such as
-        `person.x`.
-        """
-        names = {one.name: one for one in cls.parameters}
-        split = [(one, one.rpartition(".")[2]) for one in settings if "." in one]
-        return (
-            *cls.parameters,
-            *(replace(names[last], name=one) for one, last in split if last in names),
-        )
+        """Return the parameters for all things, and those set for one (`person.x`)."""
+        parameter_by_name = {parameter.name: parameter for parameter in cls.parameters}
+        single = []
+        for setting in settings:
+            _, dot, short_name = setting.rpartition(".")
+            if dot and short_name in parameter_by_name:
+                single.append(replace(parameter_by_name[short_name], name=setting))
+        return (*cls.parameters, *single)
 
     def fit(self) -> None:
+        """Find which things this control moves, and check that they stand free.
+
+        Raises:
+            InputError: nothing stands beside the object, or a thing stands in another.
+            UnknownNameError: a parameter is about a thing that the scene has not.
+        """
         things = self.scene.things
         if not things:
             raise InputError(
                 f"`controls` {self.name}: nothing stands beside the "
                 "object; add `things`, such as car@6,3"
             )
-        for name in (one.rpartition(".")[0] for one in self.specs):
-            if name and name not in things:
+        for parameter_name in self.specs:
+            thing = parameter_name.rpartition(".")[0]
+            if thing and thing not in things:
                 raise errors.UnknownNameError(
-                    f"`controls` {self.name}: thing beside the object", name, things
+                    f"`controls` {self.name}: thing beside the object", thing, things
                 )
         super().fit()
-        asked = set()
+        moved = set()
         for slot in self.slots:
-            thing, _, short = slot.parameter.name.rpartition(".")
-            if slot.width or slot.parameter.name in self.specs or short in self.specs:
-                asked.add(thing)
+            thing, _, short_name = slot.parameter.name.rpartition(".")
+            is_set = slot.parameter.name in self.specs or short_name in self.specs
+            if slot.width or is_set:
+                moved.add(thing)
         # the others stay, or another control moves them
-        self._moved = tuple(name for name in things if name in asked)
-        as_put = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
-        for name, stand in self._stands(as_put, {}).items():
+        self._moved_things = tuple(name for name in things if name in moved)
+        unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
+        for name, stand in self._compute_stands(unmoved, {}).items():
             if stand.pushed:
                 raise InputError(
                     f"`controls` {self.name}: {name} stands in something "
@@ -116,130 +151,197 @@ class ThingsControl(Control):
                 )
 
     def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
-        for thing, parameter in product(
-            self.scene.things, map(self.in_scene, self.parameters)
-        ):
-            asked = f"{thing}.{parameter.name}"
-            yield (
-                replace(parameter, name=asked),
-                self.specs.get(asked, self.spec(parameter)),
-            )
+        """Yield the parameters of each thing, which those for all things apply to."""
+        for thing in self.scene.things:
+            for parameter in map(self.in_scene, self.parameters):
+                name = f"{thing}.{parameter.name}"
+                spec = self.specs.get(name, self.spec(parameter))
+                yield replace(parameter, name=name), spec
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter, with a range of positions that is not larger than a table."""
+        if parameter.name not in ("x", "y"):
+            return parameter
         # beside a small thing, two metres are off its table
         reach = min(2.0, self.scene.metres)
-        return (
-            replace(parameter, search=(-reach, reach))
-            if parameter.name in ("x", "y")
-            else parameter
-        )
+        return replace(parameter, search=(-reach, reach))
 
     @property
     def refines(self) -> frozenset[str]:
-        """None is changed; but it comes after whatever moves what things may not stand
-        in.
+        """Inputs that this control reads and does not change.
+
+        So it comes after whatever moves what things may not stand in.
         """
-        stay = [name for name in self.scene.things if name not in self._moved]
-        poses = [f"{name}.to_world" for name in ("object", "camera", *stay)]
-        return frozenset(
-            [*poses, *(f"{name}.offsets" for name in ("object", *self.scene.things))]
-        )
+        fixed = [name for name in self.scene.things if name not in self._moved_things]
+        poses = [f"{name}.to_world" for name in ("object", "camera", *fixed)]
+        offsets = [f"{name}.offsets" for name in ("object", *self.scene.things)]
+        return frozenset([*poses, *offsets])
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the pose of each thing that this control moves."""
         inputs = {}
-        for name, stand in self._stands(values, so_far).items():
+        for name, stand in self._compute_stands(values, so_far).items():
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_foot(part)).to(base)
             turn = geometry.euler(values[f"{name}.heading"], *base.new_zeros(2))
-            if values[f"{name}.presence"]:
+            is_absent = values[f"{name}.presence"]
+            if is_absent:
                 turn = AWAY * turn
-            place = base.new_tensor([*stand.place, stand.height])
-            sunk = (
-                base.new_tensor([0.0, 0.0, SUNK / self.scene.metres])
-                * values[f"{name}.presence"]
-            )
-            inputs[f"{name}.to_world"] = (
-                geometry.affine(turn, place - sunk - turn @ foot) @ base
-            )
+            position = base.new_tensor([*stand.position, stand.height])
+            sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * is_absent
+            translation = position - sunk - turn @ foot
+            inputs[f"{name}.to_world"] = geometry.affine(turn, translation) @ base
         return inputs
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Where each thing stands in the end, as `with` says places."""
-        return {
-            f"{name}.at_{axis}": Value(value=float(coordinate), unit="metres")
-            for name, stand in self._stands(values, so_far).items()
-            for axis, coordinate in zip(
-                "xy",
-                (stand.place - geometry.middle(self.scene)[:2]) * self.scene.metres,
-                strict=True,
-            )
-        }
+        """Return where each thing stands in the end, as the setting `things` has it."""
+        origin = geometry.middle(self.scene)[:2]
+        measurements = {}
+        for name, stand in self._compute_stands(values, so_far).items():
+            x, y = (stand.position - origin) * self.scene.metres
+            measurements[f"{name}.at_x"] = Value(value=float(x), unit="metres")
+            measurements[f"{name}.at_y"] = Value(value=float(y), unit="metres")
+        return measurements
 
-    def _stands(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Stand]:
-        """Where the things that move stand, by name; without derivatives."""
+    def _compute_stands(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Stand]:
+        """Compute where the things that move stand, by name; without derivatives."""
         scene = self.scene
-        metres = self.scene.metres
-        thing = _footprint(scene, "object", so_far)
-        eye = geometry.camera_in(scene, so_far)[:3, 3].detach().double().cpu().numpy()
-        middle_of = (thing.outline.min(axis=0) + thing.outline.max(axis=0)) / 2.0
-        free = min(CAMERA / metres, NEAR * float(np.linalg.norm(eye[:2] - middle_of)))
-        around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
-        others = [thing, parts.Footprint(around, eye[2], eye[2] + free)]
-        others += [
-            _footprint(scene, name, so_far)
-            for name in scene.things
-            if name not in self._moved
-        ]
+        obstacles = self._list_obstacles(so_far)
+        object_outline = obstacles[0].outline
+        object_center = (object_outline.min(axis=0) + object_outline.max(axis=0)) / 2.0
         solids = [solid for part in scene.around.values() for solid in part.solids]
         stands = {}
-        for name in self._moved:
-            x, y, heading, away = (
-                float(values[f"{name}.{one.name}"].detach()) for one in self.parameters
-            )
-            foot = _foot(scene.meshes[name])
+        for name in self._moved_things:
             base = _footprint(scene, name, so_far)
-            angle = np.radians(heading)
-            turn = np.array(
-                [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+            stand, outline = self._find_stand(
+                name, values, base, object_center, obstacles, solids
             )
-            asked = foot[:2] + np.array([x, y]) / metres
-            outline = (base.outline - foot[:2]) @ turn.T
-            lift = foot[2] - scene.ground_height(foot[:2])
-            here = parts.Footprint(outline + asked, base.low, base.high)
-            way = asked - middle_of
-            way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
-            pushed = 0.0
-            in_solids = (
-                []
-                if away
-                else [geometry.blocked(here, solid.footprint, way) for solid in solids]
-            )
-            if any(begin < 0.0 < end for begin, end in in_solids):
-                pushed = (
-                    min(begin for begin, end in in_solids if begin < 0.0 < end)
-                    - GAP / metres
-                )
-            in_others = (
-                [] if away else [geometry.blocked(here, other, way) for other in others]
-            )
-            for begin, end in sorted(in_others + in_solids):
-                if begin < pushed < end:
-                    pushed = end + GAP / metres
-            place = asked + pushed * way
-            stands[name] = Stand(place, lift + scene.ground_height(place), pushed)
-            if not away:
-                others.append(parts.Footprint(outline + place, base.low, base.high))
+            stands[name] = stand
+            if not values[f"{name}.presence"]:
+                obstacles.append(parts.Footprint(outline, base.low, base.high))
         return stands
+
+    def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
+        """List what a thing may not stand in: the object first, the camera, other things.
+
+        Things that move are not among them yet.
+        """
+        scene = self.scene
+        tested = _footprint(scene, "object", so_far)
+        object_center = (tested.outline.min(axis=0) + tested.outline.max(axis=0)) / 2.0
+        camera = geometry.camera_in(scene, so_far)
+        eye = camera[:3, 3].detach().double().cpu().numpy()
+        object_distance = float(np.linalg.norm(eye[:2] - object_center))
+        clearance = min(CAMERA / scene.metres, NEAR * object_distance)
+        circle = np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
+        around_camera = parts.Footprint(
+            eye[:2] + clearance * circle, eye[2], eye[2] + clearance
+        )
+        fixed_things = [name for name in scene.things if name not in self._moved_things]
+        return [
+            tested,
+            around_camera,
+            *(_footprint(scene, name, so_far) for name in fixed_things),
+        ]
+
+    def _find_stand(
+        self,
+        name: str,
+        values: Values,
+        base: parts.Footprint,
+        object_center: assets.Doubles,
+        obstacles: Sequence[parts.Footprint],
+        solids: Sequence[parts.Solid],
+    ) -> tuple[Stand, assets.Doubles]:
+        """Find the free position of one thing, and its outline (K, 2) there.
+
+        Args:
+            name: of the thing.
+            values: of the control.
+            base: what the thing takes up before it is moved.
+            object_center: (2,) that it is pushed away from.
+            obstacles: which it may not stand in; it goes away from the object.
+            solids: of the place, which it goes towards the object for.
+        """
+        scene = self.scene
+        x, y, heading, is_absent = (
+            float(values[f"{name}.{parameter.name}"].detach())
+            for parameter in self.parameters
+        )
+        foot = _foot(scene.meshes[name])
+        requested = foot[:2] + np.array([x, y]) / scene.metres
+        outline = _rotate_outline(base.outline - foot[:2], heading)
+        direction = _unit_direction(requested - object_center)
+        pushed = 0.0
+        if not is_absent:
+            footprint = parts.Footprint(outline + requested, base.low, base.high)
+            gap = GAP / scene.metres
+            pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
+        position = requested + pushed * direction
+        height_above_ground = foot[2] - scene.ground_height(foot[:2])
+        height = height_above_ground + scene.ground_height(position)
+        return Stand(position, height, pushed), outline + position
+
+
+def _rotate_outline(outline: assets.Doubles, degrees: float) -> assets.Doubles:
+    """Turn corners (K, 2) about the origin, counter-clockwise."""
+    angle = np.radians(degrees)
+    rotation = np.array(
+        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    )
+    return np.asarray(outline @ rotation.T)
+
+
+def _unit_direction(vector: assets.Doubles) -> assets.Doubles:
+    """Return the direction (2,) of a vector; +x for one of length 0."""
+    if not vector.any():
+        return np.array([1.0, 0.0])
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _find_free_shift(
+    footprint: parts.Footprint,
+    direction: assets.Doubles,
+    obstacles: Sequence[parts.Footprint],
+    solids: Sequence[parts.Solid],
+    gap: float,
+) -> float:
+    """Find how far something is shifted along a direction so that it stands free.
+
+    Args:
+        footprint: what it takes up where it was put.
+        direction: (2,) unit vector away from the object.
+        obstacles: which it goes forwards for, along the direction.
+        solids: which it first goes backwards for, where it stands in one.
+        gap: that stays free.
+    """
+    in_solids = [
+        geometry.blocked(footprint, solid.footprint, direction) for solid in solids
+    ]
+    in_obstacles = [
+        geometry.blocked(footprint, obstacle, direction) for obstacle in obstacles
+    ]
+    shift = 0.0
+    solid_begins = [begin for begin, end in in_solids if begin < 0.0 < end]
+    if solid_begins:
+        shift = min(solid_begins) - gap
+    for begin, end in sorted(in_obstacles + in_solids):
+        if begin < shift < end:
+            shift = end + gap
+    return shift
 
 
 def _foot(part: parts.MeshPart) -> assets.Doubles:
-    """Where a thing is put and turned about, (3,): the middle of its box, at the height
-    of its lowest point.
+    """Return the point (3,) that a thing is put at and turned about.
+
+    It is the center of its box, at the height of its lowest point.
     """
     low = part.mesh.vertices.min(axis=0)
     high = part.mesh.vertices.max(axis=0)
@@ -250,18 +352,21 @@ def _foot(part: parts.MeshPart) -> assets.Doubles:
 def _footprint(
     scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]
 ) -> parts.Footprint:
-    """What a mesh takes up where the controls before have it."""
+    """Return what a mesh takes up where the controls before have put it."""
     part = scene.meshes[name]
-    pose, offsets = (so_far.get(f"{name}.{one}") for one in ("to_world", "offsets"))
+    pose = so_far.get(f"{name}.to_world")
+    offsets = so_far.get(f"{name}.offsets")
     if pose is None and offsets is None:
-        return _as_put(part)
-    vertices = part.mesh.vertices + (
-        0.0 if offsets is None else offsets.detach().cpu().double().numpy()
-    )
-    matrix = part.to_world if pose is None else pose.detach().cpu().double().numpy()
+        return _initial_footprint(part)
+    vertices = part.mesh.vertices + 0.0
+    if offsets is not None:
+        vertices = part.mesh.vertices + offsets.detach().cpu().double().numpy()
+    matrix = part.to_world
+    if pose is not None:
+        matrix = pose.detach().cpu().double().numpy()
     return geometry.footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 @lru_cache(maxsize=256)
-def _as_put(part: parts.MeshPart) -> parts.Footprint:
+def _initial_footprint(part: parts.MeshPart) -> parts.Footprint:
     return geometry.footprint(geometry.standing(part))

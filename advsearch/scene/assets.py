@@ -48,8 +48,9 @@ class MeshRig(Protocol):
         """Names of its animations."""
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex goes from the mesh's own, (V, 3) in its units;
-        differentiable.
+        """Return how far each vertex goes from the mesh's own, (V, 3) in its units.
+
+        Differentiable.
         """
 
     def measured(
@@ -60,9 +61,10 @@ class MeshRig(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh with one UV chart set: v = 0 is the BOTTOM row of the texture
-    image (the OBJ convention). UVs are in [0, 1], but for meshes of Mitsuba scenes,
-    whose textures may go on beyond their edges.
+    """A triangle mesh with one UV chart set.
+
+    V = 0 is the BOTTOM row of the texture image (the OBJ convention). UVs are in [0,
+    1], but for meshes of Mitsuba scenes, whose textures may go on beyond their edges.
     """
 
     vertices: Floats  # (V, 3) positions, z up, in the author's units
@@ -81,12 +83,11 @@ class Mesh:
 
     @property
     def repeats(self) -> bool:
-        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond
-        its edges.
-        """
+        """Whether its texture coordinates leave [0, 1], so that a texture repeats."""
         return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
 
     def __post_init__(self) -> None:
+        """Check shapes and values. Raises InputError."""
         count = len(self.vertices)
         for name, array, width in (
             ("vertices", self.vertices, 3),
@@ -115,8 +116,9 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Material:
-    """Parameters of the principled BSDF other than base colour; all in [0, 1] (Burley
-    2012, Disney principled).
+    """Parameters of the principled BSDF other than base colour.
+
+    All in [0, 1] (Burley 2012, Disney principled).
     """
 
     roughness: float = 0.5
@@ -125,15 +127,16 @@ class Material:
     clearcoat: float = 0.0
 
     def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
-        """Return the material with the settings over it whose names are `prefix` and
-        the attribute's.
+        """Return the material with some settings over it.
+
+        Their names are `prefix` and the attribute's.
         """
-        given = {
+        replaced = {
             name: value
             for name in vars(self)
             if (value := values.get(prefix + name)) is not None
         }
-        return replace(self, **given)
+        return replace(self, **replaced)
 
 
 @dataclass(frozen=True)
@@ -152,9 +155,11 @@ FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and
-    normal map are of the principled surface; a normal map is `(n + 1) / 2` of unit
-    normals along tangent (along u), normal x tangent and normal.
+    """A mesh and what it looks like.
+
+    Pictures have row 0 on top, at v = 1. Opacity and normal map are of the principled
+    surface; a normal map is `(n + 1) / 2` of unit normals along tangent (along u),
+    normal x tangent and normal.
     """
 
     name: str  # short, used in paths
@@ -177,8 +182,9 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class ObjectAsset(Shape):
-    """The object a model should recognise. A None is what is not known, or does not
-    come from a file.
+    """The object a model should recognise.
+
+    A None is what is not known, or does not come from a file.
     """
 
     source: str = ""  # where it came from, for messages and logs
@@ -199,8 +205,9 @@ class ObjectAsset(Shape):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how it was read: the up axis where that was
-        guessed, and the warnings.
+        """What a user should know of how it was read.
+
+        The up axis where that was guessed, and the warnings.
         """
         guessed = (self.up.reason,) if self.up is not None and self.up.reason else ()
         return (*guessed, *self.warnings)
@@ -208,9 +215,10 @@ class ObjectAsset(Shape):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentAsset:
-    """A light from everywhere: an equirectangular map. Row 0 looks straight up, and
-    columns run as in a photograph (a file's own order). Raises InputError: a texel is
-    negative, NaN or infinite.
+    """A light from everywhere: an equirectangular map.
+
+    Row 0 looks straight up, and columns run as in a photograph (a file's own order).
+    Raises InputError: a texel is negative, NaN or infinite.
     """
 
     name: str  # short, used in paths
@@ -230,58 +238,55 @@ class EnvironmentAsset:
     place: Any = None
 
     def __post_init__(self) -> None:
-        bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
-        if bad.any():
-            row, column = np.unravel_index(int(bad.argmax()), bad.shape)
-            found = (
-                f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or "
+        """Check the radiance. Raises InputError: a texel is negative, NaN or infinite."""
+        is_bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
+        if is_bad.any():
+            row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
+            description = (
+                f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN or "
                 "infinite"
             )
             raise InputError(
                 f"environment {self.name!r}: expected finite radiance of at least 0, "
-                f"got {found} (the first in row "
+                f"got {description} (the first in row "
                 f"{row}, column {column}); clamp them"
             )
 
 
 def face_vectors(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3), twice as long as their areas, out of triangles (F, 3, 3),
-    counter-clockwise.
+    """Return the outward vectors (F, 3) of triangles (F, 3, 3), counter-clockwise.
+
+    They are twice as long as the areas.
     """
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place
-    (3,).
-    """
+    """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift (3,)."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = linear, place
+    pose[:3, :3] = linear
+    pose[:3, 3] = place
     return pose
 
 
 def footing(points: Doubles) -> tuple[Doubles, float]:
-    """Return the place (3,) in the middle below some points (N, 3), and their largest
-    extent.
-    """
+    """Return the point (3,) in the middle below points (N, 3), and their extent."""
     low = points.min(axis=0)
     high = points.max(axis=0)
     return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
 
 
 def grouped(numbers: Ints) -> list[Ints]:
-    """Return, for each number from 0 to the largest of some (N,), the places at which
-    it stands, rising.
-    """
+    """Return the rising indices (n,) of each group, from 0 to the largest one."""
     return np.split(
         np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1]
     )
 
 
 def normalised(mesh: Mesh) -> Mesh:
-    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and
-    centred in x and y. Raises InputError: all vertices coincide, so there is no size to
-    normalise.
+    """Return the mesh with its largest extent 1, standing on z = 0 and centered.
+
+    Raises InputError: all vertices coincide, so there is no size to normalise.
     """
     vertices = mesh.vertices.astype(np.float64)
     origin, size = footing(vertices)
@@ -300,51 +305,66 @@ TEXTURE_CELLS = 32
 
 
 def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
-    """Return what leaves at most `most` faces of a mesh, or of one that stands
-    elsewhere, or the fewest of a coarse grid; None: it has no more. After Rossignac and
-    Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"):
-    vertices are clustered by a grid, and a face of which two corners meet is left out.
-    Both sides of a seam of the texture move together, so that no gap opens.
+    """Return a function that simplifies a mesh, also once its vertices are elsewhere.
+
+    After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
+    complex scenes"): vertices are clustered by a grid, and a face of which two corners
+    meet is left out. Both sides of a seam of the texture move together, so that no gap
+    opens.
+
+    Args:
+        mesh: the full mesh.
+        most: faces that are left at most, or the fewest of a coarse grid.
+
+    Returns:
+        None if the mesh has no more faces.
     """
     if len(mesh.faces) <= most:
         return None
-    low = mesh.vertices.min(axis=0)
-    extent = max(float((mesh.vertices.max(axis=0) - low).max()), 1e-12)
     chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
     for grid in GRIDS:
-        cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(
-            np.int64
+        cluster_of = _cluster_vertices(mesh, grid)
+        # vertices of a cluster in different parts of the texture stay apart
+        cluster_and_chart = _encode_rows(np.column_stack([cluster_of, chart]))
+        _, representative, new_vertex = np.unique(
+            cluster_and_chart, return_index=True, return_inverse=True
         )
-        places = np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
-        together = _key(np.column_stack([places, chart]))
-        _, kept, left = np.unique(together, return_index=True, return_inverse=True)
-        faces = left.reshape(-1)[mesh.faces]
-        first, second, third = places[kept][faces].T
+        faces = new_vertex.reshape(-1)[mesh.faces]
+        first, second, third = cluster_of[representative][faces].T
         faces = faces[(first != second) & (second != third) & (third != first)]
         if len(faces) <= most:
             break
-    rest = np.unique(faces, axis=0).astype(np.uint32)
-    counts = np.bincount(places)
+    distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
+    cluster_size = np.bincount(cluster_of)
 
-    def fewer(whole: Mesh) -> Mesh:
-        mean = np.stack(
-            [
-                np.bincount(places, whole.vertices[:, axis]) / counts
-                for axis in range(3)
-            ],
-            axis=1,
-        )
+    def simplify(full: Mesh) -> Mesh:
+        sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
+        mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
-            mean[places[kept]].astype(np.float32),
-            rest,
-            whole.normals[kept],
-            whole.uvs[kept],
+            mean[cluster_of[representative]].astype(np.float32),
+            distinct_faces,
+            full.normals[representative],
+            full.uvs[representative],
         )
 
-    return fewer
+    return simplify
 
 
-def _key(rows: Ints) -> Ints:
+def _cluster_vertices(mesh: Mesh, grid: int) -> Ints:
+    """Return the cluster (V,) of each vertex: the cell of a grid that it is in.
+
+    Args:
+        mesh: with V vertices.
+        grid: cells along its largest extent.
+    """
+    lower = mesh.vertices.min(axis=0)
+    extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
+    scaled = (mesh.vertices - lower) / extent * (grid - 1)
+    cells = np.floor(scaled + 0.5).astype(np.int64)
+    return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
+
+
+def _encode_rows(rows: Ints) -> Ints:
     """Return one number for each row of whole numbers, the same for equal rows only."""
     low = rows.min(axis=0)
     sizes = rows.max(axis=0) - low + 1
@@ -354,7 +374,7 @@ def _key(rows: Ints) -> Ints:
     return key
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # How large things really are: an object's longest side in metres, from what is said of
 # it or from its file.
 #
@@ -370,17 +390,54 @@ TRIPOD = 1.6
 SMALLEST = 1e-4  # metres of an object's longest side
 LARGEST = 1e4
 USUAL = {
-    "airplane": (6.0, 75.0), "apple": (0.05, 0.12), "backpack": (0.3, 0.8), "ball": (0.03, 0.4),
-    "banana": (0.12, 0.3), "bed": (1.6, 2.4), "bench": (1.0, 2.5), "bicycle": (1.3, 2.0), "bike": (1.3, 2.3),
-    "boat": (2.0, 40.0), "book": (0.12, 0.4), "bottle": (0.1, 0.4), "bowl": (0.08, 0.4), "bus": (6.0, 20.0),
-    "car": (2.5, 6.0), "cat": (0.25, 0.8), "chair": (0.6, 1.4), "cow": (1.5, 3.0), "cup": (0.05, 0.2),
-    "dog": (0.3, 1.4), "hammer": (0.15, 0.6), "horse": (1.6, 3.0), "hydrant": (0.5, 1.2), "keyboard": (0.2, 0.5),
-    "lamp": (0.2, 2.2), "laptop": (0.25, 0.5), "man": (1.4, 2.1), "motorcycle": (1.6, 2.7), "mug": (0.07, 0.2),
-    "pan": (0.25, 0.6), "person": (0.8, 2.1), "phone": (0.1, 0.2), "pickup": (4.0, 7.0), "sedan": (3.8, 5.5),
-    "shoe": (0.15, 0.4), "sign": (0.5, 4.0), "sofa": (1.3, 3.5), "suv": (3.8, 5.6), "table": (0.5, 3.0),
-    "teapot": (0.12, 0.4), "tractor": (2.5, 8.0), "train": (15.0, 400.0), "truck": (4.5, 20.0), "van": (3.8, 7.5),
-    "vase": (0.1, 0.9), "vehicle": (2.0, 20.0), "woman": (1.3, 2.0),
-}  # fmt: skip
+    "airplane": (6.0, 75.0),
+    "apple": (0.05, 0.12),
+    "backpack": (0.3, 0.8),
+    "ball": (0.03, 0.4),
+    "banana": (0.12, 0.3),
+    "bed": (1.6, 2.4),
+    "bench": (1.0, 2.5),
+    "bicycle": (1.3, 2.0),
+    "bike": (1.3, 2.3),
+    "boat": (2.0, 40.0),
+    "book": (0.12, 0.4),
+    "bottle": (0.1, 0.4),
+    "bowl": (0.08, 0.4),
+    "bus": (6.0, 20.0),
+    "car": (2.5, 6.0),
+    "cat": (0.25, 0.8),
+    "chair": (0.6, 1.4),
+    "cow": (1.5, 3.0),
+    "cup": (0.05, 0.2),
+    "dog": (0.3, 1.4),
+    "hammer": (0.15, 0.6),
+    "horse": (1.6, 3.0),
+    "hydrant": (0.5, 1.2),
+    "keyboard": (0.2, 0.5),
+    "lamp": (0.2, 2.2),
+    "laptop": (0.25, 0.5),
+    "man": (1.4, 2.1),
+    "motorcycle": (1.6, 2.7),
+    "mug": (0.07, 0.2),
+    "pan": (0.25, 0.6),
+    "person": (0.8, 2.1),
+    "phone": (0.1, 0.2),
+    "pickup": (4.0, 7.0),
+    "sedan": (3.8, 5.5),
+    "shoe": (0.15, 0.4),
+    "sign": (0.5, 4.0),
+    "sofa": (1.3, 3.5),
+    "suv": (3.8, 5.6),
+    "table": (0.5, 3.0),
+    "teapot": (0.12, 0.4),
+    "tractor": (2.5, 8.0),
+    "train": (15.0, 400.0),
+    "truck": (4.5, 20.0),
+    "van": (3.8, 7.5),
+    "vase": (0.1, 0.9),
+    "vehicle": (2.0, 20.0),
+    "woman": (1.3, 2.0),
+}
 """Metres that the longest side of a thing lies between, by the word for it in the name
 of a file: wide, to tell one unit from another.
 """
@@ -400,10 +457,16 @@ def on_roads(asset: ObjectAsset) -> bool:
 
 
 def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with its size in metres, where it is told: by `size`, of its
-    longest side in metres, by `unit`, one of `UNITS`, of its file, or by itself. Raises
-    InputError: both are given, `size` is out of range, or the object comes from no file
-    that could have a unit.
+    """Return an object with its size in metres, if it is known.
+
+    Args:
+        asset: the object.
+        size: its longest side in metres.
+        unit: of its file, one of `UNITS`.
+
+    Raises:
+        InputError: both are given, the size is out of range, or the object comes
+            from no file that could have a unit.
     """
     if size is None and unit is None:
         return asset
@@ -422,13 +485,13 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
         float(size) if size is not None else (asset.extent or 0.0) * UNITS[unit or "m"]
     )
     if not SMALLEST <= metres <= LARGEST:
-        said = (
+        statement = (
             f"size={size:g}"
             if size is not None
             else (f"unit={unit} for a mesh of {asset.extent:.4g}")
         )
         raise InputError(
-            f"{said}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
+            f"{statement}: expected a longest side of {SMALLEST:g} to {LARGEST:g} metres, "
             f"got {metres:.4g}; give it in "
             "metres, such as size=4.9"
         )
@@ -436,9 +499,12 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
 
 
 def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
-    """Return what is said where an object's size is unlike that of a thing of its name,
-    or is not known: `asked` tells that its user gave its size, `laid` that something in
-    the scene has one in metres, such as the road.
+    """Return a remark where an object's size is unusual for its name, or unknown.
+
+    Args:
+        asset: the object.
+        asked: whether its user gave its size.
+        laid: whether something in the scene is in metres, such as the road.
     """
     kind = next(
         (
@@ -449,29 +515,31 @@ def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
         None,
     )
     low, high = (0.005, 100.0) if kind is None else USUAL[kind]
-    strange = asset.metres is not None and not low <= asset.metres <= high
-    missing = asset.metres is None and (
+    is_unusual = asset.metres is not None and not low <= asset.metres <= high
+    is_unknown = asset.metres is None and (
         laid or (kind is not None and asset.extent is not None)
     )
-    if asked or not (strange or missing):
+    if asked or not (is_unusual or is_unknown):
         return ()
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
     fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
-    what = [
+    clauses = [
         f"its longest side is {rounded(asset.metres or 0.0)} m"
-        if strange
+        if is_unusual
         else "its size in metres is not known",
-        f"it is {rounded(extent)} in its file" if missing and extent else "",
+        f"it is {rounded(extent)} in its file" if is_unknown and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
-        "it is taken for 1 m, as the road is in metres" if missing and laid else "",
+        "it is taken for 1 m, as the road is in metres" if is_unknown and laid else "",
     ]
-    give = f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
+    remedy = (
+        f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
+    )
     if fits:
-        give += (
+        remedy += (
             f", or `unit={fits[0]}`, which makes it "
             f"{rounded(extent * UNITS[fits[0]])} m"
         )
     return (
-        f"{asset.name}: {'; '.join(filter(None, what))}. "
-        f"{'If that is wrong, g' if strange else 'G'}{give[1:]}",
+        f"{asset.name}: {'; '.join(filter(None, clauses))}. "
+        f"{'If that is wrong, g' if is_unusual else 'G'}{remedy[1:]}",
     )

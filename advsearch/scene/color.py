@@ -20,8 +20,9 @@ LOW_END = 0.0031308  # linear values up to which the encoding is straight
 
 
 def srgb_to_linear(display: Values) -> Values:
-    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32;
-    differentiable everywhere.
+    """Decode display-referred sRGB in [0, 1] to linear values.
+
+    Any shape, float32; differentiable everywhere.
     """
     low_end = display <= 0.04045
     low = display / 12.92
@@ -32,8 +33,9 @@ def srgb_to_linear(display: Values) -> Values:
 
 
 def linear_to_srgb(linear: Values) -> Values:
-    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape,
-    float32; differentiable.
+    """Encode linear values as display-referred sRGB, clipped to [0, 1].
+
+    Any shape, float32; differentiable.
     """
     clipped = linear.clip(0.0, 1.0)
     low_end = clipped <= LOW_END
@@ -45,22 +47,25 @@ def linear_to_srgb(linear: Values) -> Values:
 
 
 def levels_of(display: Tensor) -> Tensor:
-    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not
-    differentiable.
+    """Return the levels (uint8) of values in [0, 1] in an 8-bit file.
+
+    Not differentiable.
     """
     return (display.detach() * 255.0).round().byte()
 
 
 def to_8_bit(display: Tensor) -> Tensor:
-    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not
-    differentiable.
+    """Round values in [0, 1] to the 256 levels of an 8-bit file.
+
+    Not differentiable.
     """
     return (display.detach() * 255.0).round() / 255.0
 
 
 def combine_channels(values: Mapping[str, Tensor]) -> Tensor:
-    """Return the linear color (3,) of the display-referred numbers red, green and blue;
-    differentiable.
+    """Return the linear color (3,) of display-referred numbers red, green and blue.
+
+    Differentiable.
     """
     import torch  # whoever has tensors has it already
 

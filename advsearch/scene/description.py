@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -135,24 +135,25 @@ class SceneDescription:
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part. Raises InputError: its name is taken."""
-        taken = {own.name: own for own in self.parts}
-        if part.name in (OBJECT, "environment", "ground", "camera", *taken):
-            plugin = isinstance(taken.get(part.name), PluginPart)
-            instead = (
+        part_by_name = {existing.name: existing for existing in self.parts}
+        if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
+            is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
+            alternative = (
                 f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]"
-                if plugin
+                if is_plugin
                 else ""
             )
             raise InputError(
                 f"`controls` {part.name}: the scene has something of that name "
                 "already; choose another name, as in "
-                f"light:{part.name}-2{instead}"
+                f"light:{part.name}-2{alternative}"
             )
         return replace(self, parts=(*self.parts, part))
 
     def with_values(self, **given: float | None) -> SceneDescription:
-        """Return the scene with some settings replaced; dots in their names are written
-        as two underscores.
+        """Return the scene with some settings replaced.
+
+        Dots in their names are written as two underscores.
         """
         return replace(
             self,
@@ -168,100 +169,115 @@ class SceneDescription:
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
-        """Return a bundled object or one from a mesh file. Raises InputError: there is
-        none, or it can't be used.
+        """Return a bundled object or one from a mesh file.
+
+        Raises InputError: there is none, or it can't be used.
         """
-        return _object(spec, None, None)
+        return _load_object(spec, None, None)
 
     def seen_by(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it, or as the camera around the
-        object does with another lens: by a path to a camera file, the name of a bundled
-        camera model, or that of a mounted camera. Raises UnknownNameError: it has no
-        such camera. Raises InputError: a setting of the camera around the object was
-        given, and another is to see it; or a file cannot be used.
+        """Return the scene as one of its cameras sees it, or through another lens.
+
+        Args:
+            camera: name of a camera of the scene, or of a mounted one; or, for the camera
+                around the object, the path of a camera file or the name of a bundled camera
+                model.
+
+        Raises:
+            InputError: a setting of the camera around the object was given, and another is
+                to see it; or a file cannot be used.
+            UnknownNameError: it has no such camera.
         """
         if camera in PRESETS and camera not in self.cameras:
-            return self._mounted(camera)
-        seen = replace(self, camera=ORBIT_CAMERA, camera_model=None)
+            return self._with_mounted_camera(camera)
+        scene = replace(self, camera=ORBIT_CAMERA, camera_model=None)
         if camera not in (ORBIT_CAMERA, *self.cameras):
-            if not is_path(camera) and camera not in bundled():
-                known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
-                raise UnknownNameError(
-                    "camera",
-                    camera,
-                    known,
-                    "Or give the path of a camera file, such as calib.yaml.",
-                )
-            model = bundled().get(camera)
-            if is_path(camera) and (rig := read_rig(camera)):
-                model = rig[0].model
-                fov = rig[0].fov
-                seen = replace(seen, rig=rig, rig_spec=camera)
-                seen = seen if fov is None else seen.with_values(camera__fov=fov)
-            elif is_path(camera):
-                with reading(camera.partition("#")[0]):
-                    model = read_camera(camera)
-            if model is not None:
-                model.check_given(self.given)
-            return replace(seen, camera_model=model)
-        idle = sorted(
+            return scene._with_lens(camera)
+        camera_settings = sorted(
             name
             for name in self.given
             if name.startswith("camera.") and name != "camera.exposure"
         )
-        if camera != ORBIT_CAMERA and idle:
+        if camera != ORBIT_CAMERA and camera_settings:
             raise InputError(
-                f"`camera={camera}` and `set` {idle[0]} contradict each other: the "
-                "camera of the file has a place and "
+                f"`camera={camera}` and `set` {camera_settings[0]} contradict each other: "
+                "the camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
-        return replace(seen, camera=camera)
+        return replace(scene, camera=camera)
 
-    def _mounted(self, name: str) -> SceneDescription:
+    def _with_lens(self, camera: str) -> SceneDescription:
+        """Return the scene with the lens of a camera file or a bundled camera model."""
+        if not is_path(camera) and camera not in bundled():
+            known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
+            raise UnknownNameError(
+                "camera",
+                camera,
+                known,
+                "Or give the path of a camera file, such as calib.yaml.",
+            )
+        scene = self
+        model = bundled().get(camera)
+        if is_path(camera):
+            rig = read_rig(camera)
+            if rig:
+                model = rig[0].model
+                scene = replace(scene, rig=rig, rig_spec=camera)
+                if rig[0].fov is not None:
+                    scene = scene.with_values(camera__fov=rig[0].fov)
+            else:
+                with reading(camera.partition("#")[0]):
+                    model = read_camera(camera)
+        if model is not None:
+            model.check_given(self.given)
+        return replace(scene, camera_model=model)
+
+    def _with_mounted_camera(self, name: str) -> SceneDescription:
+        """Return the scene as a mounted camera sees it, by its name.
+
+        Raises InputError: the object's size in metres is not known.
+        """
         preset = PRESETS[name]
-        own = {"camera.fov": PRESETS[name].fov}
         if self.object.metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large "
                 f"{self.object.name} is is not known; give "
                 "its longest side in metres, such as `size=0.1`"
             )
-        on_plane = (
+        is_on_plane = (
             self.number("ground.size") > 0.0
             and self.photograph is None
             and not paved(self)
         )
-        on_table = on_plane and self.object.metres <= ON_TABLES
+        is_on_table = is_on_plane and self.object.metres <= ON_TABLES
+        preset_values = {"camera.fov": preset.fov}
         if "camera.elevation" not in self.given:
             place = find_place(self)
-            floor = -TABLE if on_table else 0.0 if place is None else place.file.floor
-            own["camera.height"] = preset.height + floor
+            floor = 0.0 if place is None else place.file.floor
+            if is_on_table:
+                floor = -TABLE
+            preset_values["camera.height"] = preset.height + floor
         if preset.in_lane:
-            own["camera.azimuth"] = 0.0
-        if on_table:
-            own["ground.size"] = TABLE_SIDE / self.metres
-        values = {
-            **self.values,
-            **{
-                setting: value
-                for setting, value in own.items()
-                if setting not in self.given
-            },
-        }
-        seen = replace(
+            preset_values["camera.azimuth"] = 0.0
+        if is_on_table:
+            preset_values["ground.size"] = TABLE_SIDE / self.metres
+        values = dict(self.values)
+        for setting, value in preset_values.items():
+            if setting not in self.given:
+                values[setting] = value
+        scene = replace(
             self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values
         )
         if "camera.distance" in self.given:
-            return seen
-        fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
-        fitted = float(geometry.framing_distance(seen, fov, seen.aspect)) * seen.metres
-        return seen.with_values(camera__distance=max(preset.distance, fitted))
+            return scene
+        fov = torch.tensor(scene.number("camera.fov"), dtype=torch.float64)
+        framing = float(geometry.framing_distance(scene, fov, scene.aspect))
+        distance = max(preset.distance, framing * scene.metres)
+        return scene.with_values(camera__distance=distance)
 
     @property
     def azimuth_zero(self) -> float:
-        """The direction from the object, in degrees from +x, in which the camera of
-        azimuth 0 stands.
-        """
+        """Direction from the object to the camera of azimuth 0, degrees from +x."""
         return 180.0 if self.is_in_lane and self.object.drives else 0.0
 
     @property
@@ -271,8 +287,9 @@ class SceneDescription:
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name, as the settings have it; the one under test is
-        `OBJECT`.
+        """Every mesh by name, as the settings have it.
+
+        The one under test is `OBJECT`.
         """
         around = {
             name: geometry.moved_part(part, self.values)
@@ -286,8 +303,8 @@ class SceneDescription:
             name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
         }
         return meshes | {
-            name: replace(one, to_world=meshes[one.carrier].to_world)
-            for name, one in glasses.items()
+            name: replace(glass, to_world=meshes[glass.carrier].to_world)
+            for name, glass in glasses.items()
         }
 
     @cached_property
@@ -304,15 +321,16 @@ class SceneDescription:
     def cut_out(self) -> bool:
         return any(
             mesh.opacity is not None for mesh in self.meshes.values()
-        ) or self._has("mask")
+        ) or self._has_plugin("mask")
 
     @property
     def normal_mapped(self) -> bool:
         return any(
             mesh.normal_map is not None for mesh in self.meshes.values()
-        ) or self._has("normalmap", "bumpmap")
+        ) or self._has_plugin("normalmap", "bumpmap")
 
-    def _has(self, *kinds: str) -> bool:
+    def _has_plugin(self, *kinds: str) -> bool:
+        """Return whether a Mitsuba plugin of one of these kinds is in the scene."""
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
         ]
@@ -358,9 +376,7 @@ class SceneDescription:
 
     @property
     def metres(self) -> float:
-        """What lengths in metres are to be divided by to be in object sizes: the
-        object's size in metres, or 1.
-        """
+        """Metres of one object size, or 1 where they are not known."""
         return self.object.metres or 1.0
 
     @property
@@ -370,8 +386,9 @@ class SceneDescription:
 
     @property
     def environment_name(self) -> str:
-        """How the environment was asked for, or else its own name; `NO_MAP` where there
-        is none.
+        """How the environment was asked for, or else its own name.
+
+        `NO_MAP` where there is none.
         """
         return self.environment_spec or (
             NO_MAP if self.environment is None else self.environment.name
@@ -379,31 +396,42 @@ class SceneDescription:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how object and environment were read, and what
-        controls name.
-        """
-        lit = () if self.environment is None else self.environment.warnings
-        seen = () if self.camera_model is None else self.camera_model.notes
-        size = doubts(self.object, asked=self.size is not None, laid=paved(self))
+        """What a user should know of how the scene was read, and remarks of controls."""
+        light_notes = () if self.environment is None else self.environment.warnings
+        camera_notes = () if self.camera_model is None else self.camera_model.notes
+        size_remarks = doubts(
+            self.object, asked=self.size is not None, laid=paved(self)
+        )
         front = self.object.front
-        faces = (
+        front_remarks = (
             (front.reason,)
             if front is not None and (self.is_in_lane or has_lanes(self))
             else ()
         )
-        drives = (traffic_remark(self),) if self._meets_traffic else ()
-        notes = (*self.object.notes, *faces, *size, *lit, *seen, *drives, *self.remarks)
+        traffic_remarks = (
+            (traffic_remark(self),) if self._drives_against_traffic else ()
+        )
+        notes = (
+            *self.object.notes,
+            *front_remarks,
+            *size_remarks,
+            *light_notes,
+            *camera_notes,
+            *traffic_remarks,
+            *self.remarks,
+        )
         return tuple(dict.fromkeys(note for note in notes if note))
 
     @property
-    def _meets_traffic(self) -> bool:
+    def _drives_against_traffic(self) -> bool:
         return self.is_seen_from_orbit and is_against_traffic(
             self, geometry.camera_to_world(self)
         )
 
     def environment_for(self, who: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map. Raises InputError:
-        the scene has none.
+        """Return the environment for what cannot do without a map.
+
+        Raises InputError: the scene has none.
         """
         if self.environment is None:
             check_one_environment(self.parts, who)
@@ -420,20 +448,22 @@ class SceneDescription:
 
     @property
     def metered_irradiance(self) -> float:
-        """Irradiance for which the exposure of its images is metered, in scene
-        units.
-        """
+        """Irradiance that the exposure of images is metered for, in scene units."""
         return METERED_WHITE * math.pi / (WHITE * metered_gain(self))
 
     def list_environment_light(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Return unit directions (N, 3) to the environment's light, solid angles (N,),
-        and radiance times these.
+        """Return the light of the environment as directional lights.
+
+        Returns:
+            Unit directions (N, 3) to the light, solid angles (N,), and radiance
+                times these.
         """
         return arriving(self)
 
     def ground_height(self, place: Doubles) -> float:
-        """Return how high the ground lies at a place (2,), object sizes: road,
-        pavement, table or floor; or 0.
+        """Return how high the ground lies at a place (2,), object sizes.
+
+        Road, pavement, table or floor; or 0.
         """
         return ground_height(self, place)
 
@@ -443,8 +473,9 @@ class SceneDescription:
         return geometry.standing(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
-        """Return a setting that always has a value; of the field of view, that of the
-        camera in use.
+        """Return a setting that always has a value.
+
+        Of the field of view, that of the camera in use.
         """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
             return self.cameras[self.camera].larger_fov(self.aspect)
@@ -455,51 +486,47 @@ class SceneDescription:
 
     @property
     def given_values(self) -> dict[str, float | str]:
-        """The settings that were asked for, as they are written: a choice by its
-        name.
-        """
-        asked: dict[str, float | str] = {}
+        """The settings that were requested, as users write them: a choice by its name."""
+        requested: dict[str, float | str] = {}
         for name in self.given & self.values.keys():
             value = self.values[name]
             setting = settings.parameter_of(name)
             if value is not None:
-                asked[name] = (
+                requested[name] = (
                     setting.options[int(value)]
                     if setting is not None and setting.options
                     else value
                 )
-        return asked
+        return requested
 
     @property
     def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table,
-        or nothing. Where `ground.kind` is not given, it does so for a photographed
-        environment, unless a table is described or the environment may be hidden behind
-        a colour, which would hide everything above the horizon alone.
+        """The ground that shows the environment's photograph; None where it is a table.
+
+        Where `ground.kind` is not set, a photographed environment has such a ground,
+        unless a table is described or the environment may be hidden behind a color,
+        which would hide everything above the horizon alone.
         """
-        own = self.environment
+        environment = self.environment
         kind = self.values.get("ground.kind")
-        if own is None or self.number("ground.size") == 0.0:
+        if environment is None or self.number("ground.size") == 0.0:
             return None
         if kind is not None:
-            shows = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
+            shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
         else:
-            shows = (
-                own.photographed
+            shows_photograph = (
+                environment.photographed
                 and not self.backdrop
                 and self.given.isdisjoint(settings.TABLE_SETTINGS)
             )
-        return (
-            photograph_of(own, self.capture_height, self.number("environment.rotation"))
-            if shows
-            else None
-        )
+        if not shows_photograph:
+            return None
+        rotation = self.number("environment.rotation")
+        return photograph_of(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:
-        """Height above the floor from which the environment's photograph was taken,
-        object sizes.
-        """
+        """Height above the floor of the photograph's camera, object sizes."""
         height = self.values.get("ground.height")
         if height is None and self.object.metres is None:
             return settings.PHOTOGRAPHED_FROM
@@ -517,8 +544,9 @@ class SceneDescription:
 
     @property
     def gain(self) -> float:
-        """Factor from scene radiance to display-linear values: the metered exposure
-        times `camera.exposure`.
+        """Factor from scene radiance to display-linear values.
+
+        The metered exposure times `camera.exposure`.
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas
@@ -547,96 +575,161 @@ def describe(
     plugins: Mapping[str, object] | None = None,
     things: str | None = None,
 ) -> SceneDescription:
-    """Find and read an object and an environment, bundled or from a file; arguments and
-    errors as of `advsearch.load_scene`. What stands around a node of a glTF scene or a
-    shape of a Mitsuba scene stays there, without the ground plane, and without a map if
-    it has lights of its own; `plugins` are a Mitsuba scene as its loader takes it, in
-    which `object_spec` is the id of a shape; an environment of `NO_MAP` is no map at
-    all.
+    """Find and read an object and an environment, bundled or from a file.
+
+    What stands around a node of a glTF scene or a shape of a Mitsuba scene stays there,
+    without the ground plane, and without a map if it has lights of its own. Arguments
+    and errors that are not listed are as of `advsearch.load_scene`.
+
+    Args:
+        object_spec: with `plugins` the id of a shape.
+        environment_spec: `NO_MAP` is no map at all.
+        given: settings of the scene by name.
+        up: the up axis of a mesh file.
+        facing: the axis of a mesh file that is its front.
+        size: longest side of the object, metres.
+        unit: of the object's file.
+        plugins: a Mitsuba scene as its loader takes it.
+        things: what stands beside the object.
     """
     given = given or {}
     values = settings.resolve(given)
-    file, node = (
-        split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
-    )
-    mitsuba = plugins is not None or (
-        node is not None and str(file).lower().endswith(MITSUBA_FILE)
-    )
-    if up is not None and (mitsuba or node is not None):
-        why = (
-            "the first camera of a Mitsuba scene says which way is up"
-            if mitsuba
-            else "glTF files have y up"
+    file: str | Path | ObjectAsset = object_spec
+    node = None
+    if isinstance(object_spec, str):
+        file, node = split_node(object_spec)
+    is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_FILE)
+    is_mitsuba = plugins is not None or is_mitsuba_file
+    is_scene_file = node is not None or is_mitsuba
+    _check_axes(up, facing, is_scene_file=is_scene_file, is_mitsuba=is_mitsuba)
+    if plugins is not None:
+        # a circle: it takes descriptions
+        from advsearch.scene.mitsuba_backend.scene_files import import_plugins
+
+        imported = import_plugins(plugins, node or str(object_spec))
+    elif node is None:
+        imported = ImportedScene(_load_object(object_spec, up, facing))
+    else:
+        imported = _import_scene_file(Path(str(file)), node, is_mitsuba=is_mitsuba)
+    imported = replace(imported, object=sized(imported.object, size, unit))
+
+    is_lit = _has_lights(imported.surroundings)
+    if is_mitsuba and imported.object.emission is not None:
+        is_lit = True
+    lit_by = environment_spec or (NO_MAP if is_lit else DEFAULT_ENVIRONMENT)
+    check_ground(given, lit_by)
+    if lit_by != NO_MAP:
+        check_one_environment(
+            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
         )
-        raise InputError(f"up: {why}; leave `up` out")
-    if facing is not None and (mitsuba or node is not None):
+    if is_scene_file and not {"ground.size", "ground.kind"} & set(given):
+        values["ground.size"] = 0.0
+    requested = set(given)
+    if environment_spec is not None:
+        requested.add(ENVIRONMENT)
+    camera = ORBIT_CAMERA
+    if is_mitsuba and not _describes_orbit(given):
+        camera = next(iter(imported.cameras), ORBIT_CAMERA)
+    described = SceneDescription(
+        imported.object,
+        _load_environment(lit_by),
+        values,
+        _spec_text(object_spec),
+        _spec_text(lit_by),
+        up,
+        facing,
+        size,
+        unit,
+        given=frozenset(requested),
+        parts=imported.surroundings,
+        cameras=imported.cameras,
+        camera=camera,
+        metered=not is_mitsuba,
+    )
+    described = with_things(on_its_ground(described), things, _load_thing)
+    described = with_lamps(with_solids_checked(described))
+    check_meshes(described, values)
+    _check_material_settings(described.object, given)
+    return described
+
+
+def _check_axes(
+    up: str | None, facing: str | None, *, is_scene_file: bool, is_mitsuba: bool
+) -> None:
+    """Check that a scene file is not turned. Raises InputError: it is."""
+    if not is_scene_file:
+        return
+    if up is not None:
+        reason = "glTF files have y up"
+        if is_mitsuba:
+            reason = "the first camera of a Mitsuba scene says which way is up"
+        raise InputError(f"up: {reason}; leave `up` out")
+    if facing is not None:
         raise InputError(
             "facing: a scene file stays as it is; leave `facing` out, or "
             "turn the object: `set` pose.yaw"
         )
-    if mitsuba:
+
+
+def _import_scene_file(path: Path, node: str, *, is_mitsuba: bool) -> ImportedScene:
+    """Read a glTF scene or a Mitsuba scene around one of its nodes or shapes."""
+    with reading(path):
+        if not is_mitsuba:
+            return import_scene(path, node)
         # a circle: it takes descriptions
         from advsearch.scene.mitsuba_backend.scene_files import import_plugins
-    if plugins is not None:
-        around = import_plugins(plugins, node or str(object_spec))
-    elif node is None:
-        around = ImportedScene(_object(object_spec, up, facing))
-    else:
-        with reading(path := Path(str(file))):
-            around = import_plugins(path, node) if mitsuba else import_scene(path, node)
-    around = replace(around, object=sized(around.object, size, unit))
-    shining = (
+
+        return import_plugins(path, node)
+
+
+def _has_lights(parts: Iterable[ScenePart]) -> bool:
+    """Return whether one of the parts is a light."""
+    return any(
         isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines)
-        for part in around.surroundings
+        for part in parts
     )
-    alone = any(shining) or (mitsuba and around.object.emission is not None)
-    lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
-    check_ground(given, lit_by)
-    if lit_by != NO_MAP:
-        check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
-    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(
-        given
-    ):
-        values["ground.size"] = 0.0
-    if isinstance(lit_by, EnvironmentAsset) or lit_by == NO_MAP:
-        environment = lit_by if isinstance(lit_by, EnvironmentAsset) else None
-    elif is_place_file(lit_by):
-        environment = import_place(str(lit_by))
-    elif is_path(lit_by):
+
+
+def _describes_orbit(requested: settings.Given) -> bool:
+    """Return whether settings say where the camera around the object is."""
+    return any(
+        name.startswith("camera.") and name != "camera.exposure" for name in requested
+    )
+
+
+def _load_environment(
+    lit_by: str | Path | EnvironmentAsset,
+) -> EnvironmentAsset | None:
+    """Return an environment, bundled or from a file; None for `NO_MAP`."""
+    if isinstance(lit_by, EnvironmentAsset):
+        return lit_by
+    if lit_by == NO_MAP:
+        return None
+    if is_place_file(lit_by):
+        return import_place(str(lit_by))
+    if is_path(lit_by):
         with reading(lit_by):
-            environment = library.import_environment(Path(lit_by))
-    else:
-        environment = library.load_environment(str(lit_by))
-    orbits = any(
-        name.startswith("camera.") and name != "camera.exposure" for name in given
-    )
-    described = SceneDescription(
-        around.object, environment, values, _spec(object_spec), _spec(lit_by), up, facing, size, unit,
-        given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
-        parts=around.surroundings,
-        cameras=around.cameras,
-        camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
-        metered=not mitsuba,
-    )  # fmt: skip
-    described = with_things(on_its_ground(described), things, _load_thing)
-    described = with_lamps(with_solids_checked(described))
-    check_meshes(described, values)
-    idle = [name for name in given if name.startswith("material.")]
-    if described.object.surface is not None and idle:
-        whose = (
-            "several materials"
-            if described.object.finishes
-            else "a surface of Mitsuba's own"
-        )
+            return library.import_environment(Path(lit_by))
+    return library.load_environment(str(lit_by))
+
+
+def _check_material_settings(asset: ObjectAsset, requested: settings.Given) -> None:
+    """Check that settings of the material apply. Raises InputError: they do not."""
+    material_settings = [name for name in requested if name.startswith("material.")]
+    if asset.surface is not None and material_settings:
+        surface = "a surface of Mitsuba's own"
+        if asset.finishes:
+            surface = "several materials"
         raise InputError(
-            f"`set` {idle[0]}: the object has {whose}, without it; leave it out"
+            f"`set` {material_settings[0]}: the object has {surface}, without it; "
+            "leave it out"
         )
-    return described
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named. Raises
-    UnknownNameError: it has not.
+    """Check that a scene has the meshes whose settings are named.
+
+    Raises UnknownNameError: it has not.
     """
     for name in names:
         mesh = settings.mesh_of(name)
@@ -650,9 +743,13 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
 
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
-    """Refuse an environment, or what needs one that is a map of ours, asked for by
-    `who`, as it is written, beside one that a Mitsuba scene has of its own among its
-    parts. Raises InputError: there are two.
+    """Check that a Mitsuba scene has no environment of its own among its parts.
+
+    Raises InputError: it has, and another is requested.
+
+    Args:
+        parts: of the scene.
+        who: the setting that needs a map of ours, as users write it.
     """
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
@@ -665,8 +762,9 @@ def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
-    """Refuse what contradicts a ground that shows the environment's photograph. Raises
-    InputError: there is no photograph, or a table is described beside it.
+    """Check the settings of a ground that is no table.
+
+    Raises InputError: there is no photograph to show, or a table is described as well.
     """
     kind = given.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
@@ -685,26 +783,28 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         )
 
 
-def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
+def _spec_text(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
     return spec.name if isinstance(spec, (ObjectAsset, EnvironmentAsset)) else str(spec)
 
 
 def _load_thing(spec: str, facing: str | None) -> ObjectAsset:
-    return _object(spec, None, facing)
+    return _load_object(spec, None, facing)
 
 
-def _object(
+def _load_object(
     spec: str | Path | ObjectAsset, up: str | None, facing: str | None
 ) -> ObjectAsset:
+    """Return an asset as it is, or load a bundled object or a mesh file."""
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
+        known_up: Literal["y", "z"] | None = None
+        if up == "y":
+            known_up = "y"
+        elif up == "z":
+            known_up = "z"
         with reading(spec):
-            return import_object(
-                Path(spec),
-                up="y" if up == "y" else "z" if up == "z" else None,
-                facing=facing,
-            )
+            return import_object(Path(spec), up=known_up, facing=facing)
     if up is not None:
         raise InputError(
             "up: bundled objects stand upright already; leave `up` out, or give a "
@@ -719,8 +819,9 @@ def _object(
 
 
 def is_path(spec: str | Path) -> bool:
-    """A spec with a folder or a file ending is a path; a bare word is a bundled
-    name.
+    """Return whether a spec is a path: it has a directory or a suffix.
+
+    A bare word is the name of something bundled.
     """
     return (
         isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""

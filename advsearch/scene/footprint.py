@@ -8,9 +8,7 @@ from advsearch.scene.assets import Doubles
 
 
 class Footprint(NamedTuple):
-    """What something takes up: its convex outline on the ground, corners (K, 2), and
-    between which heights.
-    """
+    """A convex outline on the ground, corners (K, 2), and a range of heights."""
 
     outline: Doubles
     low: float

@@ -65,9 +65,13 @@ class Frame:
     def of(
         fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)
     ) -> Frame:
-        """Return the frame of a camera with a field of view along the larger side,
-        degrees, an aspect of width over height, and a shift of the picture to the right
-        in its widths and downwards in its heights: what it shows moves the other way.
+        """Return the frame of a camera.
+
+        Args:
+            fov: field of view along the larger side, degrees.
+            aspect: width over height.
+            shift: of the image to the right in its widths and downwards in its
+                heights: what it shows moves the other way.
         """
         larger = math.tan(math.radians(fov) / 2.0)
         x = larger * min(1.0, aspect)
@@ -77,7 +81,7 @@ class Frame:
         return Frame(-x + right, x + right, -y - down, y - down)
 
     def corners(self) -> Doubles:
-        """Unit directions (4, 3) to the corners."""
+        """Return unit directions (4, 3) to the corners."""
         tangents = [
             (x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)
         ]
@@ -88,9 +92,14 @@ class Frame:
 def framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the distance of the camera to the middle of a scene's object, () float64
-    in object sizes, for a field of view () along the larger side of the picture,
-    degrees, and its width over height; differentiable in the first.
+    """Return the distance () of the camera to the middle of a scene's object.
+
+    In object sizes, float64; differentiable in the field of view.
+
+    Args:
+        description: the scene.
+        fov: () field of view along the larger side of the image, degrees.
+        aspect: width over height.
     """
     offsets = torch.from_numpy(
         description.object.mesh.vertices.astype(np.float64) - middle(description)
@@ -110,19 +119,23 @@ def framing_distance(
     )
     axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
-    (wide, high) = edge * FRAME_FILL
-    fits = (outwards + torch.maximum(left.abs() / wide, up.abs() / high)).max()
-    whole = _from_all_around(offsets, elevation, edge)
-    return torch.maximum(fits, whole).clamp_min(
+    (half_width, half_height) = edge * FRAME_FILL
+    from_default_view = (
+        outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
+    ).max()
+    from_all_around = _framing_distance_all_around(offsets, elevation, edge)
+    return torch.maximum(from_default_view, from_all_around).clamp_min(
         float(offsets.norm(dim=1).max()) + CLEARANCE
     )
 
 
 def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
-    """Return the unit vectors to the left and upwards in the picture and from the
-    object to the camera: rows, (3, 3); for the camera's direction around the object,
-    its height above the ground plane, and the picture's rotation, counter-clockwise,
-    all in degrees.
+    """Return the axes of a camera on an orbit: rows left, up and from the object to it.
+
+    Args:
+        azimuth: of the camera around the object, degrees.
+        elevation: of the camera above the ground plane, degrees.
+        roll: rotation of the image, counter-clockwise, degrees.
     """
     azimuth = math.radians(azimuth)
     elevation = math.radians(elevation)
@@ -140,28 +153,36 @@ def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
 
 
 def middle(description: SceneDescription) -> Doubles:
-    """Return what the camera looks at: the middle (3,) of the object's bounding box in
-    its default pose.
+    """Return what the camera looks at.
+
+    The middle (3,) of the object's bounding box in its default pose.
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
-def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
-    """The distance at which every vertex projects inside the tangents, from every
-    azimuth at one elevation. Seen from all around, a vertex runs through a circle of
-    radius rho at height z: what it asks for is a sine of the azimuth plus a constant
-    for each edge of the picture, whose largest value is known in closed form.
+def _framing_distance_all_around(
+    offsets: Tensor, elevation: float, tangents: Tensor
+) -> Tensor:
+    """Return the distance at which every vertex is in the image from every azimuth.
+
+    Seen from all around, a vertex runs through a circle of radius rho at height z: what
+    it needs is a sine of the azimuth plus a constant for each edge of the image, whose
+    largest value is known in closed form.
     """
     rho = offsets[:, :2].norm(dim=1)
     z = offsets[:, 2]
     cosine = math.cos(math.radians(elevation))
     sine = math.sin(math.radians(elevation))
-    across = 1.0 / tangents[0]
-    along = 1.0 / tangents[1]
-    aside = rho * torch.sqrt(across**2 + cosine**2) + z * sine
-    above = rho * (cosine - sine * along).abs() + z * (sine + cosine * along)
-    below = rho * (cosine + sine * along).abs() + z * (sine - cosine * along)
+    inverse_width = 1.0 / tangents[0]
+    inverse_height = 1.0 / tangents[1]
+    aside = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
+    above = rho * (cosine - sine * inverse_height).abs() + z * (
+        sine + cosine * inverse_height
+    )
+    below = rho * (cosine + sine * inverse_height).abs() + z * (
+        sine - cosine * inverse_height
+    )
     return torch.stack([aside.max(), above.max(), below.max()]).max()
 
 
@@ -178,41 +199,50 @@ def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
 
 
 def affine(linear: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,);
-    differentiable.
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,).
+
+    Differentiable.
     """
     top = torch.cat([linear, place[:, None]], dim=1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
 
 
 def object_to_world(description: SceneDescription) -> Doubles:
-    """Return the object's pose: scale and rotate about the middle of its bounding box,
-    keep it on the ground, shift. "On the ground" means that the lowest vertex is at z =
-    0 before `pose.z` is added, whatever the rotation.
+    """Return the object's pose.
+
+    Scale and rotate about the middle of its bounding box, keep it on the ground, shift.
+    "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added,
+    whatever the rotation.
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
     pose = {
         parameter.name: description.number(f"pose.{parameter.name}")
         for parameter in POSE
     }
-    return _posed(vertices, 0.0, pose)
+    return _compute_pose(vertices, 0.0, pose)
 
 
 def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
-    """Return a mesh around the object, as it came, as the settings have it: posed about
-    its own middle, where it stands, by those that are called `pose:NAME.yaw` and so on.
+    """Return a mesh around the object as the settings have it.
+
+    It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
+    and so on.
     """
     pose = {
-        own.name: value
-        for own in POSE
-        if (value := values.get(f"pose:{part.name}.{own.name}")) is not None
+        parameter.name: value
+        for parameter in POSE
+        if (value := values.get(f"pose:{part.name}.{parameter.name}")) is not None
     }
     if pose:
-        places = standing(part)
-        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
+        positions = standing(part)
+        pose = {
+            **{parameter.name: float(parameter.default) for parameter in POSE},
+            **pose,
+        }
         part = replace(
             part,
-            to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world,
+            to_world=_compute_pose(positions, float(positions[:, 2].min()), pose)
+            @ part.to_world,
         )
     return replace(
         part, material=part.material.with_values(values, f"material:{part.name}.")
@@ -227,50 +257,63 @@ def standing(part: MeshPart) -> Doubles:
     )
 
 
-def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
-    """Scale and rotate places (V, 3) about the middle of their bounding box by
-    parameters of `settings.POSE`, put the lowest at `floor`, and shift; returns (4, 4).
+def _compute_pose(
+    positions: Doubles, floor: float, pose: Mapping[str, float]
+) -> Doubles:
+    """Return the pose (4, 4) by parameters of `settings.POSE`.
+
+    Scale and rotate positions (V, 3) about the middle of their bounding box, put the
+    lowest at `floor`, and shift.
     """
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
-    lowest = float(((places - middle) @ linear.T)[:, 2].min())
-    place = (
+    lowest = float(((positions - middle) @ linear.T)[:, 2].min())
+    translation = (
         np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
     )
-    place[:2] += middle[:2]
-    return pose_of(linear, place)
+    translation[:2] += middle[:2]
+    return pose_of(linear, translation)
 
 
 def camera_to_world(
     description: SceneDescription, aspect: float | None = None
 ) -> Doubles:
-    """Return the pose of the camera in use, for a picture of an aspect (width over
-    height; None for the description's): by default on an orbit around the middle of the
-    object, looking at it. The camera looks along its own +z with +y up and +x to the
-    left, as Mitsuba's sensors do. It frames the object in its default pose, so that a
-    shifted or scaled object moves in the picture.
+    """Return the pose (4, 4) of the camera in use.
+
+    By default it is on an orbit around the middle of the object, looking at it. The
+    camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors
+    do. It frames the object in its default pose, so that a shifted or scaled object
+    moves in the image.
+
+    Args:
+        description: the scene.
+        aspect: width over height of the image; None for the scene's.
     """
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
-    number = description.number
-    if (asked := description.values["camera.distance"]) is not None:
-        distance = asked / description.metres
+    get_number = description.number
+    if (requested_distance := description.values["camera.distance"]) is not None:
+        distance = requested_distance / description.metres
     else:
         distance = float(
             framing_distance(
                 description,
-                torch.tensor(number("camera.fov"), dtype=torch.float64),
+                torch.tensor(get_number("camera.fov"), dtype=torch.float64),
                 aspect,
             )
         )
-    elevation = number("camera.elevation")
+    elevation = get_number("camera.elevation")
     height = description.values.get("camera.height")
     if height is not None:
-        above = (height / description.metres - float(middle(description)[2])) / distance
-        elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
-    azimuth = description.azimuth_zero + number("camera.azimuth")
-    axes = camera_axes(azimuth, elevation, number("camera.roll"))
+        height_above_center = (
+            height / description.metres - float(middle(description)[2])
+        ) / distance
+        elevation = math.degrees(
+            math.asin(min(max(height_above_center, -STEEPEST), STEEPEST))
+        )
+    azimuth = description.azimuth_zero + get_number("camera.azimuth")
+    axes = camera_axes(azimuth, elevation, get_number("camera.roll"))
     return pose_of(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),
         middle(description) + distance * axes[2],
@@ -283,11 +326,19 @@ def projected(
     points: Tensor,
     size: tuple[int, int],
 ) -> tuple[Tensor, Tensor]:
-    """Return where points (N, 3) float64 in the camera's coordinates are seen by scene
-    inputs, (N, 2) pixels to the right and down from the middle of a picture of a size
-    (height, width), and which are before the camera, (N,) bool.
+    """Return where the camera of scene inputs sees points.
+
+    Args:
+        description: the scene.
+        inputs: of the scene.
+        points: (N, 3) float64 in the camera's coordinates.
+        size: height and width of the image.
+
+    Returns:
+        (N, 2) pixels to the right and down from the middle of the image; (N,) bool,
+            which are before the camera.
     """
-    sides = torch.tensor(size[::-1], dtype=torch.float64)
+    image_size = torch.tensor(size[::-1], dtype=torch.float64)
     # to the right, down and ahead
     points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)
     if (model := description.camera_model) is not None:
@@ -296,8 +347,8 @@ def projected(
             if "camera.lens" in inputs
             else model
         )
-        places, seen = model.project(points)
-        return (places - 0.5) * sides, seen
+        positions, is_visible = model.project(points)
+        return (positions - 0.5) * image_size, is_visible
     fov = (
         inputs.get("camera.fov", torch.tensor(description.number("camera.fov")))
         .double()
@@ -305,16 +356,17 @@ def projected(
     )
     focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
-    places = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
+    positions = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
-            places[:, axis] -= sides[axis] * inputs[name].double().reshape(())
-    return places, depth > NEAREST
+            positions[:, axis] -= image_size[axis] * inputs[name].double().reshape(())
+    return positions, depth > NEAREST
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4),
-    which may be scaled.
+    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4).
+
+    The carrier may be scaled.
     """
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return affine(
@@ -324,22 +376,24 @@ def seated(carrier: Tensor, seat: Tensor) -> Tensor:
 
 
 def driving(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of a car that a camera with the pose (4, 4) looks ahead
-    from: level, with its +x ahead, on the ground below the camera; differentiable.
+    """Return the pose (4, 4) of a car that a camera (4, 4) looks ahead from.
+
+    It is level, with its +x ahead, on the ground below the camera; differentiable.
     """
     ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    none = torch.zeros_like(ahead[0])
-    along = torch.ones_like(ahead[0])
+    zero = torch.zeros_like(ahead[0])
+    one = torch.ones_like(ahead[0])
     axes = torch.stack(
-        [ahead[0], -ahead[1], none, ahead[1], ahead[0], none, none, none, along]
+        [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, one]
     ).reshape(3, 3)
-    return affine(axes, torch.cat([camera[:2, 3], none[None]]))
+    return affine(axes, torch.cat([camera[:2, 3], zero[None]]))
 
 
 @lru_cache(maxsize=4)
 def real_harmonics(height: int, width: int) -> Tensor:
-    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal
-    angles: (height, width, 9). Each has root mean square 1 over the sphere (Ramamoorthi
+    """Return the nine real spherical harmonics of degrees 0 to 2: (height, width, 9).
+
+    Over a map of equal angles. Each has root mean square 1 over the sphere (Ramamoorthi
     and Hanrahan 2001, section 3).
     """
     theta = (torch.arange(height) + 0.5) * math.pi / height
@@ -361,8 +415,9 @@ def real_harmonics(height: int, width: int) -> Tensor:
 
 
 def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix;
-    differentiable.
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
+
+    Differentiable.
     """
     zero = torch.zeros_like(yaw)
     one = torch.ones_like(yaw)
@@ -376,8 +431,7 @@ def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
 
 
 def rotation_vector(degrees: Tensor) -> Tensor:
-    """Return the rotation about the axis of a vector by its length in degrees, (3,) to
-    (3, 3).
+    """Return the rotation (3, 3) about a vector (3,) by its length in degrees.
 
     Rodrigues' formula with guarded series, so that value and derivative are right at
     zero, where the plain formula is NaN.
@@ -414,8 +468,9 @@ def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
 
 
 def put_away(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose
-    (4, 4).
+    """Return the pose (4, 4) of what is out of sight.
+
+    Tiny, behind the camera of a pose (4, 4).
     """
     return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
 
@@ -435,10 +490,18 @@ def overlapping(one: Footprint, other: Footprint) -> bool:
 
 
 def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
-    """Return from where to where one thing overlaps with another as it is shifted along
-    a way (2,), in lengths of that; (inf, -inf) where it never does. By separating axes
-    (Ericson 2005, Real-Time Collision Detection, section 5.2.1), each of which says so
-    of a stretch.
+    """Return over which interval of a shift one footprint overlaps another.
+
+    By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
+    each of which bounds an interval.
+
+    Args:
+        one: the footprint that is shifted.
+        other: the footprint that stays.
+        way: (2,) of the shift; the interval is in its length.
+
+    Returns:
+        Begin and end; (inf, -inf) where they never overlap.
     """
     if min(one.high, other.high) <= max(one.low, other.low):
         return math.inf, -math.inf
@@ -448,17 +511,20 @@ def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, floa
             for points in (one.outline, other.outline)
         ]
     )
-    across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    first = one.outline @ across.T
-    second = other.outline @ across.T
-    speed = across @ way
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    moving_range = one.outline @ normals.T
+    fixed_range = other.outline @ normals.T
+    speed = normals @ way
     reach = np.stack(
-        [second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)]
+        [
+            fixed_range.min(axis=0) - moving_range.max(axis=0),
+            fixed_range.max(axis=0) - moving_range.min(axis=0),
+        ]
     )
-    still = speed == 0.0
-    if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
+    is_parallel = speed == 0.0
+    if (is_parallel & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
         return math.inf, -math.inf
-    stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
+    stretches = np.sort(reach[:, ~is_parallel] / speed[~is_parallel], axis=0)
     begin = float(stretches[0].max())
     end = float(stretches[1].min())
     return (begin, end) if begin < end else (math.inf, -math.inf)

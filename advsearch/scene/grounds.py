@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -35,15 +36,17 @@ Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
 
 
 class Photograph:
-    """The ground that shows an equirectangular map's photograph and catches what the
-    scene does to its light.
+    """The ground that shows the photograph of an equirectangular map.
+
+    It catches what the scene does to the light of the map.
 
     A photographed environment shows the floor that its camera stood on. That part of
     the map is projected from the height of the camera onto the plane z = 0, and the
     plane gets the reflectance that shows the photograph where
     nothing is in the way of the light:
 
-        reflectance(p) = pi map(from (0, 0, height) to p) / E,   E = irradiance of the map's upper half on the plane
+        reflectance(p) = pi map(from (0, 0, height) to p) / E
+        E = irradiance of the map's upper half on the plane
 
     A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' /
     E`: the photograph times what the scene leaves of the light, and adds to it. That is
@@ -63,51 +66,66 @@ class Photograph:
     def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
         self._rows = radiance.shape[0]
         self._first = (self._rows - 1) // 2
-        # rings around the point below the camera, with the map's own coordinates as
-        # texture coordinates
-        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
-        turns = np.linspace(0.0, 1.0, SECTORS + 1)
-        radius, turn = np.meshgrid(radii, turns, indexing="ij")
-        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
-        polar = math.pi - np.arctan(radius)
-        vertices = height * np.stack(
-            [radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1
-        )
-        texels = self._rows - self._first
-        row = polar / math.pi * (self._rows - 1) - self._first
-        uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
-        inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
-        outer = inner + SECTORS + 1
-        further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
-        faces = np.concatenate(
-            [np.stack([outer, inner, outer + 1], axis=1), further]
-        ).astype(np.uint32)
-        normals = np.tile(
-            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
-        )
-        places = vertices.reshape(-1, 3).astype(np.float32)
-        texture = uvs.reshape(-1, 2).astype(np.float32)
-        self.mesh = Mesh(places, faces, normals, texture)
+        self.mesh = self._make_mesh(height, rotation)
         self.base = self.reflectance(
             torch.from_numpy(np.asarray(radiance, dtype=np.float32))
         )
 
+    def _make_mesh(self, height: float, rotation: float) -> Mesh:
+        """Make rings of faces around the point below the camera.
+
+        Their texture coordinates are those of the lower half of the map.
+        """
+        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
+        turns = np.linspace(0.0, 1.0, SECTORS + 1)
+        radius, turn = np.meshgrid(radii, turns, indexing="ij")
+        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
+        vertices = height * np.stack(
+            [radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1
+        )
+        polar = math.pi - np.arctan(radius)
+        n_rows = self._rows - self._first
+        row = polar / math.pi * (self._rows - 1) - self._first
+        uvs = np.stack([turn, 1.0 - (row + 0.5) / n_rows], axis=-1)
+        normals = np.tile(
+            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
+        )
+        return Mesh(
+            vertices.reshape(-1, 3).astype(np.float32),
+            _make_ring_faces(),
+            normals,
+            uvs.reshape(-1, 2).astype(np.float32),
+        )
+
     def reflectance(self, radiance: Tensor) -> Tensor:
-        """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light
-        comes from above. Differentiable; row 0 is the horizon, the last one is straight
-        down, and columns are those of the map.
+        """Return the plane's texture (h, W, 3) for a map of any size.
+
+        0 where no light comes from above. Differentiable; row 0 is the horizon, the
+        last one is straight down, and columns are those of the map.
         """
         rows = radiance.shape[0]
-        at = torch.arange(self._first, self._rows, device=radiance.device) * (
+        position = torch.arange(self._first, self._rows, device=radiance.device) * (
             (rows - 1) / (self._rows - 1)
         )
-        upper = at.floor().long().clamp_max(rows - 2)
-        share = (at - upper)[:, None, None].to(radiance.dtype)
-        lower_half = radiance[upper] + share * (radiance[upper + 1] - radiance[upper])
+        upper = position.floor().long().clamp_max(rows - 2)
+        fraction = (position - upper)[:, None, None].to(radiance.dtype)
+        lower_half = radiance[upper] + fraction * (
+            radiance[upper + 1] - radiance[upper]
+        )
         arriving = irradiance(radiance)
         return torch.where(
             arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
         )
+
+
+def _make_ring_faces() -> npt.NDArray[np.uint32]:
+    """Return the faces (F, 3) of the rings; the innermost are single triangles."""
+    ring_starts = np.arange(RINGS)[:, None] * (SECTORS + 1)
+    inner = (ring_starts + np.arange(SECTORS)).ravel()
+    outer = inner + SECTORS + 1
+    first = np.stack([outer, inner, outer + 1], axis=1)
+    second = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
+    return np.concatenate([first, second]).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
@@ -118,8 +136,9 @@ def photograph_of(
 
 
 def irradiance(radiance: Tensor) -> Tensor:
-    """Return the irradiance (3,) of a map (H, W, 3) on an unshadowed horizontal
-    surface; differentiable.
+    """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
+
+    Differentiable.
     """
     rows, columns = radiance.shape[:2]
     edges = (
@@ -132,12 +151,12 @@ def irradiance(radiance: Tensor) -> Tensor:
 
 
 def paved(scene: SceneDescription) -> bool:
-    """Tell whether the object stands on a road, or on the ground of a place."""
+    """Return whether the object stands on a road, or on the ground of a place."""
     return any(part.is_ground for part in scene.around.values())
 
 
 def has_lanes(scene: SceneDescription) -> bool:
-    """Tell whether the object stands in a lane, where what faces +x drives along it."""
+    """Return whether the object stands in a lane, where what faces +x drives along it."""
     place = find_place(scene)
     return place is not None and place.file.lane_width is not None
 
@@ -148,9 +167,7 @@ CAR_CAMERA = 2.5
 
 
 def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
-    """Tell whether a camera of a pose (4, 4) drives in the object's lane towards its
-    front.
-    """
+    """Return whether a camera (4, 4) drives in the object's lane towards its front."""
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
     ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
@@ -175,9 +192,7 @@ def traffic_remark(scene: SceneDescription) -> str:
 
 
 def enclosed(scene: SceneDescription) -> bool:
-    """Tell whether so much stands around the object that light paths seldom leave the
-    scene.
-    """
+    """Return whether much stands around the object: light paths seldom leave the scene."""
     return any(part.laid and not part.is_ground for part in scene.around.values())
 
 
@@ -196,7 +211,8 @@ PLACES: Mapping[str, tuple[str, str | None]] = {
 
 
 def find_ground_kind(scene: SceneDescription) -> str | None:
-    """Return the kind of ground that a scene's environment and its settings ask for;
+    """Return the kind of ground that a scene's environment and its settings ask for.
+
     None where they name none.
     """
     requested = scene.values.get("ground.kind")
@@ -217,8 +233,9 @@ def find_place(scene: SceneDescription) -> Place | None:
 
 
 def load_requested_place(scene: SceneDescription) -> Place | None:
-    """Return the place that a scene's environment and its settings ask for; None where
-    they ask for none.
+    """Return the place that a scene's environment and its settings ask for.
+
+    None where they ask for none.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
@@ -231,31 +248,32 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
 
 
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the road or the place that its environment and its settings
-    ask for, and no other.
+    """Return the scene with the road or the place that its settings ask for.
+
+    Another one that it had is left out.
     """
     others = tuple(
         part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid)
     )
     place = load_requested_place(scene)
-    if place is not None:
-        light = scene.environment
-        unit = None if light is None else light.candelas
-        is_dark = False
-        if light is not None and unit is not None and place.file.lamps:
-            arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-            is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-        return replace(
-            scene,
-            parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)),
-        )
-    return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
+    if place is None:
+        if len(others) == len(scene.parts):
+            return scene
+        return replace(scene, parts=others)
+    light = scene.environment
+    unit = None if light is None else light.candelas
+    is_dark = False
+    if light is not None and unit is not None and place.file.lamps:
+        arriving = irradiance(torch.from_numpy(light.radiance.copy()))
+        is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
+    place_parts = lay_place(place, scene.metres, unit, is_dark=is_dark)
+    return replace(scene, parts=(*others, *place_parts))
 
 
 DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # How far and how high a camera may go before the picture around a scene no longer fits
 # the ground that is laid in it.
 #
@@ -290,8 +308,9 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of the place in an environment's picture, in the lengths of the
-    camera's distance.
+    """What is known of the place in an environment's picture.
+
+    In the lengths of the camera's distance.
     """
 
     # above the ground from which it was taken; infinite where nothing near is shown
@@ -302,9 +321,11 @@ class Surroundings:
 
 
 class CameraView(NamedTuple):
-    """How a camera looks: its place around the object and where it looks to, degrees of
-    azimuth; its horizontal distance and its height above the ground; and how far below
-    the horizon its picture ends, degrees.
+    """How a camera looks.
+
+    Its place around the object and where it looks to, degrees of azimuth; its
+    horizontal distance and its height above the ground; and how far below the horizon
+    its picture ends, degrees.
     """
 
     azimuth: float
@@ -315,64 +336,71 @@ class CameraView(NamedTuple):
 
 
 def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
-    """Return up to which horizontal distance from the object, and up to which height
-    above the ground, an environment's picture fits a camera that looks as this one does
-    (its own distance does not count): in the lengths of `environment`, infinite without
-    a bound, 0 where it fits nowhere. See above.
+    """Return up to which distance and height a picture fits a camera.
+
+    In the lengths of `environment`, infinite without a bound, 0 where it fits nowhere;
+    see above. The camera's own distance does not count.
     """
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
-    behind = (FACTOR - 1.0) * _reach(environment.stands, camera.towards)
+    behind = (FACTOR - 1.0) * _reach_of_area(environment.stands, camera.towards)
     unseen = (
         math.inf
         if camera.lowest <= 0.0
         else camera.height / math.tan(math.radians(min(camera.lowest, 179.0)))
     )
     return max(
-        0.0, min(behind, _reach(environment.laid, camera.azimuth) + unseen)
+        0.0, min(behind, _reach_of_area(environment.laid, camera.azimuth) + unseen)
     ), FACTOR * environment.height
 
 
-def _reach(area: Box | float, azimuth: float) -> float:
+def _reach_of_area(area: Box | float, azimuth: float) -> float:
     if isinstance(area, float):
         return area
     x = math.cos(math.radians(azimuth))
     y = math.sin(math.radians(azimuth))
-    across = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
-    return min(across, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
+    x_reach = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
+    return min(x_reach, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
 
 
 def surroundings_of(scene: SceneDescription) -> Surroundings | None:
-    """Return what is known of the place in a scene's environment; None where nothing of
-    it has to fit a ground.
+    """Return what is known of the place in a scene's environment.
+
+    None where nothing of it has to fit a ground.
     """
-    lit = scene.environment
+    environment = scene.environment
     # what encloses the object is geometry, true from everywhere
-    if lit is None or scene.backdrop or enclosed(scene):
+    if environment is None or scene.backdrop or enclosed(scene):
         return None
     place = find_place(scene)
-    laid: Box | float = math.inf if place is None else bound_ground(place)
-    bundled = PLACES.get(lit.ground or "")
-    shown = lit.place if bundled is None else load_bundled_place(*bundled)
-    if place is not None and shown is not None and shown.file.picture is not None:
-        picture = shown.file.picture
+    extent: Box | float = math.inf if place is None else bound_ground(place)
+    bundled = PLACES.get(environment.ground or "")
+    pictured_place = (
+        environment.place if bundled is None else load_bundled_place(*bundled)
+    )
+    if (
+        place is not None
+        and pictured_place is not None
+        and pictured_place.file.picture is not None
+    ):
+        picture = pictured_place.file.picture
         return Surroundings(
             picture.height,
             (*picture.x, *picture.y),
-            laid,
+            extent,
             scene.number("environment.rotation"),
         )
-    if lit.photographed and (paved(scene) or scene.photograph is not None):
+    if environment.photographed and (paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.metres
         radius = scene.values.get("ground.radius")
-        return Surroundings(height, RADIUS * height if radius is None else radius, laid)
-    return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
+        return Surroundings(
+            height, RADIUS * height if radius is None else radius, extent
+        )
+    return Surroundings(math.inf, math.inf, extent) if paved(scene) else None
 
 
 def bound_ground(place: Place) -> Box:
-    """Return from where to where the ground of a place reaches in x and in y,
-    metres.
-    """
+    """Return the bounds of the ground of a place in x and in y, metres."""
     vertices = np.concatenate(
         [part.mesh.vertices for part in place.parts if part.is_ground]
     )
@@ -384,25 +412,26 @@ def bound_ground(place: Place) -> Box:
 def view_of(
     scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None
 ) -> CameraView:
-    """Return how a scene is looked at: by its own camera, or by one with another pose
-    (4, 4) or field of view.
+    """Return how a scene is looked at.
+
+    By its own camera, or by one with another pose (4, 4) or field of view.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
     ahead = pose[:3, 2]
     half = math.radians(scene.number("camera.fov") if fov is None else fov) / 2.0
-    below = math.degrees(math.atan(math.tan(half) * min(1.0, 1.0 / scene.aspect)))
+    half_height = math.degrees(math.atan(math.tan(half) * min(1.0, 1.0 / scene.aspect)))
     if scene.camera_model is not None and scene.camera_model.name:
-        below = 90.0
+        half_height = 90.0
     azimuth = math.degrees(math.atan2(y, x))
-    level = math.hypot(ahead[0], ahead[1])
-    towards = (
+    level_length = math.hypot(ahead[0], ahead[1])
+    direction = (
         math.degrees(math.atan2(ahead[1], ahead[0]))
-        if level > 1e-6
+        if level_length > 1e-6
         else azimuth + 180.0
     )
-    lowest = below - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
-    return CameraView(azimuth, towards, math.hypot(x, y), float(z), lowest)
+    lowest = half_height - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
+    return CameraView(azimuth, direction, math.hypot(x, y), float(z), lowest)
 
 
 def place_of(view: CameraView) -> Doubles:
@@ -420,72 +449,89 @@ def place_of(view: CameraView) -> Doubles:
 def past(
     scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False
 ) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, go past what its
-    environment's picture is valid for; `turns`: that is turned from view to view.
+    """Return remarks where views go past what an environment's picture is valid for.
+
+    Args:
+        scene: that is looked at.
+        views: at least one.
+        turns: whether the map is rotated from view to view.
     """
-    around = surroundings_of(scene)
+    surroundings = surroundings_of(scene)
     place = find_place(scene)
     outside = () if place is None else remark_outside(scene, place, views)
-    if outside or around is None:
+    if outside or surroundings is None:
         return outside
     name = scene.environment_name
-    unit = "m" if scene.object.metres is not None else "object sizes"
-    if valid(around, views[0]) == (0.0, 0.0) or (
-        turns and isinstance(around.stands, tuple)
-    ):
+    is_against_road = valid(surroundings, views[0]) == (0.0, 0.0)
+    if is_against_road or (turns and isinstance(surroundings.stands, tuple)):
         return (
             f"{name}: its houses are a picture, which `environment.rotation` turns "
             "against the road: they then stand "
             "across it; leave the rotation out",
         )
-    limits = [valid(around, view) for view in views]
-    each = zip(views, limits, strict=True)
+    limits = [valid(surroundings, view) for view in views]
     beyond = [
-        view for view, (far, high) in each if view.distance > far or view.height > high
+        view
+        for view, (distance, height) in zip(views, limits, strict=True)
+        if view.distance > distance or view.height > height
     ]
     if not beyond:
         return ()
-    near = min(limits)[0]
-    far = max(limits)[0]
-    which = (
-        f"{near:.3g} {unit}"
-        if far < 1.05 * near
-        else (f"{near:.3g} to {far:.3g} {unit} (by where it looks)")
-    )
-    high = f" and {limits[0][1]:.3g} {unit} high" if math.isfinite(limits[0][1]) else ""
-    reach = max(view.distance for view in beyond)
-    top = max(view.height for view in beyond)
-    share = len(beyond) / len(views)
-    there = (
-        "the camera is"
-        if len(views) == 1
-        else (f"{100.0 * share:.0f} % of the views are past that, up to")
-    )
+    unit = "m" if scene.object.metres is not None else "object sizes"
+    who = "the camera is"
+    if len(views) > 1:
+        percentage = 100.0 * (len(beyond) / len(views))
+        who = f"{percentage:.0f} % of the views are past that, up to"
+    farthest = max(view.distance for view in beyond)
+    highest = max(view.height for view in beyond)
     return (
         f"{name}: the place around the object is a picture, which fits a camera up to "
-        f"{which} away{high}; {there} "
-        f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around "
-        "is more than twice too large or "
+        f"{_describe_limits(limits, unit)}; {who} "
+        f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
+        "around is more than twice too large or "
         "too high, or the ground ends in sight: predictions from there are about the "
         "picture, not about a real place",
     )
 
 
+def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
+    """Return up to where an environment's picture fits a camera, for a message.
+
+    Args:
+        limits: distance and height of each view, see `valid`.
+        unit: of these.
+    """
+    smallest = min(limits)[0]
+    largest = max(limits)[0]
+    distance = f"{smallest:.3g} {unit}"
+    if largest >= 1.05 * smallest:
+        distance = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    max_height = limits[0][1]
+    height = f" and {max_height:.3g} {unit} high" if math.isfinite(max_height) else ""
+    return f"{distance} away{height}"
+
+
 def remark_outside(
     scene: SceneDescription, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return what is said where views of a scene, at least one, are outside of what its
-    place holds for.
+    """Return a remark where views are outside of what the place is valid for.
+
+    Args:
+        scene: that is looked at.
+        place: of the scene.
+        views: at least one.
     """
     bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
     positions = np.array([place_of(view) for view in views])
     is_outside = np.zeros(len(views), bool)
-    for axis, (low, high) in bounds:
-        along = positions[:, "xyz".index(axis)]
-        is_outside |= (along < low) | (along > high)
+    for axis, (lower, upper) in bounds:
+        coordinate = positions[:, "xyz".index(axis)]
+        is_outside |= (coordinate < lower) | (coordinate > upper)
     if not is_outside.any():
         return ()
-    box = " and ".join(f"{axis} {low:g} to {high:g} m" for axis, (low, high) in bounds)
+    box = " and ".join(
+        f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in bounds
+    )
     x, y, z = positions[int(is_outside.argmax())]
     first = f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
     which = f"the camera is outside, at {first}"

@@ -5,13 +5,15 @@ A headlamp is a point that shines by a table of luminous intensity over angles, 
 glass that glows. Of one lamp, at h degrees aside and v above the horizon, with d =
 -0.57 - v, the angle below the cut-off:
 
-    low:  (14,500 exp(-(h/5)^2/2) exp(-d/1.5) + 4,000 exp(-(h/16)^2/2) exp(-d/5)) / (1 + exp(-d/0.08))      candela
+    low:  (14,500 exp(-(h/5)^2/2) exp(-d/1.5) + 4,000 exp(-(h/16)^2/2) exp(-d/5))
+          / (1 + exp(-d/0.08)) candela
     high: low + 45,000 exp(-(h/3.5)^2/2 - (v/1.5)^2/2)
 
 The cut-off is level, 1 % below the horizon; a real one rises on the side of the kerb.
 These numbers fulfil what a lamp of class B has to (UN Regulation 112, section 6.2 and
 6.3): at 0.86 degrees down at least 5,100 cd ahead and 10,100 at
-1.72 aside, at 1.72 down at least 1,700 at 9 aside, above the horizon at most 350 to 625, of the high beam 40,500. The
+1.72 aside, at 1.72 down at least 1,700 at 9 aside, above the horizon at most 350 to
+625, of the high beam 40,500. The
 glass of a headlamp shines 250 cd ahead, which is what is left above the cut-off, and
 that of a tail lamp 10 cd in red (UN Regulation 7: from 4).
 `tests/scene/test_headlamps.py` holds them to these.
@@ -82,8 +84,9 @@ OUT = 0.004  # how far glass stands out from what it lies on, metres
 
 
 def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
-    """Return the luminous intensity of one headlamp, "low" or "high", at degrees aside
-    and up; see above.
+    """Return the luminous intensity of one headlamp, "low" or "high"; see above.
+
+    `h` and `v` are degrees aside and up.
     """
     below = CUT_OFF - v
     spot = 14500.0 * np.exp(-((h / 5.0) ** 2) / 2.0 - below.clip(0.0) / 1.5)
@@ -99,8 +102,9 @@ def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
 
 @lru_cache(maxsize=2)
 def table(kind: str) -> Floats:
-    """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it,
-    candela; row 0 on top.
+    """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
+
+    In candela; row 0 on top.
     """
     up = SIDES * ROWS / COLUMNS
     aside, above = np.meshgrid(
@@ -119,50 +123,67 @@ def table(kind: str) -> Floats:
 
 
 def with_lamps(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the lamps that its object, its things and its camera's car
-    have on, and no others. Raises InputError: the light of the environment has no unit,
-    the object's size is not known, or a name is taken.
+    """Return the scene with the lamps that are on, and no others.
+
+    Those of its object, its things and the car of its camera.
+
+    Raises:
+        InputError: the light of the environment has no unit, the object's size is not
+            known, or a name is taken.
     """
     others = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
-    asked = {
+    kind_by_carrier = {
         "object": chosen(scene, "object.lamps"),
         CAMERA: chosen(scene, "camera.lamps"),
     }
-    asked |= {part.name: part.lamps for part in others if isinstance(part, ThingPart)}
-    asked = {carrier: kind for carrier, kind in asked.items() if kind != LAMPS[0]}
-    if not asked:
-        return (
-            scene if len(others) == len(scene.parts) else replace(scene, parts=others)
+    for part in others:
+        if isinstance(part, ThingPart):
+            kind_by_carrier[part.name] = part.lamps
+    lit = {
+        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS[0]
+    }
+    if not lit:
+        if len(others) == len(scene.parts):
+            return scene
+        return replace(scene, parts=others)
+    unit = _check_units(scene, next(iter(lit)))
+    scene = replace(scene, parts=others)
+    weight = 1.0 / (2 * len(lit))
+    lamps: list[ScenePart] = []
+    for carrier, kind in lit.items():
+        lamps += _make_lamps(scene, carrier, kind, unit, weight)
+    duplicates = {part.name for part in others} & {lamp.name for lamp in lamps}
+    if duplicates:
+        raise InputError(
+            "things: lamps of the scene are called "
+            f"{', '.join(sorted(duplicates))}; give yours another name="
         )
+    return replace(scene, parts=(*others, *lamps))
+
+
+def _check_units(scene: SceneDescription, carrier: str) -> float:
+    """Return the luminance of a radiance of 1, cd/m2.
+
+    Raises InputError: there is none, or metres are not known.
+    """
+    settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
+    setting = settings.get(carrier, "things: lamps")
     unit = None if scene.environment is None else scene.environment.candelas
-    who = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}.get(
-        next(iter(asked)), "things: lamps"
-    )
     if unit is None:
         raise InputError(
-            f"{who}: lamps are in candela, and the brightness of this environment has "
-            "no unit; take one of the avenue, "
+            f"{setting}: lamps are in candela, and the brightness of this environment "
+            "has no unit; take one of the avenue, "
             "or leave the lamps off"
         )
     if scene.object.metres is None:
         raise InputError(
-            f"{who}: lamps are so many metres apart, and how large {scene.object_name} "
-            "is is not known; give its "
+            f"{setting}: lamps are so many metres apart, and how large "
+            f"{scene.object_name} is is not known; give its "
             "longest side in metres, such as `size=4.5`"
         )
-    scene = replace(scene, parts=others)
-    made: list[ScenePart] = []
-    for carrier, kind in asked.items():
-        made += _lamps_of(scene, carrier, kind, unit, 1.0 / (2 * len(asked)))
-    taken = {part.name for part in others} & {part.name for part in made}
-    if taken:
-        raise InputError(
-            "things: lamps of the scene are called "
-            f"{', '.join(sorted(taken))}; give yours another name="
-        )
-    return replace(scene, parts=(*others, *made))
+    return unit
 
 
 def chosen(scene: SceneDescription, setting: str) -> str:
@@ -170,33 +191,38 @@ def chosen(scene: SceneDescription, setting: str) -> str:
     return LAMPS[int(scene.values.get(setting) or 0.0)]
 
 
-def _lamps_of(
+def _make_lamps(
     scene: SceneDescription, carrier: str, kind: str, unit: float, weight: float
 ) -> Iterable[ScenePart]:
-    sides = (1.0, -1.0)
+    """Yield the lamps of one car: the glass of a mesh, and two beams.
+
+    Args:
+        scene: in which they shine.
+        carrier: the mesh that carries them, or `CAMERA`.
+        kind: "low" or "high".
+        unit: luminance of a radiance of 1, cd/m2.
+        weight: of each beam, see `BeamLamp`.
+    """
     if carrier == CAMERA:
-        places = [
-            np.array([EGO[0], side * EGO[1], EGO[2]]) / scene.metres for side in sides
+        ahead, aside, above = EGO
+        positions = [
+            np.array([ahead, side * aside, above]) / scene.metres
+            for side in (1.0, -1.0)
         ]
     else:
         part = scene.meshes[carrier]
         metres = part.metres if isinstance(part, ThingPart) else scene.metres
         # a metre in its coordinates
         step = float(np.ptp(part.mesh.vertices, axis=0).max()) / metres
-        front = _glass(part, "headlamps", 1.0, step, GLASS / unit * WHITE)
-        yield from (front, _glass(part, "taillamps", -1.0, step, REAR / unit * RED))
-        vertices = front.mesh.vertices
-        places = []
-        for side in sides:
-            lamp = vertices[side * (vertices[:, 1] - vertices[:, 1].mean()) >= 0.0]
-            low = lamp.min(axis=0)
-            high = lamp.max(axis=0)
-            places.append(
-                np.array([high[0] + 5.0 * OUT * step, *(low + high)[1:] / 2.0])
-            )
+        front = _make_glass(part, "headlamps", 1.0, step, GLASS / unit * WHITE)
+        yield from (
+            front,
+            _make_glass(part, "taillamps", -1.0, step, REAR / unit * RED),
+        )
+        positions = _find_beam_positions(front.mesh.vertices, step)
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
-    for name, place in zip(("left", "right"), places, strict=True):
-        seat = pose_of([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], place)
+    for name, position in zip(("left", "right"), positions, strict=True):
+        seat = pose_of([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], position)
         yield BeamLamp(
             f"{carrier}-{name}-beam",
             carrier,
@@ -207,23 +233,48 @@ def _lamps_of(
         )
 
 
-def _glass(
+def _find_beam_positions(vertices: Floats, step: float) -> list[Doubles]:
+    """Return where the left and the right beam start, before the glass of a car.
+
+    Args:
+        vertices: (V, 3) of the glass.
+        step: a metre in the car's coordinates.
+    """
+    positions = []
+    for side in (1.0, -1.0):
+        offset = vertices[:, 1] - vertices[:, 1].mean()
+        lamp = vertices[side * offset >= 0.0]
+        lower = lamp.min(axis=0)
+        upper = lamp.max(axis=0)
+        middle = (lower + upper)[1:] / 2.0
+        positions.append(np.array([upper[0] + 5.0 * OUT * step, *middle]))
+    return positions
+
+
+def _make_glass(
     part: MeshPart, where: str, ahead: float, step: float, power: Doubles
 ) -> LampGlass:
-    """The glass of a car's two headlamps or tail lamps (`where`, of `NAMED`), which
-    shine along its x axis by `ahead`: the faces of a material that is called so, or
-    else two disks before what is foremost there; `step` is a metre in the car's
-    coordinates, `power` (3,) the radiance times square metres that each of the two
-    sends there.
+    """Return the glass of a car's two headlamps or tail lamps.
+
+    It is the faces of a material with such a name, or else two disks before what is
+    foremost there.
+
+    Args:
+        part: the car.
+        where: of `NAMED`.
+        ahead: 1 for lamps that shine along +x, -1 along -x.
+        step: a metre in the car's coordinates.
+        power: (3,) the radiance times square metres that each of the two sends
+            there.
     """
     mesh = part.mesh
-    named = [
+    named_faces = [
         faces
         for name, faces in mesh.materials.items()
         if NAMED[where].search(name) and len(faces)
     ]
-    if named:
-        lies_on = np.concatenate(named)
+    if named_faces:
+        lies_on = np.concatenate(named_faces)
         follows, faces = np.unique(
             mesh.faces[lies_on].astype(np.int64), return_inverse=True
         )
@@ -231,21 +282,21 @@ def _glass(
         normals = mesh.normals[follows].astype(np.float64)
         vertices = mesh.vertices[follows] + OUT * step * normals
     else:
-        vertices, faces = _disks(mesh, where, ahead, step)
+        vertices, faces = _make_disks(mesh, where, ahead, step)
         normals = np.tile([[ahead, 0.0, 0.0]], (len(vertices), 1))
         follows = cKDTree(mesh.vertices).query(vertices)[1]
         lies_on = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(
             vertices[faces].mean(axis=1)
         )[1]
     corners = vertices[faces] / step
-    across = ahead * face_vectors(corners)[:, 0] / 2.0
+    facing_area = ahead * face_vectors(corners)[:, 0] / 2.0
     shape = (
         vertices.astype(np.float32),
         faces.astype(np.uint32),
         normals.astype(np.float32),
         mesh.uvs[follows],
     )
-    radiance = 2.0 * power / max(float(across.clip(0.0).sum()), 1e-9)
+    radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
         name=f"{part.name}-{where}",
         mesh=Mesh(*shape),
@@ -258,35 +309,47 @@ def _glass(
     )
 
 
-def _disks(mesh: Mesh, where: str, ahead: float, step: float) -> tuple[Doubles, Ints]:
+def _make_disks(
+    mesh: Mesh, where: str, ahead: float, step: float
+) -> tuple[Doubles, Ints]:
+    """Make two disks before what is foremost of a car, for lamps without a material.
+
+    Args:
+        mesh: of the car.
+        where: of `NAMED`.
+        ahead: 1 for lamps that shine along +x, -1 along -x.
+        step: a metre in the car's coordinates.
+
+    Returns:
+        Vertices (V, 3) and faces (F, 3).
+    """
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [ahead, 1.0, 1.0]
-    low = corners.min(axis=(0, 1))
-    high = corners.max(axis=(0, 1))
-    (height, share) = HEIGHTS[where]
-    wide = high[1] - low[1]
+    lower = corners.min(axis=(0, 1))
+    upper = corners.max(axis=(0, 1))
+    height, height_fraction = HEIGHTS[where]
+    width = upper[1] - lower[1]
     turn = ahead * np.linspace(0.0, 2.0 * np.pi, SPOKES, endpoint=False)
-    rim = min(RADIUS * step, 0.1 * wide) * np.stack(
-        [0.0 * turn, np.cos(turn), np.sin(turn)], axis=1
-    )
+    circle = np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
+    rim = min(RADIUS * step, 0.1 * width) * circle
     vertices = list[Doubles]()
-    faces = list[Ints]()
     for side in (1.0, -1.0):
-        middle = np.array([0.0, (low[1] + high[1]) / 2.0 + side * ASIDE * wide, low[2]])
-        middle[2] += min(height * step, share * (high[2] - low[2]))
-        disk = np.concatenate([[middle], middle + rim])
-        beside = (corners.min(axis=1) > disk.max(axis=0)) | (
-            corners.max(axis=1) < disk.min(axis=0)
-        )
-        near = corners[~beside[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-        foremost = max(
-            (x for place in disk[:, 1:] for x in heights_over(near, place)),
-            default=high[0],
-        )
-        disk[:, 0] = ahead * (foremost + OUT * step)
-        spokes = np.arange(SPOKES)
-        faces.append(
-            len(vertices) * len(disk)
-            + np.stack([0 * spokes, 1 + spokes, 1 + (spokes + 1) % SPOKES], axis=1)
-        )
+        center_y = (lower[1] + upper[1]) / 2.0 + side * ASIDE * width
+        center = np.array([0.0, center_y, lower[2]])
+        center[2] += min(height * step, height_fraction * (upper[2] - lower[2]))
+        disk = np.concatenate([[center], center + rim])
+        disk[:, 0] = ahead * (_find_foremost(corners, disk, upper[0]) + OUT * step)
         vertices.append(disk)
-    return np.concatenate(vertices), np.concatenate(faces)
+    spoke = np.arange(SPOKES)
+    disk_faces = np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % SPOKES], axis=1)
+    faces = np.concatenate([disk_faces, (1 + SPOKES) + disk_faces])
+    return np.concatenate(vertices), faces
+
+
+def _find_foremost(corners: Doubles, disk: Doubles, otherwise: float) -> float:
+    """Return the largest x of triangles (F, 3, 3) where a disk (V, 3) covers them."""
+    is_apart = (corners.min(axis=1) > disk.max(axis=0)) | (
+        corners.max(axis=1) < disk.min(axis=0)
+    )
+    near = corners[~is_apart[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
+    heights = [x for point in disk[:, 1:] for x in heights_over(near, point)]
+    return max(heights, default=otherwise)

@@ -8,8 +8,8 @@ read through `importlib.resources`.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
 from pathlib import Path
@@ -41,16 +41,21 @@ SIDE = 256  # texels along the maps of roughness, metal and clear coat
 def finished(
     mesh: Mesh, finishes: Mapping[str, Material], main: Material
 ) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it:
-    some materials of the mesh as `finishes` say, and all other faces like `main`, whose
+    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
+
+    Some materials of the mesh as `finishes` say, and all other faces like `main`, whose
     `specular` holds for all.
     """
-    faces = np.tile(
+    face_values = np.tile(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
     )
-    for name, one in finishes.items():
-        faces[mesh.materials[name]] = one.roughness, one.metallic, one.clearcoat
-    maps = faces[rasterised(mesh, SIDE).face].astype(np.float32)
+    for name, finish in finishes.items():
+        face_values[mesh.materials[name]] = (
+            finish.roughness,
+            finish.metallic,
+            finish.clearcoat,
+        )
+    texel_values = face_values[rasterised(mesh, SIDE).face].astype(np.float32)
     surface: dict[str, object] = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
@@ -58,7 +63,7 @@ def finished(
         "clearcoat_gloss": 1.0,
     }
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
-        picture = maps[:, :, channel : channel + 1]
+        picture = texel_values[:, :, channel : channel + 1]
         surface[name] = {
             "type": "bitmap",
             "bitmap": picture,
@@ -80,7 +85,7 @@ MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, wor
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
-def _data() -> Traversable:
+def _data_directory() -> Traversable:
     return resources.files("advsearch.bundled") / "data"
 
 
@@ -88,69 +93,51 @@ def list_objects() -> tuple[str, ...]:
     return tuple(
         sorted(
             p.name
-            for p in (_data() / "objects").iterdir()
+            for p in (_data_directory() / "objects").iterdir()
             if (p / "mesh.ply").is_file()
         )
     )
 
 
 def list_environments(split: str | None = None) -> tuple[str, ...]:
-    """Return the names of bundled environments, sorted; of the half "train" or
-    "heldout", "street" or "place".
+    """Return the sorted names of bundled environments.
+
+    `split` selects those of "train", "heldout", "street" or "place".
     """
-    facts = _environments().items()
+    facts = _read_environment_facts().items()
     return tuple(
         sorted(name for name, fact in facts if split is None or fact["split"] == split)
     )
 
 
-def _environments() -> dict[str, dict[str, Any]]:
-    text = (_data() / "environments" / "environments.json").read_text("utf-8")
+def _read_environment_facts() -> dict[str, dict[str, Any]]:
+    text = (_data_directory() / "environments" / "environments.json").read_text("utf-8")
     facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
 
 def load_object(name: str) -> ObjectAsset:
-    """Return a bundled object, its largest extent 1, standing on z = 0. Raises
-    UnknownNameError: there is no such object. Raises FileFormatError: the installation
-    is damaged.
+    """Return a bundled object, its largest extent 1, standing on z = 0.
+
+    Raises:
+        FileFormatError: the installation is damaged.
+        UnknownNameError: there is no such object.
     """
     import imageio.v3 as iio  # most scenes need no such file
 
     known = list_objects()
     if name not in known:
         raise UnknownNameError("object", name, known, OBJECT_HINT)
-    folder = _data() / "objects" / name
+    directory = _data_directory() / "objects" / name
     try:
-        facts = json.loads((folder / "object.json").read_text("utf-8"))
-        runs = facts.get("faces", ())  # how many faces in a row have which material
-        names = np.repeat([name for name, _ in runs], [count for _, count in runs])
-        materials = {
-            str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)
-        }
-        elements, _ = read_elements((folder / "mesh.ply").read_bytes(), Notes(name))
-        vertex = elements["vertex"].scalars
-        faces = elements["face"].listed["vertex_indices"].values
-        places, normals, uvs = (
-            np.stack([vertex[number] for number in numbers], axis=1).astype(np.float32)
-            for numbers in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
-        )
-        mesh = Mesh(
-            places,
-            faces.reshape(-1, 3).astype(np.uint32),
-            normals,
-            uvs,
-            materials=materials,
-        )
-        if (folder / "body.npz").is_file():
-            mesh = replace(mesh, rig=make_person())
-        levels = np.asarray(
-            iio.imread((folder / "base_color.png").read_bytes(), extension=".png")
-        )[..., :3]
+        facts = json.loads((directory / "object.json").read_text("utf-8"))
+        mesh = _read_mesh(name, directory, facts.get("faces", ()))
+        content = (directory / "base_color.png").read_bytes()
+        levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
         material = Material(**facts["material"])
         finishes = {
-            finish: Material(**numbers)
-            for finish, numbers in facts.get("finishes", {}).items()
+            finish: Material(**values)
+            for finish, values in facts.get("finishes", {}).items()
         }
         return ObjectAsset(
             name=name,
@@ -170,9 +157,46 @@ def load_object(name: str) -> ObjectAsset:
         ) from error
 
 
+def _read_mesh(
+    name: str, directory: Traversable, material_runs: Sequence[tuple[str, int]]
+) -> Mesh:
+    """Read the mesh of a bundled object.
+
+    Args:
+        name: of the object, for messages.
+        directory: of its files.
+        material_runs: names of materials, each with how many faces in a row have it.
+    """
+    material_of_face = np.repeat(
+        [material for material, _ in material_runs],
+        [count for _, count in material_runs],
+    )
+    materials = {
+        str(material): np.nonzero(material_of_face == material)[0]
+        for material in dict.fromkeys(material_of_face)
+    }
+    elements, _ = read_elements((directory / "mesh.ply").read_bytes(), Notes(name))
+    columns = elements["vertex"].scalars
+    faces = elements["face"].listed["vertex_indices"].values
+    positions, normals, uvs = (
+        np.stack([columns[axis] for axis in axes], axis=1).astype(np.float32)
+        for axes in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
+    )
+    has_body = (directory / "body.npz").is_file()
+    return Mesh(
+        positions,
+        faces.reshape(-1, 3).astype(np.uint32),
+        normals,
+        uvs,
+        materials=materials,
+        rig=make_person() if has_body else None,
+    )
+
+
 def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
-    """Return the bundled body, with other defaults of the control `body` such as
-    ``{"height": 1.8}``.
+    """Return the bundled body, with other defaults such as ``{"height": 1.8}``.
+
+    See the control `body`.
     """
     # torch takes seconds, and most objects have no body
     from advsearch.scene.people import Person, body_data
@@ -181,16 +205,19 @@ def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
 
 
 def load_environment(name: str) -> EnvironmentAsset:
-    """Return a bundled environment. Raises UnknownNameError; FileFormatError: the
-    installation is damaged.
+    """Return a bundled environment.
+
+    Raises:
+        FileFormatError: the installation is damaged.
+        UnknownNameError: there is no such environment.
     """
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
-    facts = _environments()[name]
+    facts = _read_environment_facts()[name]
     try:
         content = (
-            _data() / "environments" / f"{facts.get('map', name)}.exr"
+            _data_directory() / "environments" / f"{facts.get('map', name)}.exr"
         ).read_bytes()
         radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(
             np.float32
@@ -220,9 +247,13 @@ SMALLEST = (4, 8)
 
 @dataclass(frozen=True, eq=False)
 class LightPicture:
-    """A picture in linear radiance: its size in rows and columns; `band`, which returns
-    the rows from its first argument to before its second, (n, W, 3) float32; and
-    clauses about what is left out.
+    """An image in linear radiance.
+
+    Attributes:
+        size: rows and columns.
+        band: returns the rows from its first argument to before its second, (n, W,
+            3) float32.
+        notes: clauses about what is left out.
     """
 
     size: tuple[int, int]
@@ -231,8 +262,9 @@ class LightPicture:
 
 
 def read_light(path: Path, what: str = "environment") -> LightPicture:
-    """Read an ``.hdr`` or ``.exr`` picture of any shape; errors as for
-    `import_environment`.
+    """Read an ``.hdr`` or ``.exr`` image of any shape.
+
+    Errors are those of `import_environment`.
     """
     data = read_bytes(path, what, SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -270,9 +302,13 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
-    """Read an equirectangular environment map: a Radiance ``.hdr`` (RGBE), or an
-    ``.exr`` with channels R, G and B, or Y alone (grey), in half or float; see
+    """Read an equirectangular environment map from an ``.hdr`` or ``.exr`` file.
+
+    An ``.exr`` has channels R, G and B, or Y alone (grey), in half or float; see
     `advsearch.scene.importing.hdr`.
+
+    A Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone
+    (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
     Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle
     that it covers, so that the light from each direction stays the same in the mean.
@@ -290,7 +326,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _sized(picture.band, picture.size)
+    radiance = _resize_map(picture.band, picture.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"
@@ -304,9 +340,10 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     )
 
 
-def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, and repeat its texels up to at least
-    `SMALLEST`; see `LightPicture`.
+def _resize_map(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
+    """Average a map down to at most `LARGEST`, or repeat texels up to `SMALLEST`.
+
+    See `LightPicture`.
     """
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
@@ -325,10 +362,11 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
             )
             / covered
         )
-    down, across = (
-        -(-least // extent)
-        for least, extent in zip(SMALLEST, texels.shape[:2], strict=True)
+    repeat_rows, repeat_columns = (
+        -(-smallest // extent)
+        for smallest, extent in zip(SMALLEST, texels.shape[:2], strict=True)
     )
     return np.asarray(
-        texels.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32
+        texels.repeat(repeat_rows, axis=0).repeat(repeat_columns, axis=1),
+        dtype=np.float32,
     )

@@ -86,9 +86,10 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class LampGlass(MeshPart):
-    """The glass of a car's lamps, which shines; it stands in the car's own coordinates,
-    and belongs to it: to the mesh that carries it, with whose vertices (V,) its own go,
-    and on whose faces (F,) its own lie.
+    """The glass of a car's lamps, which shines.
+
+    It stands in the car's own coordinates, and belongs to it: to the mesh that carries
+    it, with whose vertices (V,) its own go, and on whose faces (F,) its own lie.
     """
 
     carrier: str = ""
@@ -114,17 +115,20 @@ class _Point(ScenePart):
     intensity: Triple = (0.0, 0.0, 0.0)
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the way from a place (3,) to the lamp, and the irradiance (3,) where
-        that is faced; base values.
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
+
+        The irradiance is that of a surface that faces the lamp. By base values.
         """
-        way = np.array(self.position) - place
-        return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
+        to_lamp = np.array(self.position) - place
+        return to_lamp, np.array(self.intensity) / max(float(to_lamp @ to_lamp), 1e-12)
 
 
 class PointLamp(_Point):
-    """A point that shines equally in all directions. Takes `NAME.position` (3,) in
-    object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior
-    adjoint is right for the intensity; for a position Mitsuba raises.
+    """A point that shines equally in all directions.
+
+    Takes `NAME.position` (3,) in object sizes and `NAME.intensity` (3,) linear radiant
+    intensity. The interior adjoint is right for the intensity; for a position Mitsuba
+    raises.
     """
 
 
@@ -135,10 +139,12 @@ SOFTEST = 0.99  # largest share of that angle at which the light begins to fall 
 
 @dataclass(frozen=True, eq=False)
 class SpotLamp(_Point):
-    """A point that shines in a cone, as Mitsuba's `spot`. Up to `beam` from its axis it
-    shines evenly, and from there to `cutoff` its intensity, which is that on the axis,
-    falls off linearly with the angle. Takes `NAME.intensity` (3,) linear radiant
-    intensity, for which the interior adjoint is right.
+    """A point that shines in a cone, as Mitsuba's `spot`.
+
+    Up to `beam` from its axis it shines evenly, and from there to `cutoff` its
+    intensity, which is that on the axis, falls off linearly with the angle. Takes
+    `NAME.intensity` (3,) linear radiant intensity, for which the interior adjoint is
+    right.
     """
 
     # unit vector along its axis; z down where that is 0
@@ -171,17 +177,21 @@ class SpotLamp(_Point):
         )
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        way, faced = super().lighting(place)
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
+        to_lamp, irradiance = super().lighting(place)
         cutoff, beam = self.cone
-        along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
-        angle = math.degrees(math.acos(min(max(float(along), -1.0), 1.0)))
-        return way, faced * min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
+        distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
+        cosine = -to_lamp @ self.to_world[:3, 2] / distance
+        angle = math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
+        fraction = min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
+        return to_lamp, irradiance * fraction
 
 
 @dataclass(frozen=True, eq=False)
 class BallLamp(ScenePart):
-    """A ball that shines outwards with the same radiance everywhere; the camera sees it
-    where it is in view.
+    """A ball that shines outwards with the same radiance everywhere.
+
+    The camera sees it where it is in view.
 
     A ball needs no orientation, and the cone under which it is seen is sampled: as
     quiet as a disk, and simpler. Light of others passes through it, so that a lamp of
@@ -198,8 +208,9 @@ class BallLamp(ScenePart):
     radiance: Triple = (0.0, 0.0, 0.0)  # base value, linear, for each colour channel
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the
-        `light` control).
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
+
+        The irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control).
         """
         red, green, blue = (
             math.pi * self.radius**2 * channel for channel in self.radiance
@@ -214,9 +225,10 @@ CAMERA = "camera"  # what carries the lamps of the car that the camera is in
 
 @dataclass(frozen=True, eq=False)
 class BeamLamp(ScenePart):
-    """A point on a mesh, or before the camera, that shines by a table, such as a
-    headlamp; the camera does not see it. Takes `NAME.to_world` (4, 4), its pose, which
-    it has once what carries it stands there; its brightness stays.
+    """A point on a mesh, or before the camera, that shines by a table, like a headlamp.
+
+    The camera does not see it. Takes `NAME.to_world` (4, 4), its pose, which it has
+    once what carries it stands there; its brightness stays.
     """
 
     carrier: str  # the mesh that carries it, or `CAMERA`
@@ -233,15 +245,16 @@ class BeamLamp(ScenePart):
     dark: ClassVar[bool] = False
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        way = self.to_world[:3, 3] - place
-        aside, up, ahead = -way @ self.to_world[:3, :3]
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,)."""
+        to_lamp = self.to_world[:3, 3] - place
+        aside, up, ahead = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
         column = math.floor((aside / max(ahead, 1e-9) + 1.0) / 2.0 * width)
         row = math.floor((1.0 - up / max(ahead, 1e-9) * width / height) / 2.0 * height)
         if ahead <= 0.0 or not (0 <= column < width and 0 <= row < height):
-            return way, np.zeros(3)
-        return way, self.table[row, column] * np.array(self.tint) / max(
-            float(way @ way), 1e-12
+            return to_lamp, np.zeros(3)
+        return to_lamp, self.table[row, column] * np.array(self.tint) / max(
+            float(to_lamp @ to_lamp), 1e-12
         )
 
 
@@ -252,10 +265,12 @@ PATTERN = ".pattern"
 
 @dataclass(frozen=True, eq=False)
 class ProjectorPart(ScenePart):
-    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that
-    the camera does not see. Takes `NAME.pose` (4, 4), as a camera's, and `NAME.pattern`
-    (h, w, 3): what a white matt screen shows that faces it at distance 1, linear
-    radiance. The interior adjoint is right for the pattern.
+    """A projector, as Mitsuba's `projector`.
+
+    A point that throws a picture, and that the camera does not see. Takes `NAME.pose`
+    (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows
+    that faces it at distance 1, linear radiance. The interior adjoint is right for the
+    pattern.
     """
 
     fov: float = 30.0  # angle of the picture's width, degrees
@@ -284,8 +299,9 @@ class PlacedCamera:
     upright: bool = False
 
     def larger_fov(self, aspect: float) -> float:
-        """Return the field of view, degrees, along the larger side of a picture of
-        width / height `aspect`.
+        """Return the field of view, degrees, along the larger side of an image.
+
+        `aspect` is its width over its height.
         """
         if not self.upright or aspect <= 1.0:
             return self.fov
@@ -296,8 +312,9 @@ class PlacedCamera:
 
 @dataclass(frozen=True, eq=False)
 class HazePart(ScenePart):
-    """One grey medium in a ball around the origin that camera and object stand in; it
-    scatters evenly in all directions. Takes `NAME.density` (1,), the extinction per
+    """One grey medium in a ball around the origin that camera and object stand in.
+
+    It scatters evenly in all directions. Takes `NAME.density` (1,), the extinction per
     object size, and `NAME.albedo` (3,), the share of the light that is scattered and
     not absorbed.
     """
@@ -323,8 +340,9 @@ class PluginNumber:
 
 @dataclass(frozen=True, eq=False)
 class PluginNumbers(ScenePart):
-    """Numbers and colours of what is in the scene already. Takes their inputs, which
-    begin with `NAME.`.
+    """Numbers and colours of what is in the scene already.
+
+    Takes their inputs, which begin with `NAME.`.
     """
 
     numbers: tuple[PluginNumber, ...] = ()  # some of the scene
@@ -348,8 +366,9 @@ class MediumPart(PluginPart):
 
 @lru_cache(maxsize=8)
 def polygon(corners: int) -> Mesh:
-    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z: its
-    middle, then its corners.
+    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z.
+
+    Its middle, then its corners.
     """
     turns = 2.0 * np.pi * np.arange(corners) / corners
     rim = np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
@@ -363,12 +382,13 @@ def polygon(corners: int) -> Mesh:
 
 
 def sphere(rows: int, columns: int) -> Mesh:
-    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole,
-    2 (rows - 1) columns faces.
+    """Return a sphere of diameter 1 around the origin.
+
+    `rows` bands from pole to pole, 2 (rows - 1) columns faces.
     """
     v, u = (
-        one.ravel()
-        for one in np.meshgrid(
+        array.ravel()
+        for array in np.meshgrid(
             np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij"
         )
     )
@@ -387,7 +407,7 @@ def sphere(rows: int, columns: int) -> Mesh:
     # without those that are points at the poles
     faces = np.concatenate([lower[columns:], upper[:-columns]])
     vertices, outwards, uvs = (
-        one.astype(np.float32)
-        for one in (0.5 * normals, normals, np.stack([u, v], axis=1))
+        array.astype(np.float32)
+        for array in (0.5 * normals, normals, np.stack([u, v], axis=1))
     )
     return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)

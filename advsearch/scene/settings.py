@@ -19,9 +19,10 @@ CHANNELS = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One coordinate of a search: a named, bounded number, tensor or choice. Settings
-    of a scene and parameters of controls are both this, so that what `--set` fixes
-    today a control can search tomorrow under the same name.
+    """One coordinate of a search: a named, bounded number, tensor or choice.
+
+    Settings of a scene and parameters of controls are both this, so that what `--set`
+    fixes today a control can search tomorrow under the same name.
     """
 
     name: str  # short; `control.name` addresses it everywhere
@@ -61,17 +62,28 @@ class Parameter:
 
     @staticmethod
     def is_number(value: object) -> TypeGuard[float]:
-        """Return whether a value is a number that float32 has: no truth value, not NaN,
-        and at most `LARGEST`.
+        """Return whether a value is a number that float32 has.
+
+        No truth value, not NaN, and at most `LARGEST`.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.LARGEST  # type: ignore[arg-type]
 
     @classmethod
     def number(
-        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
-        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-    ) -> Parameter:  # fmt: skip
+        cls,
+        estimators: tuple[str, ...],
+        name: str,
+        unit: str,
+        low: float,
+        high: float,
+        default: float | str,
+        text: str,
+        search: tuple[float, float] | None = None,
+        *,
+        periodic: bool = False,
+        log: bool = False,
+    ) -> Parameter:
         """Make a number that moves no outlines; see `moving` for one that does."""
         return cls(
             name,
@@ -90,9 +102,19 @@ class Parameter:
 
     @classmethod
     def moving(
-        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
-        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-    ) -> Parameter:  # fmt: skip
+        cls,
+        estimators: tuple[str, ...],
+        name: str,
+        unit: str,
+        low: float,
+        high: float,
+        default: float | str,
+        text: str,
+        search: tuple[float, float] | None = None,
+        *,
+        periodic: bool = False,
+        log: bool = False,
+    ) -> Parameter:
         """Make a number that can move an outline in the image."""
         return cls(
             name,
@@ -111,14 +133,29 @@ class Parameter:
 
     @classmethod
     def named(
-        cls, name: str, options: tuple[str, ...], default: str, text: str, *, estimators: tuple[str, ...] = (),
+        cls,
+        name: str,
+        options: tuple[str, ...],
+        default: str,
+        text: str,
+        *,
+        estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
-    ) -> Parameter:  # fmt: skip
+    ) -> Parameter:
         """Make a choice among names."""
         return cls(
-            name, (), "name", 0.0, len(options) - 1.0, default, text, False, moves_silhouettes, options=options,
+            name,
+            (),
+            "name",
+            0.0,
+            len(options) - 1.0,
+            default,
+            text,
+            False,
+            moves_silhouettes,
+            options=options,
             estimators=estimators,
-        )  # fmt: skip
+        )
 
     @classmethod
     def colors(
@@ -130,10 +167,11 @@ class Parameter:
         defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
         estimators: tuple[str, ...] = LIT,
     ) -> tuple[Parameter, ...]:
-        """Make the three numbers of a color, display-referred sRGB; the text goes on
-        behind "Red", "Green", "Blue".
+        """Make the three parameters of a color, display-referred sRGB.
+
+        The text goes on behind "Red", "Green", "Blue".
         """
-        texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
+        descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
             cls(
                 name,
@@ -142,15 +180,18 @@ class Parameter:
                 low,
                 1.0,
                 default,
-                words,
+                description,
                 search=search,
                 estimators=estimators,
             )
-            for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
+            for name, default, description in zip(
+                CHANNELS, defaults, descriptions, strict=True
+            )
         )
 
 
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
+    """Return a parameter of the principled surface."""
     return Parameter(
         name,
         (),
@@ -240,46 +281,123 @@ POSE = (
 ORBIT_CAMERA = "orbit"
 
 CAMERA = (
-    _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera "
-                                                         "around the object.", (0.0, 360.0),
-            periodic=True),
-    _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the "
-                                                       "ground plane.", (5.0, 60.0)),
-    _camera("roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, "
-                                                   "counter-clockwise.", (-15.0, 15.0),
-            periodic=True),
-    _camera("distance", "metres", 1e-4, 1e5, "fits the object",
-            "Distance to the object's middle; in object sizes where its size in metres "
-            "is not known.", (0.8, 1.5),
-            log=True),
-    _camera("height", "metres", -1e4, 1e5, "as the elevation says",
-            "Height of the lens above the ground, in place of `elevation`; in object "
-            "sizes as `distance`."),
-    _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side "
-                                                "of the picture."),
-    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered "
-                                                         "exposure.",
-              estimators=("image",)),
-)  # fmt: skip
+    _camera(
+        "azimuth",
+        "degrees",
+        -3600.0,
+        3600.0,
+        40.0,
+        "Direction of the camera around the object.",
+        (0.0, 360.0),
+        periodic=True,
+    ),
+    _camera(
+        "elevation",
+        "degrees",
+        -89.0,
+        89.0,
+        25.0,
+        "Height of the camera above the ground plane.",
+        (5.0, 60.0),
+    ),
+    _camera(
+        "roll",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation of the picture, counter-clockwise.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _camera(
+        "distance",
+        "metres",
+        1e-4,
+        1e5,
+        "fits the object",
+        "Distance to the object's middle; in object sizes where its size in metres "
+        "is not known.",
+        (0.8, 1.5),
+        log=True,
+    ),
+    _camera(
+        "height",
+        "metres",
+        -1e4,
+        1e5,
+        "as the elevation says",
+        "Height of the lens above the ground, in place of `elevation`; in object "
+        "sizes as `distance`.",
+    ),
+    _camera(
+        "fov",
+        "degrees",
+        1.0,
+        170.0,
+        35.0,
+        "Field of view along the larger side of the picture.",
+    ),
+    Parameter(
+        "exposure",
+        (),
+        "stops",
+        -10.0,
+        10.0,
+        0.0,
+        "Brightness over the metered exposure.",
+        estimators=("image",),
+    ),
+)
 EV = Parameter(
-    "ev", (), "EV at ISO 100", -10.0, 24.0, "metered",
+    "ev",
+    (),
+    "EV at ISO 100",
+    -10.0,
+    24.0,
+    "metered",
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
-    "for lit streets.", estimators=(),
-)  # fmt: skip
+    "for lit streets.",
+    estimators=(),
+)
 DROPS = (
-    Parameter("drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm "
-                                                  "before the camera.",
-              estimators=()),
-    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these "
-                                                     "drops.", estimators=()),
-    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a "
-                                                   "whole number.", estimators=()),
-)  # fmt: skip
+    Parameter(
+        "drops",
+        (),
+        "1",
+        0.0,
+        2000.0,
+        0.0,
+        "Raindrops on a sheet of glass 6 cm before the camera.",
+        estimators=(),
+    ),
+    Parameter(
+        "drop_size",
+        (),
+        "mm",
+        0.2,
+        10.0,
+        1.5,
+        "Median of the radii of these drops.",
+        estimators=(),
+    ),
+    Parameter(
+        "drop_seed",
+        (),
+        "1",
+        0.0,
+        1e6,
+        0.0,
+        "Where they are, and how large: a whole number.",
+        estimators=(),
+    ),
+)
 # what the lamps of a car may be: with either beam its tail lamps shine too
 LAMPS = ("off", "low", "high")
 
 
 def _lamps(whose: str) -> Parameter:
+    """Return the parameter for the lamps of a car."""
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
         "beam; in the avenue."
@@ -298,17 +416,55 @@ def _lamps(whose: str) -> Parameter:
 
 
 ENVIRONMENT = (
-    Parameter("rotation", (), "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", periodic=True,
-              search=(0.0, 360.0), estimators=Parameter.LIT),
-    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0),
-              estimators=Parameter.LIT),
-)  # fmt: skip
+    Parameter(
+        "rotation",
+        (),
+        "degrees",
+        -3600.0,
+        3600.0,
+        0.0,
+        "Rotation about the vertical.",
+        periodic=True,
+        search=(0.0, 360.0),
+        estimators=Parameter.LIT,
+    ),
+    Parameter(
+        "exposure",
+        (),
+        "stops",
+        -10.0,
+        10.0,
+        0.0,
+        "Brightness, after metering.",
+        search=(-1.0, 1.0),
+        estimators=Parameter.LIT,
+    ),
+)
 GROUND_KINDS = (
-    TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM, SNOW_AVENUE,
+    TABLE,
+    PHOTOGRAPH,
+    DRY_ROAD,
+    WET_ROAD,
+    DRY_AVENUE,
+    WET_AVENUE,
+    CROSSING,
+    CAR_PARK,
+    ROOM,
+    LIT_ROOM,
+    SNOW_AVENUE,
 ) = (
-    "table", "photograph", "road", "wet-road", "avenue", "wet-avenue", "crossing", "car-park", "room", "lit-room",
+    "table",
+    "photograph",
+    "road",
+    "wet-road",
+    "avenue",
+    "wet-avenue",
+    "crossing",
+    "car-park",
+    "room",
+    "lit-room",
     "snow-avenue",
-)  # fmt: skip
+)
 ROADS = (DRY_ROAD, WET_ROAD)
 PLACES = (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 # height above the floor of the camera of a photograph, where sizes are not known
@@ -316,24 +472,53 @@ PHOTOGRAPHED_FROM = 3.0
 # settings that only a table has
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 GROUND = (
-    Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
-              "what the environment has: photograph where the map is a file, a road in "
-              "a street, else table",
-              "What the object stands on: a square table, the floor that the "
-              "environment's photograph shows, a road, "
-              "or a place with all that stands in it: an avenue, a crossing, a car "
-              "park or a room.",
-              options=GROUND_KINDS),
-    Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
-    *Parameter.colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
-    Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} "
-                                                    "object sizes",
-              "Height above the floor from which the photograph was taken; in object "
-              "sizes as `camera.distance`."),
-    Parameter("radius", (), "metres", 1e-3, 1e5, "5 heights",
-              "How far from the photograph's camera its floor is empty; in object "
-              "sizes as `camera.distance`."),
-)  # fmt: skip
+    Parameter(
+        "kind",
+        (),
+        "name",
+        0.0,
+        len(GROUND_KINDS) - 1.0,
+        "what the environment has: photograph where the map is a file, a road in "
+        "a street, else table",
+        "What the object stands on: a square table, the floor that the "
+        "environment's photograph shows, a road, "
+        "or a place with all that stands in it: an avenue, a crossing, a car "
+        "park or a room.",
+        options=GROUND_KINDS,
+    ),
+    Parameter(
+        "size",
+        (),
+        "object sizes",
+        0.0,
+        1000.0,
+        3.0,
+        "Side of the table; 0 leaves the ground out.",
+    ),
+    *Parameter.colors(
+        "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
+    ),
+    Parameter(
+        "height",
+        (),
+        "metres",
+        1e-3,
+        1000.0,
+        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+        "Height above the floor from which the photograph was taken; in object "
+        "sizes as `camera.distance`.",
+    ),
+    Parameter(
+        "radius",
+        (),
+        "metres",
+        1e-3,
+        1e5,
+        "5 heights",
+        "How far from the photograph's camera its floor is empty; in object "
+        "sizes as `camera.distance`.",
+    ),
+)
 MATERIAL = (
     _surface(
         "roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)
@@ -349,9 +534,13 @@ MATERIAL = (
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
-    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
-    "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
-}  # fmt: skip
+    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")),
+    "pose": POSE,
+    "environment": ENVIRONMENT,
+    "ground": GROUND,
+    "material": MATERIAL,
+    "object": (_lamps("the object, a car"),),
+}
 
 SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{setting.name}": setting
@@ -366,8 +555,9 @@ Given = Mapping[str, float | str | Sequence[float]]
 
 
 def parameter_of(name: str) -> Parameter | None:
-    """Return the parameter that a setting's name means, also of a mesh around the
-    object; None if there is none.
+    """Return the parameter that a setting's name means; None if there is none.
+
+    Also for settings of a mesh around the object.
     """
     family, _, rest = name.partition(":")
     if rest and family in OF_A_MESH:
@@ -376,18 +566,23 @@ def parameter_of(name: str) -> Parameter | None:
 
 
 def mesh_of(name: str) -> str | None:
-    """Return the mesh around the object whose setting it is: ``chair`` of
-    ``pose:chair.yaw``; None for the scene's.
+    """Return the mesh whose setting a name is: ``chair`` of ``pose:chair.yaw``.
+
+    None for settings of the scene.
     """
     mesh, dot, _ = name.partition(":")[2].rpartition(".")
     return mesh if dot else None
 
 
 def resolve(given: Given) -> dict[str, float | None]:
-    """Return every setting's value: what was given, checked, over the defaults; None
-    where the scene works it out. Settings of meshes around the object are there where
-    they were given. Raises UnknownNameError: a name is not a setting. Raises
-    InputError: a value is not a finite number inside its range.
+    """Return every setting's value: the defaults, and over them what was given.
+
+    None where the scene works a value out. Settings of meshes around the object are
+    there where they were given.
+
+    Raises:
+        InputError: a value is not a finite number inside its range.
+        UnknownNameError: a name is not a setting.
     """
     if "camera.elevation" in given and "camera.height" in given:
         raise InputError(
@@ -395,8 +590,8 @@ def resolve(given: Given) -> dict[str, float | None]:
             "leave one of them out"
         )
     values = {
-        name: None if isinstance(one.default, str) else one.default
-        for name, one in SETTINGS.items()
+        name: None if isinstance(parameter.default, str) else parameter.default
+        for name, parameter in SETTINGS.items()
     }
     for name, value in given.items():
         setting = parameter_of(name)
@@ -416,8 +611,8 @@ def resolve(given: Given) -> dict[str, float | None]:
             )
         values[name] = float(value)
         if not setting.low <= value <= setting.high:  # NaN is not, either
-            inside = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
+            allowed_range = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
             raise InputError(
-                f"`set` {name}: expected a number from {inside}, got {value:g}"
+                f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
             )
     return values

@@ -75,39 +75,41 @@ class ThingPart(MeshPart):
 
 
 def asked_things(text: str | None) -> tuple[AskedThing, ...]:
-    """Read things that are asked for in one text, see above. Raises InputError: it says
-    something else.
-    """
+    """Read the things of a setting, see above. Raises InputError: it is invalid."""
     things: list[AskedThing] = []
     for part in filter(None, map(str.strip, (text or "").split(";"))):
-        thing = _asked(part)
-        taken = [*TAKEN, *(other.name for other in things)]
-        if thing.name in taken and "name=" in part:
+        thing = _parse_thing(part)
+        reserved = [*TAKEN, *(other.name for other in things)]
+        if thing.name in reserved and "name=" in part:
             raise InputError(
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
-        number = 2
-        while thing.name in taken:
+        suffix = 2
+        while thing.name in reserved:
             thing = replace(
-                thing, name=f"{thing.name.removesuffix(f'-{number - 1}')}-{number}"
+                thing, name=f"{thing.name.removesuffix(f'-{suffix - 1}')}-{suffix}"
             )
-            number += 1
+            suffix += 1
         things.append(thing)
     if len(things) > MOST:
         raise InputError(f"things: expected at most {MOST}, got {len(things)}")
     return tuple(things)
 
 
-def _asked(part: str) -> AskedThing:
-    what, at, rest = part.rpartition("@")
-    words = [word.strip() for word in rest.split(",")]
-    options = dict(word.partition("=")[::2] for word in words[2:])
+def _parse_thing(part: str) -> AskedThing:
+    """Read one thing.
+
+    Raises InputError, UnknownNameError: it is not as described above.
+    """
+    object_spec, separator, rest = part.rpartition("@")
+    fields = [word.strip() for word in rest.split(",")]
+    options = dict(word.partition("=")[::2] for word in fields[2:])
     if (
-        not at
-        or not what.strip()
-        or len(words) < 2
-        or any("=" not in word for word in words[2:])
+        not separator
+        or not object_spec.strip()
+        or len(fields) < 2
+        or any("=" not in word for word in fields[2:])
     ):
         raise InputError(
             "things: expected WHAT@X,Y in metres, such as "
@@ -120,22 +122,22 @@ def _asked(part: str) -> AskedThing:
     if lamps not in LAMPS:
         raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
     x, y = (
-        _number(part, name, word, -FARTHEST, FARTHEST)
-        for name, word in zip("xy", words, strict=False)
+        _parse_number(part, name, word, -FARTHEST, FARTHEST)
+        for name, word in zip("xy", fields, strict=False)
     )
     heading = (
-        _number(part, "heading", options["heading"], -3600.0, 3600.0)
+        _parse_number(part, "heading", options["heading"], -3600.0, 3600.0)
         if "heading" in options
         else 0.0
     )
     size = (
-        _number(part, "size", options["size"], SMALLEST, LARGEST)
+        _parse_number(part, "size", options["size"], SMALLEST, LARGEST)
         if "size" in options
         else None
     )
-    name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
+    name = safe_name(Path(options.get("name") or object_spec.strip().partition("#")[0]))
     return AskedThing(
-        what.strip(),
+        object_spec.strip(),
         x,
         y,
         heading,
@@ -147,7 +149,8 @@ def _asked(part: str) -> AskedThing:
     )
 
 
-def _number(part: str, name: str, text: str, low: float, high: float) -> float:
+def _parse_number(part: str, name: str, text: str, low: float, high: float) -> float:
+    """Read one number of a thing. Raises InputError: it is none, or out of range."""
     try:
         value = float(text)
     except ValueError:
@@ -165,14 +168,21 @@ def with_things(
     text: str | None,
     load: Callable[[str, str | None], ObjectAsset],
 ) -> SceneDescription:
-    """Return the scene with the things beside its object that a text asks for, each
-    loaded by its name or file and the axis that its front faces; what stands in another
-    one is said in its remarks. Raises UnknownNameError: there is no such object. Raises
-    InputError: the text says something else, a name is taken, or sizes in metres are
-    not known.
+    """Return the scene with the things beside its object that a setting names.
+
+    Args:
+        scene: with the object.
+        text: the setting; None for no things.
+        load: loads an object by its name or file, and the axis that its front
+            faces.
+
+    Raises:
+        InputError: the text is invalid, a name is taken, or sizes in metres are not
+            known.
+        UnknownNameError: there is no such object.
     """
-    asked = asked_things(text)
-    if not asked:
+    requested = asked_things(text)
+    if not requested:
         return scene
     if scene.object.metres is None:
         raise InputError(
@@ -182,14 +192,14 @@ def with_things(
         )
     parts = list[ThingPart]()
     remarks = list[str]()
-    for thing in asked:
-        what = thing.what
+    for thing in requested:
+        object_spec = thing.what
         name = thing.name
-        asset = sized(load(what, thing.facing), thing.size, None)
+        asset = sized(load(object_spec, thing.facing), thing.size, None)
         if asset.metres is None:
-            example = f"{what}@{thing.x:g},{thing.y:g},size=METRES"
+            example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
             raise InputError(
-                f"things: the size of {what} in metres is not known; say it: {example}"
+                f"things: the size of {object_spec} in metres is not known; say it: {example}"
             )
         if name in {part.name for part in scene.parts}:
             raise InputError(
@@ -197,10 +207,13 @@ def with_things(
                 "already; add name=NAME to it"
             )
         part = mesh_part(
-            name, asset, _pose(scene, asset, thing, asset.metres), asset.material
+            name,
+            asset,
+            _compute_pose(scene, asset, thing, asset.metres),
+            asset.material,
         )
-        looks = {**vars(part), "label": thing.label or asset.label}
-        parts.append(ThingPart(**looks, metres=asset.metres, lamps=thing.lamps))
+        fields = {**vars(part), "label": thing.label or asset.label}
+        parts.append(ThingPart(**fields, metres=asset.metres, lamps=thing.lamps))
         remarks += [
             *asset.notes,
             *doubts(asset, asked=thing.size is not None, laid=True),
@@ -208,7 +221,7 @@ def with_things(
         if asset.front is not None and asset.front.reason and has_lanes(scene):
             remarks.append(asset.front.reason)
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
-    places = {"the object": footprint(scene.base_vertices)} | {
+    footprints = {"the object": footprint(scene.base_vertices)} | {
         name: footprint(standing(part))
         for name, part in scene.meshes.items()
         if isinstance(part, ThingPart)
@@ -216,26 +229,27 @@ def with_things(
     remarks += [
         f"{first[0].upper()}{first[1:]} and {other} stand in each other: their "
         "outlines on the ground overlap."
-        for first, other in combinations(places, 2)
-        if overlapping(places[first], places[other])
+        for first, other in combinations(footprints, 2)
+        if overlapping(footprints[first], footprints[other])
     ]
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
-def _pose(
-    scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float
+def _compute_pose(
+    scene: SceneDescription, asset: ObjectAsset, requested: AskedThing, metres: float
 ) -> Doubles:
     foot, extent = footing(asset.mesh.vertices.astype(np.float64))
-    linear = metres / scene.metres / extent * rotation(asked.heading, 0.0, 0.0)
-    place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
+    linear = metres / scene.metres / extent * rotation(requested.heading, 0.0, 0.0)
+    position = middle(scene)[:2] + np.array([requested.x, requested.y]) / scene.metres
     return pose_of(
-        linear, np.array([*place, ground_height(scene, place)]) - linear @ foot
+        linear, np.array([*position, ground_height(scene, position)]) - linear @ foot
     )
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: road, pavement,
-    table or floor; or 0.
+    """Return how high the ground lies at a position (2,), object sizes.
+
+    That is the height of the road, the pavement, the table or the floor; or 0.
     """
     ground = (part for part in scene.around.values() if part.is_ground)
     triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in ground)
@@ -246,27 +260,28 @@ def ground_height(scene: SceneDescription, place: Doubles) -> float:
 
 
 def heights_over(corners: Doubles, place: Doubles) -> list[float]:
-    """Return how high the triangles (F, 3 corners, 3) lie that are above or below a
-    place (2,).
-    """
+    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,)."""
     a, b, c = np.moveaxis(corners, 1, 0)
-    sides = [
+    doubled_areas = [
         (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1])
         - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
         for begin, end in ((b, c), (c, a), (a, b))
     ]
-    whole = sides[0] + sides[1] + sides[2]
-    shares = np.stack(sides) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
-    under = (shares >= 0.0).all(axis=0)
+    total_area = doubled_areas[0] + doubled_areas[1] + doubled_areas[2]
+    barycentric = np.stack(doubled_areas) / np.where(
+        np.abs(total_area) > 1e-12, total_area, np.nan
+    )
+    is_under = (barycentric >= 0.0).all(axis=0)
     heights: list[float] = (
-        (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+        (barycentric * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[is_under].tolist()
     )
     return heights
 
 
 def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
-    """Return which solid of the scene's place something overlaps with, such as "a
-    house"; None where it stands free.
+    """Return the solid of the scene that a footprint overlaps, such as "a house".
+
+    None where it stands free.
     """
     for part in scene.around.values():
         for solid in part.solids:
@@ -276,15 +291,15 @@ def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
 
 
 def with_solids_checked(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with a remark on its object and each thing that stands in a
-    house, a post or the like.
-    """
+    """Return the scene with a remark on its object and each thing inside a solid."""
     if not any(part.solids for part in scene.around.values()):
         return scene
-    taken = {"the object": footprint(scene.base_vertices)}
-    taken |= {name: footprint(standing(scene.meshes[name])) for name in scene.things}
+    footprints = {"the object": footprint(scene.base_vertices)}
+    footprints |= {
+        name: footprint(standing(scene.meshes[name])) for name in scene.things
+    }
     remarks = list[str]()
-    for name, outline in taken.items():
+    for name, outline in footprints.items():
         solid = solid_at(scene, outline)
         if solid is not None:
             remarks.append(
@@ -295,9 +310,7 @@ def with_solids_checked(scene: SceneDescription) -> SceneDescription:
 
 
 def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[str, ...]:
-    """Return what is said where cameras, at places (3,) in metres, are inside a solid
-    of the scene's place.
-    """
+    """Return a remark where cameras, at positions (3,) in metres, are inside a solid."""
     inside = list[str]()
     for eye in eyes:
         x, y, z = eye / scene.metres

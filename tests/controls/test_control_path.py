@@ -243,7 +243,7 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
             (ways,) = control._paths
-            place, target = control._camera(ways, start, at, control._object(ways, start, at)[0])
+            place, target = control._position_camera(ways, start, at, control._shift_object(ways, start, at)[0])
             return (target - place).expand(*at.shape, 3)
 
         torch.testing.assert_close(both(time), torch.stack([both(one) for one in time]))

@@ -1,8 +1,10 @@
 """The `corruption` control: one of the common image corruptions, by name and severity,
 on the finished picture.
 
-    severity 0: the picture as it is;  0 to 1: mixed with that of severity 1;  1 to 5: the published severities, and
-    between two of them their parameters interpolated
+    severity 0   the image as it is
+    0 to 1       mixed with that of severity 1
+    1 to 5       the published severities; between two of them their parameters are
+                 interpolated
 
 They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4
 and appendix A) as functions of the picture in torch; those by noise, blur, shifted
@@ -35,9 +37,9 @@ _GREY = 1.0 / 512.0
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Raise the value, keep hue and saturation."""
-    (more,) = filters.at_level(BRIGHTNESS, level)
+    (increase,) = filters.at_level(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
-    return image + ((value + more).clamp(max=1.0) - value) * (image + _GREY) / (
+    return image + ((value + increase).clamp(max=1.0) - value) * (image + _GREY) / (
         value + _GREY
     )
 
@@ -51,11 +53,11 @@ def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Scale the saturation, keep hue and value; grey stays grey."""
-    factor, more = filters.at_level(SATURATE, level)
+    factor, increase = filters.at_level(SATURATE, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
-    wanted = (factor * saturation + more).clamp(max=1.0)
-    return value - (value - image) * wanted / (saturation + _GREY)
+    new_saturation = (factor * saturation + increase).clamp(max=1.0)
+    return value - (value - image) * new_saturation / (saturation + _GREY)
 
 
 def pixelate(image: Tensor, whole: int) -> Tensor:
@@ -65,8 +67,8 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     and as many in a smaller one.
     """
     height, width = image.shape[:2]
-    share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
-    cells = (max(1, int(height * share)), max(1, int(width * share)))
+    fraction = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
+    cells = (max(1, int(height * fraction)), max(1, int(width * fraction)))
     averaged = F.interpolate(images.planes(image), cells, mode="area")
     return images.picture(
         F.interpolate(averaged, (height, width), mode="nearest-exact")
@@ -81,11 +83,23 @@ def jpeg(image: Tensor, whole: int) -> Tensor:
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     corruption.__name__: corruption
     for corruption in (
-        filters.gaussian_noise, filters.shot_noise, filters.impulse_noise, filters.speckle_noise,
-        filters.defocus_blur, filters.glass_blur, filters.motion_blur, filters.zoom_blur, filters.gaussian_blur,
-        filters.snow, filters.frost, filters.fog, brightness, contrast, saturate,
+        filters.gaussian_noise,
+        filters.shot_noise,
+        filters.impulse_noise,
+        filters.speckle_noise,
+        filters.defocus_blur,
+        filters.glass_blur,
+        filters.motion_blur,
+        filters.zoom_blur,
+        filters.gaussian_blur,
+        filters.snow,
+        filters.frost,
+        filters.fog,
+        brightness,
+        contrast,
+        saturate,
     )
-}  # fmt: skip
+}
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity
 and the seed.
 """
@@ -111,15 +125,29 @@ class CorruptionControl(Control):
     kind = "corruption"
     amount = "severity"
     parameters = (
-        replace(Parameter.named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
-        Parameter.number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
-                         "How strong it is: 0 is none, 1 to 5 are the published "
-                         "severities.",
-                         (0.0, float(filters.LEVELS))),
-    )  # fmt: skip
-    choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a "
-                                 "whole number from 0.",
-                      whole=(0, 2**32 - 1)),)  # fmt: skip
+        replace(
+            Parameter.named("which", NAMES, NAMES[0], "Which corruption."),
+            search=(0, len(NAMES) - 1),
+        ),
+        Parameter.number(
+            ("image",),
+            "severity",
+            "1",
+            0.0,
+            float(filters.LEVELS),
+            0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.",
+            (0.0, float(filters.LEVELS)),
+        ),
+    )
+    choices = (
+        Choice(
+            "seed",
+            0,
+            "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
+            whole=(0, 2**32 - 1),
+        ),
+    )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
@@ -144,6 +172,7 @@ class CorruptionControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the severity that is applied: a whole one for stepped corruptions."""
         severity = values["severity"]
         applied = (
             nearest(severity)
@@ -167,16 +196,16 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         `docs/controls/corruption.md` says.
     """
     if which in STEPPED:
-        at = STEPPED[which]
-        whole = nearest(severity)
-        out = at(image, whole) if whole else image
+        apply_at = STEPPED[which]
+        applied_severity = nearest(severity)
+        result = apply_at(image, applied_severity) if applied_severity else image
         # by the straight lines between the steps: a staircase has no slope
         if severity.requires_grad:
             below = min(int(severity.detach()), filters.LEVELS - 1)
-            low = at(image, below).detach() if below else image.detach()
-            high = at(image, below + 1).detach()
-            out = out + (severity - severity.detach()) * (high - low)
-        return out.clamp(0.0, 1.0)
+            low = apply_at(image, below).detach() if below else image.detach()
+            high = apply_at(image, below + 1).detach()
+            result = result + (severity - severity.detach()) * (high - low)
+        return result.clamp(0.0, 1.0)
     if which in FROM_NOTHING:
         return FROM_NOTHING[which](image, severity, seed).clamp(0.0, 1.0)
     if float(severity.detach()) >= 1.0:

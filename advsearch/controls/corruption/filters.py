@@ -34,8 +34,9 @@ def scale(image: Tensor) -> float:
 
 
 def reference_size(height: int, width: int) -> tuple[int, int]:
-    """Return the size of a picture of the same shape whose smaller side has `REFERENCE`
-    pixels.
+    """Return the rows and columns of a reference image of the same shape.
+
+    Its smaller side has `REFERENCE` pixels.
     """
     side = min(height, width)
     return round(height * REFERENCE / side), round(width * REFERENCE / side)
@@ -47,29 +48,34 @@ def generator(seed: int, name: str) -> torch.Generator:
 
 
 def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, ...]:
-    """Interpolate the five rows of n numbers of a table linearly at a severity () in
-    [1, 5]; returns n differentiable tensors ().
+    """Interpolate the five rows of a table linearly at a severity () in [1, 5].
+
+    Returns one tensor () a column; differentiable.
     """
     rows = torch.tensor(table, dtype=torch.float32, device=level.device)
-    return between(level, lambda whole: rows[whole - 1]).unbind()
+    return between(level, lambda severity: rows[severity - 1]).unbind()
 
 
 def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
-    """Mix what `make` returns for the two whole severities around one in [1, 5], on its
-    device; differentiable.
+    """Mix what `make` returns for the whole severities below and above a severity.
+
+    Args:
+        level: () in [1, 5]; the result is differentiable in it, and on its device.
+        make: returns a tensor for a whole severity.
     """
     below = min(int(level.detach()), LEVELS - 1)
-    share = level - below
-    if float(share.detach()) == 0.0 and not share.requires_grad:
+    fraction = level - below
+    if float(fraction.detach()) == 0.0 and not fraction.requires_grad:
         return make(below).to(level.device)
-    low = make(below).to(level.device)
-    high = make(below + 1).to(level.device)
-    return low + share * (high - low)
+    lower = make(below).to(level.device)
+    upper = make(below + 1).to(level.device)
+    return lower + fraction * (upper - lower)
 
 
 def blurred(image: Tensor, sigma: Tensor) -> Tensor:
-    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels;
-    edges are continued.
+    """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels.
+
+    Edges are continued.
     """
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
@@ -90,31 +96,28 @@ def blurred(image: Tensor, sigma: Tensor) -> Tensor:
 def streaked(
     image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float
 ) -> Tensor:
-    """Blur an (H, W, C) picture along a line at an `angle` in radians: a one-sided
-    Gaussian, cut off at twice the `radius`.
+    """Blur an image along a line: a one-sided Gaussian, cut off at twice the radius.
 
-    Radius () and standard deviation `sigma` () are in reference pixels, of which one is
-    `step` pixels of this picture.
+    Args:
+        image: (H, W, C).
+        radius: () in pixels of the reference image.
+        sigma: () standard deviation, in pixels of the reference image.
+        angle: of the line, radians.
+        step: pixels of this image for a pixel of the reference image.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
-    along = torch.arange(count, device=image.device) / step
-    weights = torch.exp(-0.5 * (along / sigma) ** 2) * (
-        2.0 * radius + 1.0 - along
-    ).clamp(0.0, 1.0)
+    distance = torch.arange(count, device=image.device) / step
+    cut_off = (2.0 * radius + 1.0 - distance).clamp(0.0, 1.0)
+    weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
     weights = weights / weights.sum()
     height, width = image.shape[:2]
     padded = F.pad(images.planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
-    for number, weight in enumerate(weights):
-        down = round(number * math.sin(angle))
-        across = round(number * math.cos(angle))
-        moved = padded[
-            :,
-            :,
-            count + down : count + down + height,
-            count + across : count + across + width,
-        ]
-        total = total + weight * images.picture(moved)
+    for index, weight in enumerate(weights):
+        top = count + round(index * math.sin(angle))
+        left = count + round(index * math.cos(angle))
+        shifted = padded[:, :, top : top + height, left : left + width]
+        total = total + weight * images.picture(shifted)
     return total
 
 
@@ -146,49 +149,52 @@ def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Count photons: Poisson numbers with the picture as their mean, by inverting the
-    distribution function.
+    """Draw photon counts: Poisson numbers with the image as their mean.
 
     The values are exact. Counts have no derivative, so each is taken to keep its place
     in the distribution, a number of standard deviations from the mean, when the mean or
     the spread changes a little.
     """
     (photons,) = at_level(SHOT, level)
-    share = _noise(image, seed, "shot noise", normal=False)
+    quantile = _noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
-        counted = poisson(image * photons, share) / photons
-        away = (counted - image) / torch.sqrt(image / photons + _DARK)
-    return image + away * torch.sqrt(image / photons + _DARK)
+        counted = poisson(image * photons, quantile) / photons
+        deviations = (counted - image) / torch.sqrt(image / photons + _DARK)
+    return image + deviations * torch.sqrt(image / photons + _DARK)
 
 
 def poisson(mean: Tensor, share: Tensor) -> Tensor:
-    """Return the Poisson numbers of means, 0 to about 80, at given shares of the
-    distribution in [0, 1), of the same shape; no derivative.
+    """Return Poisson counts by inverting the distribution function; no derivative.
+
+    Args:
+        mean: of each count, 0 to about 80.
+        share: quantile of each count in [0, 1), of the same shape.
     """
-    chance = torch.exp(-mean.double())
-    total = chance.clone()
-    count = torch.zeros_like(chance)
-    for number in range(1, 400):
-        short = share > total
-        if not bool(short.any()):
+    probability = torch.exp(-mean.double())
+    total = probability.clone()
+    count = torch.zeros_like(probability)
+    for candidate in range(1, 400):
+        is_above = share > total
+        if not bool(is_above.any()):
             break
-        count += short
-        chance *= mean / number
-        total += chance
+        count += is_above
+        probability *= mean / candidate
+        total += probability
     return count.to(mean.dtype)
 
 
 def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Replace a share of the values by 0 or 1 ("salt and pepper").
+    """Replace a fraction of the values by 0 or 1 ("salt and pepper").
 
-    A value is lost at once, which has no derivative by the share of lost ones; taken
-    instead is that of the average over all draws of which ones are lost.
+    A value is lost at once, which has no derivative by the fraction of lost values; the
+    derivative is that of the average over all draws of which ones are lost.
     """
-    (lost,) = at_level(IMPULSE, level)
-    turn = _noise(image, seed, "impulse noise", normal=False)
+    (lost_fraction,) = at_level(IMPULSE, level)
+    draw = _noise(image, seed, "impulse noise", normal=False)
     extreme = (_noise(image, seed, "impulse value", normal=False) < 0.5).float()
-    kept = torch.where(turn < lost.detach(), extreme, image)
-    return kept + (lost - lost.detach()) * (extreme - image.detach())
+    noisy = torch.where(draw < lost_fraction.detach(), extreme, image)
+    slope = extreme - image.detach()
+    return noisy + (lost_fraction - lost_fraction.detach()) * slope
 
 
 # standard deviation, reference pixels
@@ -234,16 +240,14 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
         disc / disc.sum(), s=size
     )
-    whole = torch.fft.irfft2(product, s=size)
+    convolved = torch.fft.irfft2(product, s=size)
     return images.picture(
-        whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
+        convolved[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width]
     )
 
 
 def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Blur along a line, within 45 degrees of the horizontal, as of a camera that
-    moves.
-    """
+    """Blur along a line within 45 degrees of the horizontal, like a moving camera."""
     radius, sigma = at_level(MOTION, level)
     turn = float(torch.rand((), generator=generator(seed, "motion blur")))
     return streaked(
@@ -252,9 +256,7 @@ def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Average the picture with magnified ones, as of a camera that moves towards the
-    object.
-    """
+    """Average the image with magnified ones, like a camera that moves ahead."""
     (largest,) = at_level(ZOOM, level)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=level.device
@@ -271,38 +273,54 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur
-    again.
-    """
+    """Blur, show at each pixel what a neighbor shows, and blur again."""
     sigma = at_level(GLASS, level)[0] * scale(image)
     shift = between(
-        level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole)
+        level,
+        lambda severity: _glass_shift(image.shape[0], image.shape[1], seed, severity),
     )
     return blurred(images.warped(blurred(image, sigma), shift * scale(image)), sigma)
 
 
 @lru_cache(maxsize=8)
-def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels. One
-    pixel after another, from the bottom right, takes over what a random neighbour shows
-    by then; so what is shown may come from further away than one step.
+def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
+    """Return from how far each pixel is taken behind frosted glass.
+
+    One pixel after another, from the bottom right, takes over what a random neighbor
+    has by then; so it may come from further away than one step.
+
+    Args:
+        height: of the image.
+        width: of the image.
+        seed: chooses the neighbors.
+        whole: severity, a whole number.
+
+    Returns:
+        (H, W, 2) to the right and down, in pixels of the reference image.
     """
-    tall, wide = reference_size(height, width)
-    _, reach, passes = (int(value) for value in GLASS[whole - 1])
+    rows, columns = reference_size(height, width)
+    _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
     source = generator(seed, "glass blur")
-    shown = list(range(tall * wide))
-    for _ in range(passes):
-        jumps = torch.randint(-reach, reach, (tall, wide, 2), generator=source)
-        to_neighbour = (jumps[..., 0] * wide + jumps[..., 1]).flatten().tolist()
-        for row in range(tall - reach, reach, -1):
-            for place in range(row * wide + wide - reach, row * wide + reach, -1):
-                shown[place] = shown[place + to_neighbour[place]]
-    came = torch.tensor(shown)
-    place_of = torch.arange(tall * wide)
-    across = came % wide - place_of % wide
-    down = came // wide - place_of // wide
-    shift = torch.stack([across, down]).view(1, 2, tall, wide).float()
+    origins = list(range(rows * columns))
+    for _ in range(n_passes):
+        jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
+        to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
+        _swap_in_neighbors(origins, to_neighbor, rows, columns, reach)
+    origin = torch.tensor(origins)
+    pixel = torch.arange(rows * columns)
+    right = origin % columns - pixel % columns
+    down = origin // columns - pixel // columns
+    shift = torch.stack([right, down]).view(1, 2, rows, columns).float()
     return images.picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
+
+
+def _swap_in_neighbors(
+    origins: list[int], to_neighbor: list[int], rows: int, columns: int, reach: int
+) -> None:
+    """Let each pixel take over the origin of its neighbor, from the bottom right."""
+    for row in range(rows - reach, reach, -1):
+        for pixel in range(row * columns + columns - reach, row * columns + reach, -1):
+            origins[pixel] = origins[pixel + to_neighbor[pixel]]
 
 
 def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
@@ -312,30 +330,52 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
         shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
         shift = between(
-            severity, lambda whole: _elastic_shift(height, width, seed, whole)
+            severity,
+            lambda whole_severity: _elastic_shift(height, width, seed, whole_severity),
         )
     return images.warped(image, scale(image) * shift)
 
 
 @lru_cache(maxsize=8)
-def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels."""
-    tall, wide = reference_size(height, width)
-    wrinkle, smooth, corner = ELASTIC[whole - 1]
+def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
+    """Return from how far each pixel is taken: wrinkles and a shear.
+
+    Args:
+        height: of the image.
+        width: of the image.
+        seed: chooses the wrinkles and the shear.
+        whole: severity, a whole number.
+
+    Returns:
+        (H, W, 2) to the right and down, in pixels of the reference image.
+    """
+    rows, columns = reference_size(height, width)
+    wrinkle_height, wrinkle_width, corner_shift = ELASTIC[severity - 1]
     source = generator(seed, "elastic")
-    corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner
-    noise = torch.rand(tall, wide, 2, generator=source) * 2.0 - 1.0
+    corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner_shift
+    noise = torch.rand(rows, columns, 2, generator=source) * 2.0 - 1.0
     waves = ndimage.gaussian_filter(
-        noise.numpy(), (smooth, smooth, 0.0), mode="reflect", truncate=3.0
+        noise.numpy(),
+        (wrinkle_width, wrinkle_width, 0.0),
+        mode="reflect",
+        truncate=3.0,
     )
+    shear = _shear(rows, columns, corners)
+    shift = torch.from_numpy(waves) * wrinkle_height + shear
+    return images.resized(shift, height, width)
+
+
+def _shear(rows: int, columns: int, corners: Tensor) -> Tensor:
+    """Return the affine shift (rows, columns, 2) that moves three corners (3, 2).
+
+    They are corners of the middle third of the image.
+    """
     third = REFERENCE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
-    rows = torch.arange(tall)[:, None, None] - (tall - 1) / 2.0
-    columns = torch.arange(wide)[None, :, None] - (wide - 1) / 2.0
-    shear = (corners[0] + corners[2]) / 2.0 + rows * by_row + columns * by_column
-    shift = torch.from_numpy(waves) * wrinkle + shear
-    return images.resized(shift, height, width)
+    row = torch.arange(rows)[:, None, None] - (rows - 1) / 2.0
+    column = torch.arange(columns)[None, :, None] - (columns - 1) / 2.0
+    return (corners[0] + corners[2]) / 2.0 + row * by_row + column * by_column
 
 
 FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # how dense the fog is
@@ -366,7 +406,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     height, width = image.shape[:2]
     (density,) = at_level(FOG, level)
     drift = between(
-        level, lambda whole: _drift(height, width, seed, FOG_DECAY[whole - 1])
+        level, lambda severity: _drift(height, width, seed, FOG_DECAY[severity - 1])
     )
     brightest = image.max()
     return (
@@ -376,20 +416,23 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
-    """(H, W, 1) fog in [0, 1]."""
-    tall, wide = reference_size(height, width)
+    """Make fog (H, W, 1) in [0, 1]."""
+    rows, columns = reference_size(height, width)
     return images.resized(
-        fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None],
+        fractal(max(rows, columns), decay, generator(seed, "fog"))[
+            :rows, :columns, None
+        ],
         height,
         width,
     )
 
 
 def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
-    """Return fractal noise in [0, 1], at least side x side, made by midpoint
-    displacement on a torus.
+    """Make fractal noise in [0, 1] by midpoint displacement on a torus.
 
-    Each step doubles the grid: new points are the mean of their four neighbours plus
+    It is at least side x side.
+
+    Each step doubles the grid: new points are the mean of their four neighbors plus
     noise, whose height falls by `decay` squared from step to step (Fournier, Fussell,
     Carpenter 1982, Computer rendering of stochastic models).
     """
@@ -402,7 +445,8 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
         down = grid.roll(-1, 0)
         middle = (grid + right + down + right.roll(-1, 0)) / 4.0 + noise[0]
         finer = torch.empty(2 * size, 2 * size)
-        finer[::2, ::2], finer[1::2, 1::2] = grid, middle
+        finer[::2, ::2] = grid
+        finer[1::2, 1::2] = middle
         finer[::2, 1::2] = (grid + right + middle + middle.roll(1, 0)) / 4.0 + noise[1]
         finer[1::2, ::2] = (grid + down + middle + middle.roll(1, 1)) / 4.0 + noise[2]
         grid = finer
@@ -421,40 +465,42 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _crystals(height: int, width: int, seed: int) -> Tensor:
-    """(H, W, 3) ice in [0, 1]: feathers of crystals over a film that is thicker in
-    places, a little blue.
-    """
-    tall, wide = reference_size(height, width)
+    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
+    rows, columns = reference_size(height, width)
     source = generator(seed, "frost")
-    film = fractal(max(tall, wide), 1.4, source)[:tall, :wide, None]
-    feathers = images.resized(_feathers(2 * tall, 2 * wide, source), tall, wide)
+    film = fractal(max(rows, columns), 1.4, source)[:rows, :columns, None]
+    feathers = images.resized(_feathers(2 * rows, 2 * columns, source), rows, columns)
     ice = 0.2 + 0.3 * film + (0.45 + 0.75 * film) * feathers
     return images.resized((ice * torch.tensor(ICE)).clamp(0.0, 1.0), height, width)
 
 
 def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
-    """Return (height, width, 1) in [0, 1]: ice needles with barbs at 60 degrees, as ice
-    grows on glass.
+    """Draw ice needles with barbs at 60 degrees, as ice grows on glass.
+
+    Returns:
+        (height, width, 1) in [0, 1].
     """
     canvas = Image.new("L", (width, height))
     pen = ImageDraw.Draw(canvas)
-    drawn = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
-    for shine, across, down, turn, size in sorted(drawn):
-        start = complex(across * width, down * height)
-        along = cmath.rect(1.0, 2.0 * math.pi * turn)
-        length = 12.0 + 110.0 * size**3
-        _line(pen, start, start + length * along, shine)
-        for step in range(4, int(length), 4):
-            uneven = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
-            barb = (0.2 + 0.35 * uneven) * (length - step) * along
-            for side in (math.pi / 3.0, -math.pi / 3.0):
-                _line(
-                    pen,
-                    start + step * along,
-                    start + step * along + barb * cmath.rect(1.0, side),
-                    0.7 * shine,
-                )
+    needles = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
+    for shine, x, y, turn, size in sorted(needles):
+        _draw_feather(pen, complex(x * width, y * height), turn, size, shine)
     return torch.from_numpy(np.asarray(canvas, dtype=np.float32) / 255.0)[..., None]
+
+
+def _draw_feather(
+    pen: ImageDraw.ImageDraw, start: complex, turn: float, size: float, shine: float
+) -> None:
+    """Draw one ice needle from a point, with a direction, a size and a shine in [0, 1]."""
+    direction = cmath.rect(1.0, 2.0 * math.pi * turn)
+    length = 12.0 + 110.0 * size**3
+    _line(pen, start, start + length * direction, shine)
+    for step in range(4, int(length), 4):
+        unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
+        barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
+        root = start + step * direction
+        for angle in (math.pi / 3.0, -math.pi / 3.0):
+            _line(pen, root, root + barb * cmath.rect(1.0, angle), 0.7 * shine)
 
 
 def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) -> None:
@@ -465,7 +511,8 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
     (keep,) = at_level(SNOW_KEEP, level)
     layer = between(
-        level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole)
+        level,
+        lambda severity: _snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
@@ -473,16 +520,19 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _snowfall(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 1) falling snow in [0, 1] at a whole severity."""
-    tall, wide = reference_size(height, width)
-    mean, spread, flake, over, radius, sigma = SNOW[whole - 1]
+def _snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
+    """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
+    rows, columns = reference_size(height, width)
+    mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = generator(seed, "snow")
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
-        math.ceil(tall / flake), math.ceil(wide / flake), 1, generator=source
+        math.ceil(rows / flake_size),
+        math.ceil(columns / flake_size),
+        1,
+        generator=source,
     )
-    flakes = images.resized(noise, tall, wide)
-    flakes = torch.where(flakes < over, torch.zeros_like(flakes), flakes)
+    flakes = images.resized(noise, rows, columns)
+    flakes = torch.where(flakes < threshold, torch.zeros_like(flakes), flakes)
     streaks = streaked(flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0)
     return images.resized(streaks.clamp(0.0, 1.0), height, width)

@@ -52,9 +52,13 @@ CLEARANCE = 0.05
 
 @cache
 def loaded(spec: str) -> assets.ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on
-    the origin. Raises InputError where there is no such object, or the file cannot be
-    used.
+    """Return an object, its largest extent 1, centered on the origin.
+
+    Args:
+        spec: name of a bundled object, or the path of a mesh file.
+
+    Raises:
+        InputError: there is no such object, or the file cannot be used.
     """
     asset = SceneDescription.load_object(spec)
     mesh = assets.normalised(asset.mesh)
@@ -64,48 +68,42 @@ def loaded(spec: str) -> assets.ObjectAsset:
     )
 
 
-def _asset(option: str) -> assets.ObjectAsset:
+def _load_asset(option: str) -> assets.ObjectAsset:
     return made(option) if option in MADE else loaded(option)
 
 
 @cache
 def made(name: str) -> assets.ObjectAsset:
-    """Return one of the occluders made here, one object size large around the origin:
-    "card" or "sphere".
-    """
-    generator = np.random.Generator(np.random.PCG64(7))
+    """Return the "card" or the "sphere", one object size large around the origin."""
     if name == "card":
-        texels = np.array([0.70, 0.53, 0.36]) + generator.normal(
-            0.0, 0.012, (64, 64, 1)
-        ) * np.ones(3)
-        # the flutes under the paper
-        texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]
-        uvs = np.array(
-            [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32
-        )
-        vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(
-            np.float32
-        )
-        normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-        card = assets.Mesh(
-            vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs
-        )
-        return assets.ObjectAsset(
-            name,
-            card,
-            texels.clip(0.0, 1.0).astype(np.float32),
-            assets.Material(roughness=0.9),
-        )
+        return _make_card()
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
     return assets.ObjectAsset(
         name, parts.sphere(24, 48), grey, assets.Material(roughness=0.6)
     )
 
 
+def _make_card() -> assets.ObjectAsset:
+    """Return a square piece of cardboard in the plane x = 0."""
+    generator = np.random.Generator(np.random.PCG64(7))
+    grain = generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
+    texels = np.array([0.70, 0.53, 0.36]) + grain
+    # the flutes under the paper
+    texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]
+    uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
+    vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1)
+    normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
+    faces = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32)
+    mesh = assets.Mesh(vertices.astype(np.float32), faces, normals, uvs)
+    base_color = texels.clip(0.0, 1.0).astype(np.float32)
+    return assets.ObjectAsset("card", mesh, base_color, assets.Material(roughness=0.9))
+
+
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an occluder goes, in the camera's coordinates; lengths are in object
-    sizes.
+    """Where an occluder goes, in the camera's coordinates.
+
+    Lengths are in object sizes.
     """
 
     # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is
@@ -128,25 +126,65 @@ class OcclusionControl(Control):
     # none is changed; but it comes after whatever moves the camera or the object
     refines = frozenset(geometry.SURROUNDINGS)
     parameters = (
-        Parameter.named("which", OPTIONS, "card",
-                        "What it is: a piece of cardboard, a grey sphere, or a bundled "
-                        "object.",
-                        estimators=("differences",), moves_silhouettes=True),
-        _moving("coverage", "1", 0.0, 0.9, 0.0,
-                "Share of the object's picture area that it hides; at 0 it is out of "
-                "the frame.", (0.0, 0.5)),
-        _moving("direction", "degrees", -3600.0, 3600.0, 0.0,
-                "Side of the picture it comes in from: 0 is the right, 90 the top, "
-                "counter-clockwise.", (0.0, 360.0),
-                periodic=True),
-        _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", (0.3, 1.0), log=True),
-        _moving("distance", "1", 0.1, 0.9, 0.5,
-                "Where between the camera and the object's middle: 0 is the camera, 1 "
-                "the middle.", (0.3, 0.7)),
-        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder "
-                                                         "about its own upright axis.",
-                periodic=True),
-    )  # fmt: skip
+        Parameter.named(
+            "which",
+            OPTIONS,
+            "card",
+            "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+            estimators=("differences",),
+            moves_silhouettes=True,
+        ),
+        _moving(
+            "coverage",
+            "1",
+            0.0,
+            0.9,
+            0.0,
+            "Share of the object's picture area that it hides; at 0 it is out of "
+            "the frame.",
+            (0.0, 0.5),
+        ),
+        _moving(
+            "direction",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Side of the picture it comes in from: 0 is the right, 90 the top, "
+            "counter-clockwise.",
+            (0.0, 360.0),
+            periodic=True,
+        ),
+        _moving(
+            "size",
+            "object sizes",
+            0.05,
+            5.0,
+            0.6,
+            "Its largest extent.",
+            (0.3, 1.0),
+            log=True,
+        ),
+        _moving(
+            "distance",
+            "1",
+            0.1,
+            0.9,
+            0.5,
+            "Where between the camera and the object's middle: 0 is the camera, 1 "
+            "the middle.",
+            (0.3, 0.7),
+        ),
+        _moving(
+            "turn",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Rotation of the occluder about its own upright axis.",
+            periodic=True,
+        ),
+    )
     choices = (
         Choice(
             "object",
@@ -157,6 +195,7 @@ class OcclusionControl(Control):
     )
 
     def check_choices(self) -> None:
+        """Check the occluder that was chosen in place of `which`. Raises InputError."""
         occluder = self.chosen["object"]
         if occluder is None:
             return
@@ -173,263 +212,312 @@ class OcclusionControl(Control):
         self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        away = geometry.put_away(
+        """Add every occluder that can be chosen, out of sight."""
+        hidden_pose = geometry.put_away(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
-        for option in self._candidates():
-            asset = _asset(option)
-            looks = asset.base_color, asset.material, asset.label
+        for option in self._list_options():
+            asset = _load_asset(option)
+            appearance = asset.base_color, asset.material, asset.label
             scene = scene.with_part(
-                parts.MeshPart(self._part(option), asset.mesh, *looks, to_world=away)
+                parts.MeshPart(
+                    self._part_name(option),
+                    asset.mesh,
+                    *appearance,
+                    to_world=hidden_pose,
+                )
             )
         return scene
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        chosen = self._option(values)
+        """Return the poses of all occluders; those that are not used are out of sight."""
         camera = geometry.camera_in(self.scene, so_far).to(values["turn"])
         inputs = {
-            f"{self._part(one)}.to_world": geometry.put_away(camera)
-            for one in self._candidates()
+            f"{self._part_name(option)}.to_world": geometry.put_away(camera)
+            for option in self._list_options()
         }
         placed = self.placement(values, so_far)
         if not placed.away:
-            inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
+            part = self._part_name(self._select_option(values))
+            inputs[f"{part}.to_world"] = _compute_pose(camera, placed, values)
         return inputs
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """What is hidden of the object, and what became of the size and the distance
-        that were asked for.
-        """
+        """Return how much is hidden, and the true size and distance of the occluder."""
         placed = self.placement(values, so_far)
-        hidden = {"hidden": Value(value=float(placed.hidden), unit="1")}
-        if placed.away:
-            return hidden
-        sizes = {"true_size": placed.size, "true_distance": placed.distance}
-        return hidden | {
-            name: Value(value=float(value), unit="object sizes")
-            for name, value in sizes.items()
-        }
+        measurements = {"hidden": Value(value=float(placed.hidden), unit="1")}
+        if not placed.away:
+            lengths = {"true_size": placed.size, "true_distance": placed.distance}
+            for name, length in lengths.items():
+                measurements[name] = Value(value=float(length), unit="object sizes")
+        return measurements
 
-    def _candidates(self) -> tuple[str, ...]:
-        """Every occluder that can be chosen; each is a part of the scene."""
+    def _list_options(self) -> tuple[str, ...]:
+        """Return every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
         return tuple(map(str, self.allowed("which", MADE[0])))
 
-    def _option(self, values: Values) -> str:
+    def _select_option(self, values: Values) -> str:
         return (
-            self._candidates()[0]
+            self._list_options()[0]
             if self.chosen["object"] is not None
             else OPTIONS[int(values["which"])]
         )
 
-    def _part(self, option: str) -> str:
-        """The name of an occluder's part: the instance's, with the option where there
-        are several.
+    def _part_name(self, option: str) -> str:
+        """Return the name of an occluder's part of the scene.
+
+        The instance's name, with the option where there are several.
         """
-        return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
+        return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
     def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes, with camera and object where other controls
-        put them; without derivatives.
+        """Work out where the occluder goes, with camera and object where others put them.
+
+        Without derivatives.
         """
-        asked = {name: float(value.detach()) for name, value in values.items()}
-        seen = _Seen.of(self.scene, so_far)
-        mesh = _asset(self._option(values)).mesh
-        if seen.directions is None or asked["coverage"] <= 0.0:
-            return Placement(
-                np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True
-            )
-        points = (
-            mesh.vertices.astype(np.float64)
-            @ geometry.rotation(asked["turn"], 0.0, 0.0).T
+        requested = {name: float(value.detach()) for name, value in values.items()}
+        view = _ObjectView.of(self.scene, so_far)
+        requested_distance = requested["distance"] * view.far
+        if view.directions is None or requested["coverage"] <= 0.0:
+            return _make_hidden_placement(requested["size"], requested_distance)
+        mesh = _load_asset(self._select_option(values)).mesh
+        turn = geometry.rotation(requested["turn"], 0.0, 0.0)
+        points = mesh.vertices.astype(np.float64) @ turn.T
+        size, distance = _fit_occluder(
+            points, requested["size"], requested_distance, view.near
         )
-        size, distance = _fitting(
-            points, asked["size"], asked["distance"] * seen.far, seen.near
-        )
-        ahead = np.stack(
+        # right, up and forward of a camera that looks at it
+        in_camera = np.stack(
             [points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size],
             axis=1,
         )
-        cover = silhouettes.silhouette(ahead, mesh.faces)
+        cover = silhouettes.silhouette(in_camera, mesh.faces)
         if cover is None:
-            return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
-        axes = silhouettes.middle_axes(seen.directions)
-        sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
-        outside = silhouettes.angle_outside(
-            seen.shown, seen.rim, cover, axes, asked["direction"]
+            return _make_hidden_placement(size, distance)
+        axes = silhouettes.middle_axes(view.directions)
+        passage = silhouettes.Passage(
+            view.directions, cover, axes, requested["direction"]
         )
-        angle = sweep.solve(max(asked["coverage"], EASE), outside)
-        if asked["coverage"] < EASE:
-            angle = outside + (angle - outside) * asked["coverage"] / EASE
-        return Placement(
-            axes,
-            angle,
-            size,
-            distance,
-            float(sweep.coverage(np.array([angle]))[0]),
-            False,
-        )
+        angle = _find_covering_angle(view, passage, requested["coverage"])
+        hidden = float(passage.coverage(np.array([angle]))[0])
+        return Placement(axes, angle, size, distance, hidden, False)
 
 
 # ---- what the camera sees
-# -------------------------------------------------------------------------------------------
+
+
+def _find_covering_angle(
+    view: _ObjectView, passage: silhouettes.Passage, coverage: float
+) -> float:
+    """Find the angle, radians, at which an occluder hides a fraction of the object.
+
+    Below `EASE` it slides in from outside of the image.
+    """
+    outside = silhouettes.angle_outside(
+        view.shown, view.rim, passage.cover, passage.axes, passage.direction
+    )
+    angle = passage.solve(max(coverage, EASE), outside)
+    if coverage < EASE:
+        angle = outside + (angle - outside) * coverage / EASE
+    return angle
+
+
+def _make_hidden_placement(size: float, distance: float) -> Placement:
+    """Return the placement of an occluder that is out of sight."""
+    return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _ObjectView:
     """The object as the camera sees it."""
 
-    directions: (
-        assets.Doubles | None
-    )  # (N, 3) in which it is seen, each for the same area; None if it is not in the picture
-    shown: assets.Doubles  # (M, 3) directions spread over the whole picture
+    # (N, 3) in which it is visible, each for the same area; None if it is not in the
+    # image
+    directions: assets.Doubles | None
+    shown: assets.Doubles  # (M, 3) directions spread over the full image
     rim: assets.Doubles  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
 
     @staticmethod
-    def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
-        camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
-        pose = _numpy(so_far, "object.to_world", geometry.object_to_world(scene))
-        mesh = scene.object.mesh
-        vertices = mesh.vertices.astype(np.float64) + _numpy(
-            so_far, "object.offsets", np.zeros(3)
-        )
-        world = vertices @ pose[:3, :3].T + pose[:3, 3]
-        # right, up, forward: a sensor's own x axis points to the left
-        points = (world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0)
-        if (model := scene.camera_model) is not None:
-            model = (
-                model.with_numbers(so_far["camera.lens"].detach().cpu())
-                if "camera.lens" in so_far
-                else model
-            )
-            shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
-            directions = _through(model, points, mesh.faces)
+    def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _ObjectView:
+        """Compute the view of a scene's object with the inputs of the controls before.
+
+        Without derivatives.
+        """
+        points = _object_in_camera(scene, so_far)
+        faces = scene.object.mesh.faces
+        model = scene.camera_model
+        if model is not None:
+            if "camera.lens" in so_far:
+                model = model.with_numbers(so_far["camera.lens"].detach().cpu())
+            spread = _spread_directions(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
+            rim = spread
+            directions = _directions_through_lens(model, points, faces)
         else:
-            fov = float(
-                _numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0]
-            )
-            shift = _numpy(so_far, "camera.shift", np.zeros(2))
-            frame = geometry.Frame.of(
-                fov, scene.aspect, (float(shift[0]), float(shift[1]))
-            )
-            silhouette = silhouettes.silhouette(points, mesh.faces, frame)
-            shown = silhouettes.spread_directions(frame)
+            frame = _image_frame(scene, so_far)
+            silhouette = silhouettes.silhouette(points, faces, frame)
+            spread = silhouettes.spread_directions(frame)
             rim = frame.corners()
             directions = None if silhouette is None else silhouette.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         near = float(np.linalg.norm(points, axis=1).min())
         far = float(np.linalg.norm(middle))
-        return _Seen(directions, shown, rim, near, far)
+        return _ObjectView(directions, spread, rim, near, far)
 
 
-def _through(
+def _object_in_camera(
+    scene: SceneDescription, so_far: Mapping[str, Tensor]
+) -> assets.Doubles:
+    """Return the object's vertices (V, 3) to the right, up and forward of the camera."""
+    camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
+    pose = _input_or(so_far, "object.to_world", geometry.object_to_world(scene))
+    offsets = _input_or(so_far, "object.offsets", np.zeros(3))
+    vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
+    world = vertices @ pose[:3, :3].T + pose[:3, 3]
+    # a sensor's own x axis points to the left
+    in_camera = (world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0)
+    return np.asarray(in_camera)
+
+
+def _image_frame(
+    scene: SceneDescription, so_far: Mapping[str, Tensor]
+) -> geometry.Frame:
+    """Return what the image of a camera without distortion shows."""
+    scene_fov = np.array([scene.number("camera.fov")])
+    fov = float(_input_or(so_far, "camera.fov", scene_fov)[0])
+    shift = _input_or(so_far, "camera.shift", np.zeros(2))
+    return geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+
+
+def _directions_through_lens(
     model: geometry.CameraModel, points: assets.Doubles, faces: npt.NDArray[np.uint32]
 ) -> assets.Doubles | None:
-    """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera
-    coordinates, is seen through a lens, each for the same area of the picture, or None.
+    """Return the directions in which a mesh is seen through a lens.
+
+    Args:
+        model: of the camera.
+        points: (V, 3) vertices in camera coordinates.
+        faces: (F, 3) of the mesh.
+
+    Returns:
+        Unit directions (N, 3), each for the same area of the image; None if it is not
+        in the image.
     """
-    axes = silhouettes.middle_axes(
-        points / np.linalg.norm(points, axis=1, keepdims=True)
-    )
+    vertex_directions = points / np.linalg.norm(points, axis=1, keepdims=True)
+    axes = silhouettes.middle_axes(vertex_directions)
     cover = silhouettes.silhouette(points @ axes.T, faces)
     if cover is None:
         return None
-    places, seen = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
-    (left, top), (right, bottom) = (
-        (
-            places.amin(dim=0).clamp(0.0, 1.0).tolist(),
-            places.amax(dim=0).clamp(0.0, 1.0).tolist(),
-        )
-        if bool(seen.all())
-        else ((0.0, 0.0), (1.0, 1.0))
+    positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
+    left, top, right, bottom = 0.0, 0.0, 1.0, 1.0
+    if bool(is_visible.all()):
+        left, top = positions.amin(dim=0).clamp(0.0, 1.0).tolist()
+        right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
+    directions = _spread_directions(
+        model, (left, right), (top, bottom), silhouettes.RASTER
     )
-    looked = _looked(model, (left, right), (top, bottom), silhouettes.RASTER)
-    hidden = looked[cover.contains(*(looked @ axes.T).T)]
+    hidden = directions[cover.contains(*(directions @ axes.T).T)]
     return hidden if len(hidden) else None
 
 
-def _looked(
+def _spread_directions(
     model: geometry.CameraModel,
     across: tuple[float, float],
     down: tuple[float, float],
     count: int,
 ) -> assets.Doubles:
-    """Unit directions (N, 3) in which a lens sees a part of the picture: as
-    `Silhouette.directions`, in it.
+    """Return unit directions (N, 3) in which a lens sees a part of the image.
+
+    They are spread as those of `Silhouette.directions`.
+
+    Args:
+        model: of the camera.
+        across: bounds of the part, fractions of the width from the left.
+        down: bounds of the part, fractions of the height from the top.
+        count: of rows and columns.
     """
     row, column = np.divmod(np.arange(count * count), count)
-    number = np.arange(count * count)
-    x, y = (
-        low + (index + (0.5 + step * number) % 1.0) / count * (high - low)
-        for (low, high), index, step in (
-            (across, column, 0.7548777),
-            (down, row, 0.5698403),
-        )
-    )
+    index = np.arange(count * count)
+    x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
+    y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
+    x = across[0] + x_in_cells / count * (across[1] - across[0])
+    y = down[0] + y_in_cells / count * (down[1] - down[0])
     directions, inside = model.rays(torch.from_numpy(np.stack([x, y], axis=1)))
-    found = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    visible = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
+    return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
 
 
-def _numpy(
+def _input_or(
     inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles
 ) -> assets.Doubles:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
 # ---- where the occluder goes
-# ----------------------------------------------------------------------------------------
 
 
-def _fitting(
+def _fit_occluder(
     points: assets.Doubles, size: float, distance: float, near: float
 ) -> tuple[float, float]:
-    """Return a size and a distance close to those asked for with which an occluder with
-    points (V, 3), one object size large around the origin, is between the camera and
-    the object, whose nearest vertex is at `near`. It keeps `CLEARANCE` from the camera,
-    and no vertex is farther from the camera than the object's nearest one. Where its
-    size leaves no such place, it is made smaller.
+    """Fit an occluder between the camera and the object.
+
+    It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than
+    the object's nearest one. It is made smaller where it does not fit.
+
+    Args:
+        points: (V, 3) of the occluder, one object size large around the origin.
+        size: that is requested.
+        distance: from the camera that is requested.
+        near: distance of the object's nearest vertex from the camera.
+
+    Returns:
+        Its size, and its distance from the camera.
     """
     front = float(points[:, 0].max())
     back = float(-points[:, 0].min())
-    aside = float(np.hypot(points[:, 1], points[:, 2]).max())
+    half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
     near = max(near, 3.0 * CLEARANCE)
     for _ in range(200):
         nearest = CLEARANCE + size * front
-        reach = near * near - (size * aside) ** 2
-        farthest = math.sqrt(reach) - size * back if reach > 0.0 else 0.0
+        squared_reach = near * near - (size * half_width) ** 2
+        farthest = 0.0
+        if squared_reach > 0.0:
+            farthest = math.sqrt(squared_reach) - size * back
         if farthest >= nearest:
             break
         size *= 0.95
     return size, min(max(distance, nearest), farthest)
 
 
-def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
-    """The occluder's pose (4, 4). Differentiable in the camera, the direction and the
-    turn at the angle that was found; nothing else has a derivative here, which is why
-    the control is differentiated by differences.
+def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
+    """Return the occluder's pose (4, 4).
+
+    Differentiable in the camera, the direction and the turn, at the angle of the
+    placement; nothing else has a derivative here, which is why the control is
+    differentiated by differences.
     """
     right, up, forward = torch.from_numpy(placed.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
-    along = torch.cos(direction) * right + torch.sin(direction) * up
-    across = -torch.sin(direction) * right + torch.cos(direction) * up
+    # of the image: towards the occluder, and at a right angle
+    outwards = torch.cos(direction) * right + torch.sin(direction) * up
+    sideways = -torch.sin(direction) * right + torch.cos(direction) * up
     sine = math.sin(placed.angle)
     cosine = math.cos(placed.angle)
-    ahead = cosine * forward + sine * along
-    along = cosine * along - sine * forward
-    right = torch.cos(direction) * along - torch.sin(direction) * across
-    up = torch.sin(direction) * along + torch.cos(direction) * across
+    to_occluder = cosine * forward + sine * outwards
+    outwards = cosine * outwards - sine * forward
+    right = torch.cos(direction) * outwards - torch.sin(direction) * sideways
+    up = torch.sin(direction) * outwards + torch.cos(direction) * sideways
     turn = torch.deg2rad(values["turn"])
-    x = -torch.cos(turn) * ahead + torch.sin(turn) * right
-    y = torch.sin(turn) * ahead + torch.cos(turn) * right
+    x = -torch.cos(turn) * to_occluder + torch.sin(turn) * right
+    y = torch.sin(turn) * to_occluder + torch.cos(turn) * right
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
-    place = camera[:3, 3] + placed.distance * (to_world @ ahead)
-    return geometry.affine(linear, place)
+    center = camera[:3, 3] + placed.distance * (to_world @ to_occluder)
+    return geometry.affine(linear, center)

@@ -29,52 +29,42 @@ GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row
-    0 at its low end.
+    """Which directions a thing is seen in.
+
+    A mask (h, w) over a window of tangents, row 0 at its low end.
     """
 
     mask: NDArray[np.bool_]
     window: geometry.Frame
 
     def directions(self) -> assets.Doubles:
-        """Unit directions (N, 3), one in each covered pixel; all stand for the same
-        area of the picture. Their places within pixels are a low-discrepancy sequence
-        (Roberts 2018), or an upright edge would hide whole columns.
+        """Return unit directions (N, 3), one in each covered pixel.
+
+        All stand for the same area of the image. Their positions within pixels are a
+        low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole
+        columns.
         """
         row, column = np.nonzero(self.mask)
-        (height, width) = self.mask.shape
+        height, width = self.mask.shape
         window = self.window
-        number = np.arange(len(row))
-        x = (
-            window.left
-            + (column + (0.5 + 0.7548777 * number) % 1.0)
-            * (window.right - window.left)
-            / width
-        )
-        y = (
-            window.low
-            + (row + (0.5 + 0.5698403 * number) % 1.0)
-            * (window.high - window.low)
-            / height
-        )
+        index = np.arange(len(row))
+        x_in_pixels = column + (0.5 + 0.7548777 * index) % 1.0
+        y_in_pixels = row + (0.5 + 0.5698403 * index) % 1.0
+        x = window.left + x_in_pixels * (window.right - window.left) / width
+        y = window.low + y_in_pixels * (window.high - window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
     def contains(
         self, x: assets.Doubles, y: assets.Doubles, forwards: assets.Doubles
     ) -> NDArray[np.bool_]:
-        """Whether directions, any shape and length, lie in the silhouette."""
+        """Return whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
+        window = self.window
         depth = np.maximum(forwards, geometry.NEAREST)
         column = np.floor(
-            (x / depth - self.window.left)
-            / (self.window.right - self.window.left)
-            * width
+            (x / depth - window.left) / (window.right - window.left) * width
         )
-        row = np.floor(
-            (y / depth - self.window.low)
-            / (self.window.high - self.window.low)
-            * height
-        )
+        row = np.floor((y / depth - window.low) / (window.high - window.low) * height)
         inside = (
             (forwards > geometry.NEAREST)
             & (column >= 0)
@@ -82,7 +72,8 @@ class Silhouette:
             & (row >= 0)
             & (row < height)
         )
-        row, column = (np.where(inside, at, 0).astype(np.int64) for at in (row, column))
+        column = np.where(inside, column, 0).astype(np.int64)
+        row = np.where(inside, row, 0).astype(np.int64)
         return np.asarray(inside & self.mask[row, column])
 
 
@@ -91,17 +82,42 @@ def silhouette(
     faces: NDArray[np.uint32],
     frame: geometry.Frame | None = None,
 ) -> Silhouette | None:
-    """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it
-    within a frame, None for all in front; faces (F, 3) that reach behind the camera are
-    left out. None if nothing is seen of it.
+    """Rasterise a mesh as the camera sees it; None if nothing of it is visible.
+
+    Args:
+        points: (V, 3) vertices in camera coordinates.
+        faces: (F, 3); those that reach behind the camera are left out.
+        frame: what the camera shows; None for all in front of it.
     """
     corners = points[faces.astype(np.int64)]
     corners = corners[(corners[..., 2] > geometry.NEAREST).all(axis=1)]
     if len(corners) == 0:
         return None
     tangents = corners[..., :2] / corners[..., 2:]
-    (left, low) = tangents.min(axis=(0, 1))
-    (right, high) = tangents.max(axis=(0, 1))
+    window = _find_window(tangents, frame)
+    if window is None:
+        return None
+    window_width = window.right - window.left
+    window_height = window.high - window.low
+    pixel = max(window_width, window_height) / RASTER
+    width = max(1, math.ceil(window_width / pixel))
+    height = max(1, math.ceil(window_height / pixel))
+    in_pixels = (tangents - (window.left, window.low)) * (
+        width / window_width,
+        height / window_height,
+    ) - 0.5
+    _, row, column, _ = images.pixels_in(in_pixels, (height, width))
+    mask = np.zeros((height, width), dtype=np.bool_)
+    mask[row, column] = True
+    return Silhouette(mask, window) if mask.any() else None
+
+
+def _find_window(
+    tangents: assets.Doubles, frame: geometry.Frame | None
+) -> geometry.Frame | None:
+    """Return the box of tangents (F, 3, 2) within a frame; None if it is empty."""
+    left, low = tangents.min(axis=(0, 1))
+    right, high = tangents.max(axis=(0, 1))
     if frame is not None:
         left = max(left, frame.left)
         right = min(right, frame.right)
@@ -109,24 +125,7 @@ def silhouette(
         high = min(high, frame.high)
     if not (right > left and high > low):
         return None
-    pixel = max(right - left, high - low) / RASTER
-    width, height = (
-        max(1, math.ceil((b - a) / pixel)) for a, b in ((left, right), (low, high))
-    )
-    scaled = (tangents - (left, low)) * (
-        width / (right - left),
-        height / (high - low),
-    ) - 0.5
-    _, row, column, _ = images.pixels_in(scaled, (height, width))
-    mask = np.zeros((height, width), dtype=np.bool_)
-    mask[row, column] = True
-    return (
-        Silhouette(
-            mask, geometry.Frame(float(left), float(right), float(low), float(high))
-        )
-        if mask.any()
-        else None
-    )
+    return geometry.Frame(float(left), float(right), float(low), float(high))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,43 +141,46 @@ class Passage:
     direction: float
 
     def coverage(self, angles: assets.Doubles) -> assets.Doubles:
-        """Return the hidden share (K,) at angles (K,) in radians away from the
-        middle.
-        """
+        """Return the hidden fraction (K,) at angles (K,) in radians from the middle."""
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
-        along = math.cos(turn) * right + math.sin(turn) * up
-        across = -math.sin(turn) * right + math.cos(turn) * up
-        shares = []
+        outwards = math.cos(turn) * right + math.sin(turn) * up
+        sideways = -math.sin(turn) * right + math.cos(turn) * up
+        fractions = []
         for angle in angles:
-            moved = along * math.cos(angle) - forward * math.sin(angle)
-            depth = along * math.sin(angle) + forward * math.cos(angle)
-            x = math.cos(turn) * moved - math.sin(turn) * across
-            y = math.sin(turn) * moved + math.cos(turn) * across
-            shares.append(float(self.cover.contains(x, y, depth).mean()))
-        return np.array(shares)
+            moved = outwards * math.cos(angle) - forward * math.sin(angle)
+            depth = outwards * math.sin(angle) + forward * math.cos(angle)
+            x = math.cos(turn) * moved - math.sin(turn) * sideways
+            y = math.sin(turn) * moved + math.cos(turn) * sideways
+            fractions.append(float(self.cover.contains(x, y, depth).mean()))
+        return np.array(fractions)
 
     def solve(self, wanted: float, outside: float) -> float:
-        """Return the largest angle in radians at which the wanted share is hidden: the
-        thing comes in from `outside`, and stops where it first hides as much. If it
-        never does, the angle at which it hides most is returned.
+        """Find the largest angle at which a fraction is hidden, by bisection.
+
+        The thing comes in from outside, and stops where it first hides as much. If it never
+        does, the angle at which it hides most is returned.
+
+        Args:
+            wanted: the fraction.
+            outside: angle at which it is outside of the image, radians.
         """
         angles = np.linspace(outside, 0.0, SCAN)
-        shares = self.coverage(angles)
-        enough = np.nonzero(shares >= wanted)[0]
+        fractions = self.coverage(angles)
+        enough = np.nonzero(fractions >= wanted)[0]
         if len(enough) == 0:
-            return float(angles[int(np.argmax(shares))])
+            return float(angles[int(np.argmax(fractions))])
         if enough[0] == 0:
             return float(angles[0])
-        out = float(angles[enough[0] - 1])
-        within = float(angles[enough[0]])
+        too_far = float(angles[enough[0] - 1])
+        close_enough = float(angles[enough[0]])
         for _ in range(HALVINGS):
-            middle = 0.5 * (out + within)
+            middle = 0.5 * (too_far + close_enough)
             if float(self.coverage(np.array([middle]))[0]) >= wanted:
-                within = middle
+                close_enough = middle
             else:
-                out = middle
-        return 0.5 * (out + within)
+                too_far = middle
+        return 0.5 * (too_far + close_enough)
 
 
 def spread_directions(frame: geometry.Frame) -> assets.Doubles:
@@ -187,8 +189,9 @@ def spread_directions(frame: geometry.Frame) -> assets.Doubles:
 
 
 def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
-    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows
-    right, up, forward.
+    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette.
+
+    Rows right, up, forward.
     """
     forward = hidden.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
@@ -205,18 +208,25 @@ def angle_outside(
     axes: assets.Doubles,
     direction: float,
 ) -> float:
-    """Return the angle in radians beyond which a thing that comes from a direction,
-    degrees, is out of the picture on its side: of directions (N, 3) spread over the
-    whole picture and (M, 3) at its edge; the others as of `Passage`.
+    """Return the angle in radians beyond which a thing is out of the image on its side.
+
+    Args:
+        shown: (N, 3) directions spread over the full image.
+        rim: (M, 3) directions at the edge of the image.
+        cover: the thing, as of `Passage`.
+        axes: as of `Passage`.
+        direction: from which it comes, as of `Passage`.
     """
-    radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
+    corners = cover.window.corners()
+    radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
-    angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)
+    farthest = min(reach + radius + 0.02, 0.9 * math.pi)
+    angles = np.linspace(farthest, 0.0, 2 * SCAN)
     covered = Passage(shown, cover, axes, direction).coverage(angles)
     inside = np.nonzero(covered > 0.0)[0]
-    return (
-        float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
-    )
+    if not len(inside):
+        return float(angles[0])
+    return float(angles[max(int(inside[0]) - 1, 0)])
 
 
 def _unit(vectors: assets.Doubles) -> assets.Doubles:

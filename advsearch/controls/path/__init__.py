@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -91,8 +91,9 @@ FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """A way from a file; lengths are in metres where the object's size is known, in
-    object sizes elsewhere.
+    """A path from a file.
+
+    Lengths are in metres where the object's size is known, in object sizes elsewhere.
     """
 
     times: Tensor  # (n,) ascending, seconds from the first
@@ -110,22 +111,28 @@ class Waypoints:
     notes: tuple[str, ...] = ()  # sentences about how it is read
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
-        """Return a column, or several, at times (...,), linear between waypoints;
-        differentiable in the times.
+        """Interpolate a column, or several, linearly between waypoints.
+
+        Args:
+            time: (...,) seconds; the result is differentiable in it.
+            of: (n,) or (n, k) at the waypoints.
+
+        Returns:
+            (...,) or (..., k).
         """
-        place = torch.searchsorted(self.times, time.detach(), right=True).clamp(
-            1, len(self.times) - 1
-        )
-        begin = self.times[place - 1]
-        end = self.times[place]
-        share = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
-        return torch.lerp(
-            of[place - 1], of[place], share[..., None] if of.ndim > 1 else share
-        )
+        index = torch.searchsorted(self.times, time.detach(), right=True)
+        index = index.clamp(1, len(self.times) - 1)
+        begin = self.times[index - 1]
+        end = self.times[index]
+        fraction = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
+        if of.ndim > 1:
+            fraction = fraction[..., None]
+        return torch.lerp(of[index - 1], of[index], fraction)
 
     def rotation_at(self, time: Tensor) -> Tensor:
-        """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's
-        right, down and ahead.
+        """Return the rotation (..., 3, 3) at times (...,).
+
+        Its columns are the camera's right, down and ahead.
         """
         assert self.rotations is not None
         quaternion = self.at(time, self.rotations)
@@ -137,9 +144,7 @@ class Waypoints:
 
 
 class Start(NamedTuple):
-    """A scene as it is described: poses (4, 4) of its camera and its object, and the
-    middle (3,) of that; float32.
-    """
+    """A scene as it is described: poses (4, 4), and the object's middle (3,), float32."""
 
     camera: Tensor
     middle: Tensor
@@ -168,96 +173,138 @@ class PathControl(Control):
         ),
     )
     choices = (
-        Choice("path", APPROACH,
-               "approach (straight up to where it stands), pass (straight past it), "
-               "orbit (once around), a .csv file "
-               "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
-               "Two of them with a + between: the "
-               "camera's and the object's. Several with commas between: each "
-               "configuration has one of them, `way`.",
-               "path"),
-        Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
-        Choice("seconds", SECONDS, "How long it takes; a file says so itself, but for "
-                                   "KITTI's poses.", most=LONGEST),
-        Choice("reach", REACH,
-               "How far it goes, in distances of the scene's own camera: where "
-               "approach begins, half of what pass "
-               "takes.", most=1000.0),
-        Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
-        Choice("rolling", None, "Seconds in which the rows are read, one after the "
-                                "other; below 0 from the bottom.",
-               "rolling", most=60.0, signed=True),
-        Choice("axes", None,
-               "The axes of a trajectory's poses: optical (x right, y down, z ahead), "
-               "opengl (x right, y up, z back), "
-               "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
-               "up, y right, z ahead), or none: "
-               "the camera looks at the object. By default optical.", options=tuple(AXES_MEAN)),
-        Choice("up", None, "What is up in a trajectory's world; by default z, of KITTI "
-                           "-y.",
-               options=tuple(WORLD_TO_Z_UP)),
-        Choice("object_at", None, "Where the object's middle is in a trajectory's "
-                                  "world, as [x, y, z]; by default its "
-               "origin."),
-    )  # fmt: skip
+        Choice(
+            "path",
+            APPROACH,
+            "approach (straight up to where it stands), pass (straight past it), "
+            "orbit (once around), a .csv file "
+            "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
+            "Two of them with a + between: the "
+            "camera's and the object's. Several with commas between: each "
+            "configuration has one of them, `way`.",
+            "path",
+        ),
+        Choice(
+            "moves",
+            CAMERA,
+            "What travels along a single path: camera or object.",
+            options=MOVERS,
+        ),
+        Choice(
+            "seconds",
+            SECONDS,
+            "How long it takes; a file says so itself, but for KITTI's poses.",
+            most=LONGEST,
+        ),
+        Choice(
+            "reach",
+            REACH,
+            "How far it goes, in distances of the scene's own camera: where "
+            "approach begins, half of what pass "
+            "takes.",
+            most=1000.0,
+        ),
+        Choice(
+            "shutter",
+            None,
+            "Seconds that each row is exposed: motion blur.",
+            "shutter",
+            most=60.0,
+        ),
+        Choice(
+            "rolling",
+            None,
+            "Seconds in which the rows are read, one after the "
+            "other; below 0 from the bottom.",
+            "rolling",
+            most=60.0,
+            signed=True,
+        ),
+        Choice(
+            "axes",
+            None,
+            "The axes of a trajectory's poses: optical (x right, y down, z ahead), "
+            "opengl (x right, y up, z back), "
+            "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x "
+            "up, y right, z ahead), or none: "
+            "the camera looks at the object. By default optical.",
+            options=tuple(AXES_MEAN),
+        ),
+        Choice(
+            "up",
+            None,
+            "What is up in a trajectory's world; by default z, of KITTI -y.",
+            options=tuple(WORLD_TO_Z_UP),
+        ),
+        Choice(
+            "object_at",
+            None,
+            "Where the object's middle is in a trajectory's "
+            "world, as [x, y, z]; by default its "
+            "origin.",
+        ),
+    )
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """The time, and of several paths which it is."""
-        names = (
-            _names(settings.get("path", APPROACH))
-            if isinstance(settings, Mapping)
-            else ()
-        )
+        """Return the time, and of several paths which it is."""
+        if not isinstance(settings, Mapping):
+            return cls.parameters
+        names = _split_paths(settings.get("path", APPROACH))
         if len(names) < 2:
             return cls.parameters
-        return *cls.parameters, Parameter.named(
-            Control.WAY, names, names[0], "Which of the paths."
-        )
+        choice = Parameter.named(Control.WAY, names, names[0], "Which of the paths.")
+        return (*cls.parameters, choice)
 
     def check_choices(self) -> None:
-        names = _names(self.chosen["path"])
+        """Read the paths, and check the choices that go with them."""
+        names = _split_paths(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MOST_PATHS:
             raise InputError(
                 f"{self.name}.path: expected at most {MOST_PATHS} "
                 f"different paths, got {', '.join(names)}"
             )
         self._check_object_at()
-        self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
-        self._movers = {mover for ways in self._paths for mover in ways}
-        every = [way for ways in self._paths for way in ways.values()]
-        self._files = [way for way in every if isinstance(way, Waypoints)]
-        if "moves" in self._given and not any(
-            len(one.split(BOTH)) == 1 for one in names
-        ):
+        self._paths: tuple[Ways, ...] = tuple(map(self._read_path, names))
+        self._movers = {mover for movements in self._paths for mover in movements}
+        all_movements = [
+            movement for movements in self._paths for movement in movements.values()
+        ]
+        self._files = [
+            movement for movement in all_movements if isinstance(movement, Waypoints)
+        ]
+        has_single_path = any(BOTH not in name for name in names)
+        if "moves" in self._given and not has_single_path:
             raise InputError(
                 f"{self.name}: {names[0]} says what the camera does and "
                 "what the object; leave moves out"
             )
         if "path" in self._given:  # otherwise the run may say it, later
             self._check_needless()
-        timed = any(way.has_times for way in self._files)
-        for setting, said in (
-            ("seconds", timed),
-            ("reach", len(self._files) == len(every)),
-        ):
-            if said and setting in self._given:
-                asked = self.chosen["path"]
-                raise InputError(
-                    f"{self.name}: {setting}: the file in {asked} says "
-                    "that itself; leave it out"
-                )
+        if any(movement.has_times for movement in self._files):
+            self._check_not_set("seconds")
+        if len(self._files) == len(all_movements):
+            self._check_not_set("reach")
         if self._files:
-            self.chosen["seconds"] = max(float(way.times[-1]) for way in self._files)
+            self.chosen["seconds"] = max(
+                float(movement.times[-1]) for movement in self._files
+            )
         self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
-    def _read(self, name: str) -> Ways:
-        """What a path makes of camera and object."""
-        names = (
-            two
-            if len(two := name.split(BOTH)) == 2 and all(map(_is_path, two))
-            else [name]
-        )
+    def _check_not_set(self, setting: str) -> None:
+        """Check that a choice which files state is not set. Raises InputError: it is."""
+        if setting in self._given:
+            raise InputError(
+                f"{self.name}: {setting}: the file in {self.chosen['path']} says "
+                "that itself; leave it out"
+            )
+
+    def _read_path(self, name: str) -> Ways:
+        """Return what the path of a name makes of camera and object."""
+        names = [name]
+        both = name.split(BOTH)
+        if len(both) == 2 and all(map(_is_path, both)):
+            names = both
         alone = len(names) == 1
         if alone and not _is_path(name):
             raise InputError(
@@ -266,23 +313,21 @@ class PathControl(Control):
                 f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got "
                 f"{name!r}"
             )
-        ways: dict[str, Way] = {}
-        for mover, part in zip(
-            [str(self.chosen["moves"])] if alone else MOVERS, names, strict=True
-        ):
-            ways |= (
-                {mover: part}
-                if part in PATHS
-                else self._read_file(Path(part), mover, alone)
-            )
-        return ways
+        movers = [str(self.chosen["moves"])] if alone else MOVERS
+        movements: dict[str, Way] = {}
+        for mover, path_name in zip(movers, names, strict=True):
+            if path_name in PATHS:
+                movements[mover] = path_name
+            else:
+                movements |= self._read_file(Path(path_name), mover, alone)
+        return movements
 
     def _check_needless(self) -> None:
-        """Refuse what is about trajectories where there is none."""
+        """Check that choices about trajectories have one. Raises InputError."""
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
-        if needless and not any(way.is_trajectory for way in self._files):
+        if needless and not any(waypoints.is_trajectory for waypoints in self._files):
             raise InputError(
                 f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or "
                 "KITTI, and there is none; "
@@ -290,19 +335,21 @@ class PathControl(Control):
             )
 
     def _check_object_at(self) -> None:
-        given = self.chosen["object_at"]
-        if given is None:
+        """Check the position of the object in a file's world. Raises InputError."""
+        position = self.chosen["object_at"]
+        if position is None:
             return
-        fits = isinstance(given, list | tuple) and len(given) == 3
-        if not fits or not all(
-            Parameter.is_number(value) and math.isfinite(value) for value in given
+        is_triple = isinstance(position, list | tuple) and len(position) == 3
+        if not is_triple or not all(
+            Parameter.is_number(value) and math.isfinite(value) for value in position
         ):
             raise InputError(
                 f"{self.name}.object_at: expected three numbers as in "
-                f"[20, 0, 0], got {given!r}"
+                f"[20, 0, 0], got {position!r}"
             )
 
     def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
+        """Read the file of a path: a trajectory, or a table of waypoints."""
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
         if trajectory is None:
@@ -313,52 +360,25 @@ class PathControl(Control):
                 "object moves; write its way as "
                 "time,x,y,z,heading"
             )
-        return {mover: self._follow(path, trajectory)}
+        return {mover: self._read_camera_path(path, trajectory)}
 
-    def _follow(self, path: Path, trajectory: Trajectory) -> Waypoints:
-        """Return the way of the camera on a trajectory, with notes on what its file
-        does not state.
+    def _read_camera_path(self, path: Path, trajectory: Trajectory) -> Waypoints:
+        """Return the path of the camera on a trajectory.
+
+        Its notes say what the file does not state.
         """
-        count = len(trajectory.positions)
-        notes = list(trajectory.notes)
         assumed = dict[str, str]()
-        times = trajectory.times
-        if times is None:
-            seconds = (count - 1) / KITTI_RATE
-            if "seconds" in self._given:
-                seconds = float(self.chosen["seconds"])
-            else:
-                assumed["seconds"] = (
-                    f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
-                )
-            times = np.linspace(0.0, seconds, count)
+        times = self._times_of(trajectory, assumed)
         check_times(path, times)
-
-        axes = str(self.chosen["axes"] or OPTICAL)
-        up = str(self.chosen["up"] or trajectory.default_up)
-        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
-        if trajectory.rotations is None and axes == UNUSED:
-            raise InputError(
-                f"{self.name}: axes: {path} has no rotations; leave it out"
-            )
-        if self.chosen["axes"] is None and trajectory.rotations is not None:
-            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
-        if self.chosen["up"] is None:
-            assumed["up"] = up
-        if self.chosen["object_at"] is None:
-            assumed["object_at"] = "[0, 0, 0]"
-        positions, rotations = trajectory.orient(axes, up, origin)
-        if np.abs(positions).max() > FARTHEST:
-            raise errors.FileFormatError(
-                f"{path}: expected positions within {FARTHEST:g} of the object, got "
-                "larger ones; object_at says where "
-                "that is in the file's world"
-            )
+        positions, rotations = self._orient(path, trajectory, assumed)
+        notes = list(trajectory.notes)
         if assumed:
-            listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
+            assumptions = ", ".join(
+                f"{name} {value}" for name, value in assumed.items()
+            )
             notes.append(
                 f"{path}: not everything is stated by {trajectory.format.value}. "
-                f"Assumed: {listed}. If that is wrong, "
+                f"Assumed: {assumptions}. If that is wrong, "
                 f"say {', '.join(assumed)} of the control path; with axes none the "
                 "camera looks at the object."
             )
@@ -385,29 +405,82 @@ class PathControl(Control):
             notes=tuple(notes),
         )
 
+    def _times_of(
+        self, trajectory: Trajectory, assumed: dict[str, str]
+    ) -> assets.Doubles:
+        """Return the times (n,) of a trajectory, in seconds; note what is assumed."""
+        if trajectory.times is not None:
+            return trajectory.times
+        count = len(trajectory.positions)
+        seconds = (count - 1) / KITTI_RATE
+        if "seconds" in self._given:
+            seconds = float(self.chosen["seconds"])
+        else:
+            assumed["seconds"] = (
+                f"{KITTI_RATE:g} poses a second, {_format_rounded(seconds)} in all"
+            )
+        return np.linspace(0.0, seconds, count)
+
+    def _orient(
+        self, path: Path, trajectory: Trajectory, assumed: dict[str, str]
+    ) -> tuple[assets.Doubles, Rotation | None]:
+        """Return positions and rotations as `Trajectory.orient`; note what is assumed.
+
+        Raises:
+            InputError: axes are set for a file without rotations.
+            FileFormatError: it is too far from the object.
+        """
+        axes = str(self.chosen["axes"] or OPTICAL)
+        up = str(self.chosen["up"] or trajectory.default_up)
+        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
+        if trajectory.rotations is None and axes == UNUSED:
+            raise InputError(
+                f"{self.name}: axes: {path} has no rotations; leave it out"
+            )
+        if self.chosen["axes"] is None and trajectory.rotations is not None:
+            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
+        if self.chosen["up"] is None:
+            assumed["up"] = up
+        if self.chosen["object_at"] is None:
+            assumed["object_at"] = "[0, 0, 0]"
+        positions, rotations = trajectory.orient(axes, up, origin)
+        if np.abs(positions).max() > FARTHEST:
+            raise errors.FileFormatError(
+                f"{path}: expected positions within {FARTHEST:g} of the object, got "
+                "larger ones; object_at says where "
+                "that is in the file's world"
+            )
+        return positions, rotations
+
     def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         # whatever else is asked for
         if parameter.name == Control.WAY and Control.WAY not in self.specs:
             return OneOf(parameter.options)
         return super().spec(parameter)
 
-    _later = 0.0
+    _time_shift = 0.0
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and that rows are read in, below 0 from the
-        bottom.
+        """Seconds that the shutter is open, and in which rows are read.
+
+        The latter are below 0 where rows are read from the bottom.
         """
         return float(self.chosen["shutter"] or 0.0), float(
             self.chosen["rolling"] or 0.0
         )
 
     def later(self, seconds: float) -> PathControl:
-        then = copy.copy(self)
-        then._later = self._later + seconds
-        return then
+        shifted = copy.copy(self)
+        shifted._time_shift = self._time_shift + seconds
+        return shifted
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add notes on the files, and check the paths in the scene.
+
+        Raises InputError: another control or camera has the camera, or a path is
+        impossible.
+        """
         if CAMERA in self._movers and not scene.is_seen_from_orbit:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by "
@@ -415,47 +488,54 @@ class PathControl(Control):
                 f"moves=object, or have it seen by 'orbit'"
             )
         self._check_needless()
-        there = self.within(scene)
-        for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
-            if CAMERA in ways:
-                there._check_looks(name, ways)
-        notes = [note for way in self._files for note in way.notes]
-        shortest = min(
-            (float(one.times[-1]) for one in self._files), default=self.seconds
-        )
+        in_scene = self.within(scene)
+        names = _split_paths(self.chosen["path"])
+        for name, movements in zip(names, self._paths, strict=True):
+            if CAMERA in movements:
+                in_scene._check_looks(name, movements)
+        notes = [note for waypoints in self._files for note in waypoints.notes]
+        durations = [float(waypoints.times[-1]) for waypoints in self._files]
+        shortest = min(durations, default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
-                f"path: the shortest of the files takes {_round_text(shortest)} s of "
-                f"{_round_text(self.seconds)}; who "
+                f"path: the shortest of the files takes {_format_rounded(shortest)} s of "
+                f"{_format_rounded(self.seconds)}; who "
                 "has arrived waits, and these frames count"
             )
-        return (
-            replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes))))
-            if notes
-            else scene
-        )
+        if not notes:
+            return scene
+        remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
+        return replace(scene, remarks=remarks)
 
-    def _check_looks(self, name: str, ways: Ways) -> None:
-        """Refuse a path on which the camera is at what it looks at, at a waypoint or
-        between two.
+    def _check_looks(self, name: str, movements: Ways) -> None:
+        """Check that the camera is never at what it looks at, also between waypoints.
+
+        Raises InputError: it is.
         """
-        files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
+        files = [
+            movement.times
+            for movement in movements.values()
+            if isinstance(movement, Waypoints)
+        ]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = start_of(self.scene, time.device)
-        place, target = self._camera(
-            ways, begin, time, self._object(ways, begin, time)[0]
-        )
-        gap = (target - place).expand(len(time), 3).double()
+        shift, _ = self._shift_object(movements, begin, time)
+        position, target = self._position_camera(movements, begin, time, shift)
+        gap = (target - position).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
-        share = (
-            -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)
-        ).clamp(0.0, 1.0)
-        away = (gap[:-1] + share[:, None] * step).norm(dim=1)
-        if float(away.min()) < NEAREST:
-            at = int(away.argmin())
-            when = float(torch.lerp(time[at], time[at + 1], share[at].float()))
+        # of each step, where the gap is smallest
+        fraction = -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(
+            1e-300
+        )
+        fraction = fraction.clamp(0.0, 1.0)
+        distance = (gap[:-1] + fraction[:, None] * step).norm(dim=1)
+        if float(distance.min()) < NEAREST:
+            index = int(distance.argmin())
+            seconds = float(
+                torch.lerp(time[index], time[index + 1], fraction[index].float())
+            )
             raise InputError(
-                f"`controls` {self.name}: {name}: {when:.4g} s after its start the "
+                f"`controls` {self.name}: {name}: {seconds:.4g} s after its start the "
                 "camera is where it "
                 "looks, so that it has no direction; lead it past that place, or say "
                 "what it looks at (look_x, look_y, "
@@ -463,35 +543,43 @@ class PathControl(Control):
             )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return the time, with the path's range, and the clean time as its default."""
         if parameter.name == Control.WAY:
             return parameter
         first, *last = self._paths[0].values()
         # who goes around is back at the end
-        way = last[0] if last and first == TURN else first
-        clean = CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
+        movement = last[0] if last and first == TURN else first
+        clean_time = (
+            CLEAN_AT.get(movement, 0.0) * self.seconds
+            if isinstance(movement, str)
+            else 0.0
+        )
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
         return replace(
-            parameter, default=clean, search=(0.0, self.seconds), estimators=estimators
+            parameter,
+            default=clean_time,
+            search=(0.0, self.seconds),
+            estimators=estimators,
         )
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        time = values["time"] + self._later
-        ways = self._ways(values)
+        """Return the poses of the camera, the object or both at the time."""
+        time = values["time"] + self._time_shift
+        movements = self._select_movements(values)
         start = start_of(self.scene, time.device)
-        shift, heading = self._object(ways, start, time)
+        shift, heading = self._shift_object(movements, start, time)
         inputs = {}
         if CAMERA in self._movers:
-            place, target = self._camera(ways, start, time, shift)
+            position, target = self._position_camera(movements, start, time, shift)
             roll = self.scene.number("camera.roll")
-            way = ways.get(CAMERA)
-            if isinstance(way, Waypoints) and way.rotations is not None:
-                inputs["camera.to_world"] = pose_camera(
-                    place, way.rotation_at(time), roll
-                )
+            movement = movements.get(CAMERA)
+            if isinstance(movement, Waypoints) and movement.rotations is not None:
+                pose = pose_camera(position, movement.rotation_at(time), roll)
             else:
-                inputs["camera.to_world"] = looking(place, target, roll)
+                pose = looking(position, target, roll)
+            inputs["camera.to_world"] = pose
         if THING in self._movers:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
@@ -499,105 +587,118 @@ class PathControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the distance of the camera from the object."""
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {
-            "distance": Value(
-                value=float(self._distance(self._ways(values), values["time"])),
-                unit=unit,
-            )
-        }
+        distance = self._camera_distance(self._select_movements(values), values["time"])
+        return {"distance": Value(value=float(distance), unit=unit)}
 
     def distances(self, times: Tensor) -> Tensor:
-        """Return the distances (ways, n) of the camera from the object on each of the
-        paths at times (n,), in the unit of `measured`.
+        """Return the distances of the camera from the object on each of the paths.
+
+        Args:
+            times: (n,) seconds.
+
+        Returns:
+            (paths, n) in the unit of `measured`.
         """
         return torch.stack(
-            [self._distance(ways, times).expand(times.shape) for ways in self._paths]
+            [
+                self._camera_distance(movements, times).expand(times.shape)
+                for movements in self._paths
+            ]
         )
 
-    def _distance(self, ways: Ways, time: Tensor) -> Tensor:
+    def _camera_distance(self, movements: Ways, time: Tensor) -> Tensor:
         start = start_of(self.scene, time.device)
-        shift, _ = self._object(ways, start, time)
-        away = self._camera(ways, start, time, shift)[0] - start.middle - shift
-        distance: Tensor = away.norm(dim=-1).double() * self.scene.metres
+        shift, _ = self._shift_object(movements, start, time)
+        position, _ = self._position_camera(movements, start, time, shift)
+        offset = position - start.middle - shift
+        distance: Tensor = offset.norm(dim=-1).double() * self.scene.metres
         return distance
 
-    def _ways(self, values: Values) -> Ways:
-        return (
-            self._paths[int(values[Control.WAY])]
-            if Control.WAY in values
-            else self._paths[0]
-        )
+    def _select_movements(self, values: Values) -> Ways:
+        if Control.WAY in values:
+            return self._paths[int(values[Control.WAY])]
+        return self._paths[0]
 
-    def _camera(
-        self, ways: Ways, begin: Start, time: Tensor, shift: Tensor
+    def _position_camera(
+        self, movements: Ways, scene_start: Start, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Where the camera is, and what it looks at: an object that is shifted, unless
-        a file says something else.
-        """
-        pose = begin.camera
-        center = begin.middle
-        way = ways.get(CAMERA)
-        start = pose[:3, 3]
-        if way is None:
-            return start, center
-        if isinstance(way, Waypoints):
-            place = center + way.at(time, way.places) / self.scene.metres
-            if way.rotations is not None:
-                return place, place + way.rotation_at(time)[..., 2]
-            target = center + (
-                shift
-                if way.targets is None
-                else way.at(time, way.targets) / self.scene.metres
-            )
-            return place, target
-        away = (start - center).norm()
-        reach = float(self.chosen["reach"])
-        share = (time / self.seconds).clamp(0.0, 1.0)
-        if way == APPROACH:
-            return start - _level(pose[:3, 2]) * away * (reach - 1.0) * (1.0 - share)[
-                ..., None
-            ], center + shift
-        if way == PASS:
-            return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[
-                ..., None
-            ], center + shift
-        angle = 2.0 * math.pi * share
-        (x, y, z) = start - center
-        cos = angle.cos()
-        sin = angle.sin()
-        around = torch.stack(
-            [cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1
-        )
-        return center + around, center + shift
+        """Return where the camera is, and what it looks at.
 
-    def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the object is shifted, and how many degrees it is turned by."""
-        own = begin.camera
-        way = ways.get(THING)
-        still = own.new_zeros(())
-        if way is None:
-            return own.new_zeros(3), still
-        if isinstance(way, Waypoints):
-            shift = way.at(time, way.places) / self.scene.metres
-            return shift, still if way.headings is None else way.at(time, way.headings)
-        share = (time / self.seconds).clamp(0.0, 1.0)
+        That is the object, which is shifted, unless a file says something else.
+
+        Args:
+            ways: what camera and object do.
+            begin: the scene as it is described.
+            time: (...,) seconds.
+            shift: (..., 3) of the object.
+
+        Returns:
+            Two positions (..., 3), object sizes.
+        """
+        pose = scene_start.camera
+        center = scene_start.middle
+        movement = movements.get(CAMERA)
+        start = pose[:3, 3]
+        if movement is None:
+            return start, center
+        if isinstance(movement, Waypoints):
+            return self._camera_on_waypoints(movement, center, time, shift)
+        distance = (start - center).norm()
         reach = float(self.chosen["reach"])
-        if way == TURN:
-            return own.new_zeros(3), 360.0 * share
-        away = (own[:3, 3] - begin.middle).norm()
-        if way == APPROACH:
-            return _level(own[:3, 2]) * (away * (reach - 1.0) * (1.0 - share))[
-                ..., None
-            ], still
-        return _level(-own[:3, 0]) * (away * reach * (1.0 - 2.0 * share))[
-            ..., None
-        ], still
+        progress = (time / self.seconds).clamp(0.0, 1.0)
+        if movement == APPROACH:
+            ahead = _level_direction(pose[:3, 2])
+            to_go = (1.0 - progress)[..., None]
+            return start - ahead * distance * (reach - 1.0) * to_go, center + shift
+        if movement == PASS:
+            from_middle = (1.0 - 2.0 * progress)[..., None]
+            return start + pose[:3, 0] * distance * reach * from_middle, center + shift
+        return center + _turn_about_vertical(start - center, progress), center + shift
+
+    def _camera_on_waypoints(
+        self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return where the camera is on waypoints, and what it looks at; see `_position_camera`."""
+        position = center + waypoints.at(time, waypoints.places) / self.scene.metres
+        if waypoints.rotations is not None:
+            return position, position + waypoints.rotation_at(time)[..., 2]
+        if waypoints.targets is None:
+            return position, center + shift
+        target = waypoints.at(time, waypoints.targets) / self.scene.metres
+        return position, center + target
+
+    def _shift_object(
+        self, movements: Ways, scene_start: Start, time: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return how far the object is shifted, and the degrees that it is turned by."""
+        camera = scene_start.camera
+        movement = movements.get(THING)
+        no_shift = camera.new_zeros(3)
+        no_turn = camera.new_zeros(())
+        if movement is None:
+            return no_shift, no_turn
+        if isinstance(movement, Waypoints):
+            shift = movement.at(time, movement.places) / self.scene.metres
+            if movement.headings is None:
+                return shift, no_turn
+            return shift, movement.at(time, movement.headings)
+        progress = (time / self.seconds).clamp(0.0, 1.0)
+        reach = float(self.chosen["reach"])
+        if movement == TURN:
+            return no_shift, 360.0 * progress
+        distance = (camera[:3, 3] - scene_start.middle).norm()
+        if movement == APPROACH:
+            to_go = distance * (reach - 1.0) * (1.0 - progress)
+            return _level_direction(camera[:3, 2]) * to_go[..., None], no_turn
+        from_middle = distance * reach * (1.0 - 2.0 * progress)
+        return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
 
 
 @lru_cache(maxsize=4)
 def start_of(scene: SceneDescription, device: torch.device) -> Start:
-    """Return how a scene stands; kept in memory, as it takes a look at every vertex."""
+    """Return the poses of a scene; cached, as it looks at every vertex."""
     poses = (
         geometry.camera_to_world(scene),
         geometry.middle(scene),
@@ -606,53 +707,72 @@ def start_of(scene: SceneDescription, device: torch.device) -> Start:
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
-def _level(along: Tensor) -> Tensor:
-    """The level direction (3,) of one: what travels keeps its height, as a car does."""
-    ahead = torch.stack([along[0], along[1], along.new_zeros(())])
-    return torch.as_tensor(ahead / ahead.norm().clamp_min(1e-6))
+def _level_direction(direction: Tensor) -> Tensor:
+    """Return the level direction (3,) of one: what travels keeps its height."""
+    flat = torch.stack([direction[0], direction[1], direction.new_zeros(())])
+    return torch.as_tensor(flat / flat.norm().clamp_min(1e-6))
+
+
+def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
+    """Turn an offset (3,) about the vertical by a number of turns (...,)."""
+    angle = 2.0 * math.pi * turns
+    x, y, z = offset
+    cos = angle.cos()
+    sin = angle.sin()
+    return torch.stack(
+        [cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1
+    )
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) that looks at a target (3,),
-    rolled by degrees.
+    """Return the pose (4, 4) of a camera that looks at a target.
+
+    Args:
+        place: (3,) of the camera.
+        target: (3,).
+        roll: degrees.
     """
     ahead = (target - place) / (target - place).norm().clamp_min(1e-9)
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
     # where it looks straight up or down
     aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
     left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
-    return _rolled(place, left, torch.linalg.cross(ahead, left), ahead, roll)
+    return _roll_camera(place, left, torch.linalg.cross(ahead, left), ahead, roll)
 
 
 def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
-    """Return the pose (4, 4) of a camera at a place (3,) whose right, down and ahead
-    are the columns of a rotation, rolled by degrees.
+    """Return the pose (4, 4) of a camera with a rotation.
+
+    Args:
+        place: (3,) of the camera.
+        rotation: (3, 3), columns right, down and ahead.
+        roll: degrees.
     """
     right, down, ahead = rotation.unbind(dim=-1)
-    return _rolled(place, -right, -down, ahead, roll)
+    return _roll_camera(place, -right, -down, ahead, roll)
 
 
-def _rolled(
-    place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
+def _roll_camera(
+    position: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
 ) -> Tensor:
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
     return geometry.affine(
-        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place
+        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1),
+        position,
     )
 
 
 def measure_tilt(rotations: Rotation) -> float:
-    """Return how far the top of a camera's pictures is from up, degrees, on average
-    over its rotations.
-    """
+    """Return how far the top of a camera's images is from up, mean, degrees."""
     upwards = -rotations.as_matrix()[:, 2, 1]
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
 def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
-    """Return quaternions (n, 4) with signs such that each is nearer to the one before
-    than its opposite is.
+    """Return quaternions (n, 4) whose signs do not change from one to the next.
+
+    Each is nearer to the one before than its opposite is.
     """
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
@@ -660,8 +780,9 @@ def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
 
 
 def check_times(path: Path, times: assets.Doubles) -> None:
-    """Raise FileFormatError: times (n,) from the first on are too few or many, or do
-    not ascend within limits.
+    """Check times (n,) in seconds from the first on.
+
+    Raises FileFormatError: they are too few or many, or do not ascend within limits.
     """
     if not 2 <= len(times) <= MOST_WAYPOINTS:
         raise errors.FileFormatError(
@@ -679,8 +800,12 @@ def check_times(path: Path, times: assets.Doubles) -> None:
 
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
-    """Return what turns the object about the vertical through its middle, in degrees,
-    and shifts it: (4, 4).
+    """Return the pose (4, 4) of an object that is turned and shifted.
+
+    Args:
+        start: the scene as it is described.
+        shift: (3,) object sizes.
+        heading: () degrees about the vertical through its middle.
     """
     about = geometry.euler(heading, *heading.new_zeros(2))
     center = start.middle
@@ -691,19 +816,19 @@ def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
 
 
 def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None]:
-    """Return headings (n,) so that one goes to the next the shorter way round, and what
-    is said of it.
+    """Return headings (n,) that go to the next one the shorter way round, and a note.
 
     Only where all are within one turn, from 0 to 360 or from -180 to 180: others count
-    on, as 0 to 360 does for a whole turn.
+    on, as 0 to 360 does for a whole turn. The note is None where nothing changes.
     """
     low = float(degrees.min())
     high = float(degrees.max())
-    places = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    within = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(places) or high - low >= 360.0 or not within:
+    jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
+    is_one_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(jumps) or high - low >= 360.0 or not is_one_turn:
         return degrees, None
-    first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
+    first = f"{degrees[jumps[0]]:g}"
+    last = f"{degrees[jumps[0] + 1]:g}"
     note = (
         f"it turns the shorter way from {first} to {last} degrees; for the longer "
         "one, add a waypoint between them"
@@ -711,19 +836,15 @@ def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None
     return np.asarray(np.unwrap(degrees, period=360.0)), note
 
 
-def _round_text(number: float) -> str:
+def _format_rounded(number: float) -> str:
     """Return a number with three significant digits, for a sentence."""
     return f"{float(f'{number:.3g}'):g}"
 
 
-def _names(path: object) -> tuple[str, ...]:
-    """The paths in a list, or in a text with commas between them."""
-    return tuple(
-        str(one).strip()
-        for one in (
-            path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
-        )
-    )
+def _split_paths(path: object) -> tuple[str, ...]:
+    """Return the paths in a list, or in a text with commas between them."""
+    names = path if isinstance(path, list | tuple) else str(path).split(SEVERAL)
+    return tuple(str(name).strip() for name in names)
 
 
 def _is_path(name: str) -> bool:
@@ -744,86 +865,136 @@ def _read_text(path: Path) -> str:
 def read_waypoints(
     path: Path, mover: str, *, text: str, alone: bool = True
 ) -> dict[str, Waypoints]:
-    """Return the way of all that travels, from the text of a .csv file with the columns
-    time, x, y, z, and look_x, look_y, look_z or heading. It is about the `mover`;
-    unless `alone`, one about the camera may say what the object does at the same times.
+    """Read the paths of all that travels from a table of waypoints.
 
-    Raises FileFormatError: it is no table of numbers with the columns that a path
-    needs, or its times do not ascend.
+    Args:
+        path: of the file, for messages.
+        mover: the camera or the object, which the file is about.
+        text: of a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
+            or heading.
+        alone: whether a file about the camera may say what the object does at the same
+            times.
+
+    Raises:
+        FileFormatError: it is no table of numbers with the columns that a path needs,
+            or its times do not ascend.
     """
-    further = (
-        (HEADING,)
-        if mover == THING
-        else (*LOOKING, *SHIFT, TURNING)
-        if alone
-        else LOOKING
-    )
+    optional: tuple[str, ...]
+    if mover == THING:
+        optional = (HEADING,)
+    elif alone:
+        optional = (*LOOKING, *SHIFT, TURNING)
+    else:
+        optional = LOOKING
+    header, rows = _read_csv(path, text)
+    _check_header(path, header, optional)
+    table = _parse_numbers(path, header, rows)
+    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
+    check_times(path, times)
+    column = {
+        name: table[:, index] for index, name in enumerate(header) if name != TIME
+    }
+    if not all(np.abs(values).max() <= FARTHEST for values in column.values()):
+        raise errors.FileFormatError(
+            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
+        )
+    notes = _unwrap_headings(path, column)
+
+    positions = _stack_columns(column, PLACE)
+    seconds = torch.from_numpy(times.astype(np.float32))
+    assert positions is not None
+    waypoints = {
+        mover: Waypoints(
+            seconds,
+            positions,
+            _stack_columns(column, LOOKING),
+            _stack_columns(column, (HEADING,)),
+            notes=notes.get(HEADING, ()),
+        )
+    }
+    shift = _stack_columns(column, SHIFT)
+    turn = _stack_columns(column, (TURNING,))
+    if shift is None and turn is not None:
+        shift = torch.zeros_like(positions)
+    if shift is not None:
+        waypoints[THING] = Waypoints(
+            seconds, shift, None, turn, notes=notes.get(TURNING, ())
+        )
+    return waypoints
+
+
+def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of a .csv file, without empty rows."""
+    rows = []
     try:
-        header, *rows = [
-            [cell.strip() for cell in row]
-            for row in csv.reader(text.splitlines())
-            if any(row)
-        ] or [[]]
+        for row in csv.reader(text.splitlines()):
+            if any(row):
+                rows.append([cell.strip() for cell in row])
     except csv.Error as error:
         raise errors.FileFormatError(
             f"{path}: expected a table of waypoints, got one with a {error}"
         ) from error
-    columns = (TIME, *PLACE)
-    parts = [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
-    missing = set(columns) - set(header)
-    twice = len(set(header)) < len(header)
-    if missing or twice or set(header) - {*columns, *further} or any(parts):
+    if not rows:
+        return [], []
+    return rows[0], rows[1:]
+
+
+def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> None:
+    """Check the names of columns. Raises FileFormatError: some lack, or are unknown."""
+    required = (TIME, *PLACE)
+    names = set(header)
+    is_missing = not set(required) <= names
+    has_duplicates = len(names) < len(header)
+    is_unknown = not names <= {*required, *optional}
+    is_incomplete = any(
+        0 < len(names.intersection(group)) < len(group) for group in (LOOKING, SHIFT)
+    )
+    if is_missing or has_duplicates or is_unknown or is_incomplete:
         raise errors.FileFormatError(
-            f"{path}: expected columns {', '.join(columns)}, and perhaps "
-            f"{', '.join(further)}, got "
+            f"{path}: expected columns {', '.join(required)}, and perhaps "
+            f"{', '.join(optional)}, got "
             f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or "
             "KITTI"
         )
+
+
+def _parse_numbers(
+    path: Path, header: list[str], rows: list[list[str]]
+) -> assets.Doubles:
+    """Return the numbers (rows, columns) of a table of waypoints.
+
+    Raises FileFormatError: it has too few or many rows, or something else than numbers.
+    """
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
         raise errors.FileFormatError(
             f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}"
         )
     try:
-        table = np.array(
-            [[float(one) for one in row] for row in rows], np.float64
-        ).reshape(len(rows), len(header))
+        numbers = [[float(cell) for cell in row] for row in rows]
+        return np.array(numbers, np.float64).reshape(len(rows), len(header))
     except ValueError as error:
         raise errors.FileFormatError(
             f"{path}: expected {len(header)} numbers in each row, got something else"
         ) from error
-    times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
-    check_times(path, times)
-    column = {
-        name: table[:, place] for place, name in enumerate(header) if name != TIME
-    }
-    if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
-        raise errors.FileFormatError(
-            f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none"
-        )
 
+
+def _unwrap_headings(
+    path: Path, column: dict[str, assets.Doubles]
+) -> dict[str, tuple[str, ...]]:
+    """Let headings turn the shorter way, in place; return notes by column."""
     notes = dict[str, tuple[str, ...]]()
-    for heading in [name for name in (HEADING, TURNING) if name in column]:
-        column[heading], note = the_shorter_way(column[heading])
-        notes[heading] = (f"{path}: {heading}: {note}",) if note else ()
+    for name in (HEADING, TURNING):
+        if name in column:
+            column[name], note = the_shorter_way(column[name])
+            notes[name] = (f"{path}: {name}: {note}",) if note else ()
+    return notes
 
-    def read(*names: str) -> Tensor | None:
-        if names[0] not in column:
-            return None
-        values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
-        return torch.from_numpy(values if len(names) > 1 else values[:, 0])
 
-    places = read(*PLACE)
-    seconds = torch.from_numpy(times.astype(np.float32))
-    assert places is not None
-    ways = {
-        mover: Waypoints(
-            seconds, places, read(*LOOKING), read(HEADING), notes=notes.get(HEADING, ())
-        )
-    }
-    shift = read(*SHIFT)
-    if shift is not None or TURNING in column:
-        shift = torch.zeros_like(places) if shift is None else shift
-        ways[THING] = Waypoints(
-            seconds, shift, None, read(TURNING), notes=notes.get(TURNING, ())
-        )
-    return ways
+def _stack_columns(
+    column: Mapping[str, assets.Doubles], names: Sequence[str]
+) -> Tensor | None:
+    """Return columns of a table as a tensor (n, k), or (n,) of one; None without."""
+    if names[0] not in column:
+        return None
+    values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
+    return torch.from_numpy(values if len(names) > 1 else values[:, 0])

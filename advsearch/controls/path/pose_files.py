@@ -99,9 +99,17 @@ class Trajectory:
     def orient(
         self, axes: str, up: str, origin: Sequence[float]
     ) -> tuple[assets.Doubles, Rotation | None]:
-        """Return positions (n, 3) from an origin, and rotations from a camera's axes (x
-        right, y down, z ahead), both in a world whose z is up; no rotations where the
-        axes are `UNUSED` or the file has none.
+        """Return positions and rotations in a world whose z is up.
+
+        Args:
+            axes: of the sensor, a key of `SENSOR_AXES`, or `UNUSED`.
+            up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
+            origin: (3,) in the file's world.
+
+        Returns:
+            Positions (n, 3) from the origin; rotations from a camera's axes (x
+                right, y down, z ahead), None where the axes are `UNUSED` or the
+                file has none.
         """
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
         positions = world.apply(self.positions - np.asarray(origin, np.float64))
@@ -113,8 +121,7 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
-    """Return the poses in the text of a file, or None where it is in none of the
-    formats.
+    """Read the poses in the text of a file; None if it is in none of the formats.
 
     Raises FileFormatError: rows of different lengths, numbers that are not finite,
     quaternions that are not of length 1, matrices that are no rotations, or a table of
@@ -126,12 +133,12 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first is None:
         return None
     leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
-    is_own = any(OWN_COLUMNS <= set(words) for words in leading) and not any(
+    is_waypoint_table = any(OWN_COLUMNS <= set(names) for names in leading) and not any(
         map(_find_columns, leading)
     )
     rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
-    headers = [words for words in leading if _find_columns(words)]
-    if is_own or (not headers and "," in lines[first] and leading):
+    headers = [names for names in leading if _find_columns(names)]
+    if is_waypoint_table or (not headers and "," in lines[first] and leading):
         return None  # a table with a head of another kind
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
@@ -174,8 +181,10 @@ def _is_row(line: str) -> bool:
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the columns by our names for them, or nothing unless there are a time, a
-    position and either a quaternion or a name that only these formats have.
+    """Return the columns by our names for them; nothing if it is no such table.
+
+    It needs a time, a position, and either a quaternion or a name that only these
+    formats have.
     """
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
@@ -198,13 +207,14 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         not has_quaternion and set(QUATERNION) & set(columns)
     ):
         return {}
-    is_own = not has_quaternion and OWN_COLUMNS <= set(names)
-    return {} if is_own else columns
+    is_waypoint_table = not has_quaternion and OWN_COLUMNS <= set(names)
+    return {} if is_waypoint_table else columns
 
 
 def _read_table(
     path: Path, rows: Sequence[Sequence[str]], count: int
 ) -> assets.Doubles:
+    """Return a table of numbers (rows, count). Raises FileFormatError: it is none."""
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(
@@ -220,58 +230,71 @@ def _read_table(
 def _read_named_columns(
     path: Path, names: Sequence[str], rows: Sequence[Sequence[str]], has_commas: bool
 ) -> Trajectory:
+    """Read the poses of a table whose columns have names of TUM or EuRoC."""
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
     unread = [name for index, name in enumerate(names) if index not in columns.values()]
     notes = [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
-
     times = table[:, columns["time"]]
-    stated = UNIT.search(names[columns["time"]])
-    unit = stated[1].strip() if stated else "s"
-    if unit not in UNITS:
-        raise errors.FileFormatError(
-            f"{path}: expected times in {', '.join(UNITS)}, got {reading.shown(unit)}; "
-            "correct the first line"
-        )
-    if not stated:
-        unit = next(
-            (unit for least, unit in UNIT_BY_SIZE if abs(times[0]) >= least), "s"
-        )
-        if unit != "s":
-            notes.append(
-                f"{path}: its times do not state a unit; by their size they "
-                f"are read as {unit}."
-            )
+    unit = _find_time_unit(path, names[columns["time"]], times, notes)
     # differences first: a time since 1970 in nanoseconds has more digits than a float
     times = (times - times[0]) * UNITS[unit]
-
     positions = table[:, [columns[name] for name in POSITION]]
     rotations = None
     if "qw" in columns:
         quaternions = table[:, [columns[name] for name in QUATERNION]]
-        lengths = np.linalg.norm(quaternions, axis=1)
-        off = np.abs(lengths - 1.0)
-        if off.max() > QUATERNION_TOLERANCE:
-            worst = int(off.argmax())
-            raise errors.FileFormatError(
-                f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one "
-                f"of {lengths[worst]:.3g}"
-            )
+        _check_quaternions(path, quaternions)
         rotations = Rotation.from_quat(quaternions)
-    known = PoseFormat.EUROC if has_commas else PoseFormat.TUM
-    return Trajectory(known, times, positions, rotations, tuple(notes))
+    pose_format = PoseFormat.EUROC if has_commas else PoseFormat.TUM
+    return Trajectory(pose_format, times, positions, rotations, tuple(notes))
+
+
+def _find_time_unit(
+    path: Path, name: str, times: assets.Doubles, notes: list[str]
+) -> str:
+    """Return the unit of a column of times; note it where the name does not state it."""
+    stated = UNIT.search(name)
+    if stated:
+        unit = stated[1].strip()
+        if unit not in UNITS:
+            raise errors.FileFormatError(
+                f"{path}: expected times in {', '.join(UNITS)}, got "
+                f"{reading.shown(unit)}; correct the first line"
+            )
+        return unit
+    for least, unit in UNIT_BY_SIZE:
+        if abs(times[0]) >= least:
+            notes.append(
+                f"{path}: its times do not state a unit; by their size they "
+                f"are read as {unit}."
+            )
+            return unit
+    return "s"
+
+
+def _check_quaternions(path: Path, quaternions: assets.Doubles) -> None:
+    """Check quaternions (n, 4). Raises FileFormatError: one is not of length 1."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    error = np.abs(lengths - 1.0)
+    if error.max() > QUATERNION_TOLERANCE:
+        worst = int(error.argmax())
+        raise errors.FileFormatError(
+            f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one "
+            f"of {lengths[worst]:.3g}"
+        )
 
 
 def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
+    """Read KITTI's poses. Raises FileFormatError: a matrix is no rotation."""
     poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
-    turns = poses[:, :, :3]
-    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    off = np.where(np.linalg.det(turns) > 0.0, off, np.inf)
-    if off.max() > ROTATION_TOLERANCE:
+    matrices = poses[:, :, :3]
+    products = matrices @ matrices.transpose(0, 2, 1)
+    error = np.abs(products - np.eye(3)).max(axis=(1, 2))
+    error = np.where(np.linalg.det(matrices) > 0.0, error, np.inf)
+    if error.max() > ROTATION_TOLERANCE:
         raise errors.FileFormatError(
-            f"{path}: pose {int(off.argmax()) + 1}: expected a rotation and a shift (3 "
+            f"{path}: pose {int(error.argmax()) + 1}: expected a rotation and a shift (3 "
             "rows of 4), got another map"
         )
-    return Trajectory(
-        PoseFormat.KITTI, None, poses[:, :, 3], Rotation.from_matrix(turns), ()
-    )
+    rotations = Rotation.from_matrix(matrices)
+    return Trajectory(PoseFormat.KITTI, None, poses[:, :, 3], rotations, ())

@@ -8,7 +8,8 @@ it: `ambient` lux are the irradiance that the camera's exposure is metered for. 
 ambient light is a darker projector in an equally bright picture, as a camera that
 meters would show it.
 
-    pattern = linear(texels) (1 - black) + black,        E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
+    pattern = linear(texels) (1 - black) + black
+    E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
 """
 
 from __future__ import annotations
@@ -69,57 +70,148 @@ class ProjectorControl(PictureControl):
     """
 
     part: parts.ProjectorPart
-    _later = 0.0
+    _time_shift = 0.0
     kind = "projector"
     competes_with_ambient = True
     shown = "pattern"
     default_epsilon = 1.0  # every picture is inside
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
-                  "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0),
-                  estimators=("adjoint",)),
-        _moving("azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
-                "Direction of the projector around the object.", periodic=True),
-        _moving("elevation", "degrees", -89.0, 89.0, "the camera's", "Height of the projector above the ground plane."),
-        _moving("distance", "object sizes", 0.01, 1e4, "the camera's",
-                "Distance to the object's middle; in metres where the object's size is "
-                "known.", log=True),
-        _lit("lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as "
-                                           "bright as the place",
-             "Light of a white picture."),
-        _lit("ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
-             "Light on the object without the projector.", log=True),
-        _lit("black", "1", 0.0, 1.0, 0.0,
-             "Share of white that a black texel still throws: 0.001 at a contrast of "
-             "1000."),
-        _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard "
-                                               "deviation of the blur."),
-        Parameter.number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
-                         "How often a second it flashes: light in one half of each "
-                         "period; at 0 it does not."),
-        Parameter.number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
-                         "Where in its period a flashing light is at the time of the "
-                         "picture; up to 180 it is on.",
-                         periodic=True),
-    )  # fmt: skip
+        Parameter(
+            "pattern",
+            (None, None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "black, or grey",
+            "Display-referred texels of the picture, rounded to 8 bits.",
+            search=(0.0, 1.0),
+            estimators=("adjoint",),
+        ),
+        _moving(
+            "azimuth",
+            "degrees",
+            -3600.0,
+            3600.0,
+            f"{BESIDE:g} from the camera",
+            "Direction of the projector around the object.",
+            periodic=True,
+        ),
+        _moving(
+            "elevation",
+            "degrees",
+            -89.0,
+            89.0,
+            "the camera's",
+            "Height of the projector above the ground plane.",
+        ),
+        _moving(
+            "distance",
+            "object sizes",
+            0.01,
+            1e4,
+            "the camera's",
+            "Distance to the object's middle; in metres where the object's size is "
+            "known.",
+            log=True,
+        ),
+        _lit(
+            "lumens",
+            "lumens",
+            0.0,
+            1e6,
+            f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            "Light of a white picture.",
+        ),
+        _lit(
+            "ambient",
+            "lux",
+            1e-3,
+            2e5,
+            f"the place's, or {AMBIENT:g}",
+            "Light on the object without the projector.",
+            log=True,
+        ),
+        _lit(
+            "black",
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            "Share of white that a black texel still throws: 0.001 at a contrast of "
+            "1000.",
+        ),
+        _lit(
+            "blur",
+            "texels",
+            0.0,
+            64.0,
+            0.0,
+            "How far it is out of focus: standard deviation of the blur.",
+        ),
+        Parameter.number(
+            ("differences",),
+            "flicker",
+            "Hz",
+            0.0,
+            1e5,
+            0.0,
+            "How often a second it flashes: light in one half of each "
+            "period; at 0 it does not.",
+        ),
+        Parameter.number(
+            ("differences",),
+            "phase",
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Where in its period a flashing light is at the time of the "
+            "picture; up to 180 it is on.",
+            periodic=True,
+        ),
+    )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
-        Choice("fov", None, "Angle of the picture's width, degrees; by default it just "
-                            "covers the object.", most=150.0),
-        Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
-        Choice("norm", "linf", "Norm of the ball around that start: linf (per texel "
-                               "value) or l2 (over all of them).",
-               "norm", options=("linf", "l2")),
-        Choice("epsilon", None, "Radius of that ball, display-referred; by default "
-                                "every picture is inside.", "epsilon",
-               most=PictureControl.LARGEST_EPSILON),
-        Choice("picture", None, "A picture file to project as it is; then the pattern "
-                                "is not searched.",
-               fixes="pattern"),
-    )  # fmt: skip
+        Choice(
+            "fov",
+            None,
+            "Angle of the picture's width, degrees; by default it just "
+            "covers the object.",
+            most=150.0,
+        ),
+        Choice(
+            "start",
+            "black",
+            "What the search begins with: black or grey.",
+            options=("black", "grey"),
+        ),
+        Choice(
+            "norm",
+            "linf",
+            "Norm of the ball around that start: linf (per texel "
+            "value) or l2 (over all of them).",
+            "norm",
+            options=("linf", "l2"),
+        ),
+        Choice(
+            "epsilon",
+            None,
+            "Radius of that ball, display-referred; by default "
+            "every picture is inside.",
+            "epsilon",
+            most=PictureControl.LARGEST_EPSILON,
+        ),
+        Choice(
+            "picture",
+            None,
+            "A picture file to project as it is; then the pattern is not searched.",
+            fixes="pattern",
+        ),
+    )
 
     def check_choices(self) -> None:
+        """Check that pattern, picture and ball go together. Raises InputError."""
         pattern = self._given.get("pattern")
         picture = self.chosen["picture"]
         if (
@@ -139,21 +231,21 @@ class ProjectorControl(PictureControl):
                 f"{self.name}.picture: expected the path of a picture, got {picture!r}"
             )
         self._given["picture"] = self.chosen["picture"] = str(picture)
-        beside = [
-            one
-            for one in ("pattern", "epsilon", "norm", "resolution", "aspect")
-            if one in self._given
+        conflicting = [
+            setting
+            for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
+            if setting in self._given
         ]
-        if beside:
+        if conflicting:
             raise InputError(
-                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; "
+                f"{self.name}.{conflicting[0]}: expected none beside {self.name}.picture; "
                 "leave one of them out"
             )
 
     # ---- in a scene
-    # -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add the projector, with an angle that covers the object."""
         picture = self.read_picture()
         rows = int(self.chosen["resolution"]) if picture is None else len(picture)
         columns = (
@@ -171,7 +263,10 @@ class ProjectorControl(PictureControl):
             )
             reach = farthest * max(1.0, columns / rows) * scene.metres
             fov = min(
-                math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0
+                math.degrees(
+                    2.0 * math.atan(reach / self.within(scene)._start_distance())
+                ),
+                150.0,
             )
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
@@ -188,10 +283,11 @@ class ProjectorControl(PictureControl):
         return scene.with_part(part)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter with its default beside the scene's camera, in its light."""
         parameter = super().in_scene(parameter)
         scene = self.scene
-        away = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
-        far = float(np.linalg.norm(away))
+        camera_offset = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
+        camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
                 return replace(
@@ -212,38 +308,46 @@ class ProjectorControl(PictureControl):
                     TIMES
                     * float(self.resting("ambient"))
                     * self.part.area
-                    * self._far() ** 2
+                    * self._start_distance() ** 2
                 )
                 return replace(parameter, default=min(LUMENS, bright))
             case "azimuth":
                 return replace(
                     parameter,
-                    default=math.degrees(math.atan2(away[1], away[0])) + BESIDE,
+                    default=math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
+                    + BESIDE,
                 )
             case "elevation":
                 return replace(
                     parameter,
                     default=min(
-                        max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0
+                        max(
+                            math.degrees(math.asin(camera_offset[2] / camera_distance)),
+                            -89.0,
+                        ),
+                        89.0,
                     ),
                 )
             case "distance":
                 unit = "object sizes" if scene.object.metres is None else "metres"
-                return replace(parameter, default=far * scene.metres, unit=unit)
+                return replace(
+                    parameter, default=camera_distance * scene.metres, unit=unit
+                )
         return parameter
 
     @property
     def sides(self) -> tuple[int, int]:
         return self.part.sides
 
-    def _far(self) -> float:
-        """How far away it stands at the start."""
+    def _start_distance(self) -> float:
+        """Return how far away it stands at the start."""
         spec = self.specs.get("distance")
         return float(
             spec.value if isinstance(spec, Fixed) else self.resting("distance")
         )
 
     def fit(self) -> None:
+        """Find the projector in the scene, and how often it flashes."""
         (self.part,) = (
             part
             for part in self.scene.parts
@@ -277,18 +381,17 @@ class ProjectorControl(PictureControl):
     def in_light(self, times: float) -> Self:
         if self.ambient is None:
             return self
-        there = copy.copy(self)
-        there.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
-        there.fit()
-        return there
+        scaled = copy.copy(self)
+        scaled.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
+        scaled.fit()
+        return scaled
 
     def later(self, seconds: float) -> Self:
-        then = copy.copy(self)
-        then._later = self._later + seconds
-        return then
+        shifted = copy.copy(self)
+        shifted._time_shift = self._time_shift + seconds
+        return shifted
 
     # ---- at a configuration
-    # ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)
@@ -300,21 +403,24 @@ class ProjectorControl(PictureControl):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        place = (
+        """Return the projector's pose and its light."""
+        pose_arguments = (
             float(values[name].detach())
             for name in ("azimuth", "elevation", "distance")
         )
-        pose = looking_from(self.scene, *place).to(values["distance"], copy=True)
+        pose = looking_from(self.scene, *pose_arguments).to(
+            values["distance"], copy=True
+        )
         light = self.thrown(values)
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
-        if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:
+        if rate and (rate * self._time_shift + phase) % 1.0 >= LIT_SHARE:
             light = 0.0 * light
-        at_one = (
-            self._beside(values)
+        at_unit_distance = (
+            self._relative_to_ambient(values)
             * (values["distance"].detach() / self.scene.metres) ** 2
         )
-        white = at_one * self.scene.metered_irradiance / math.pi
+        white = at_unit_distance * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def thrown(self, values: Values) -> Tensor:
@@ -326,21 +432,21 @@ class ProjectorControl(PictureControl):
         return out_of_focus(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
-        """Illuminance () of a white picture where it meets the object's middle
-        head-on.
-        """
+        """Return the illuminance () of a white image at the object's middle."""
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
-    def _beside(self, values: Values) -> Tensor:
+    def _relative_to_ambient(self, values: Values) -> Tensor:
         return self._lux(values) / values["ambient"]
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return how bright white is, and the mean of the pattern."""
         return {
             "white": Value(value=float(self._lux(values)), unit="lux"),
             "beside_ambient": Value(
-                value=float(self._beside(values)), unit="times the ambient light"
+                value=float(self._relative_to_ambient(values)),
+                unit="times the ambient light",
             ),
             "mean": Value(
                 value=float(color.srgb_to_linear(values["pattern"]).mean()),
@@ -351,6 +457,7 @@ class ProjectorControl(PictureControl):
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the pattern, and the pattern enlarged for printing."""
         pattern = values["pattern"]
         return {
             self.name: pattern,
@@ -361,8 +468,9 @@ class ProjectorControl(PictureControl):
 
 
 def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
-    """Return a picture (h, w, 3) after a Gaussian blur of so many texels (); outside it
-    there is no light.
+    """Return a picture (h, w, 3) after a Gaussian blur of so many texels ().
+
+    Outside it there is no light.
     """
     sigma = float(blur.detach())
     if not sigma and not blur.requires_grad:
@@ -382,15 +490,21 @@ def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
 def looking_from(
     scene: SceneDescription, azimuth: float, elevation: float, distance: float
 ) -> Tensor:
-    """The pose (4, 4) of what looks at the object's middle along its own +z from
-    somewhere around it; degrees, and the distance as `ProjectorControl` has it. It is
-    not to be written into.
+    """Return a pose (4, 4) that looks at the object's middle along its own +z.
+
+    Do not write into it.
+
+    Args:
+        scene: with the object.
+        azimuth: degrees.
+        elevation: degrees.
+        distance: as `ProjectorControl` has it.
     """
     left, up, outwards = torch.from_numpy(
         geometry.camera_axes(azimuth, elevation, 0.0)
     ).float()
-    place = (
+    position = (
         torch.from_numpy(geometry.middle(scene)).float()
         + distance / scene.metres * outwards
     )
-    return geometry.affine(torch.stack([left, up, -outwards], dim=1), place)
+    return geometry.affine(torch.stack([left, up, -outwards], dim=1), position)

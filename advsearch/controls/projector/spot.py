@@ -1,9 +1,11 @@
 """The `spot` control: a torch or a laser from somewhere around the object. It only adds
 light.
 
-It is a projector whose picture is a round spot, so that no outline moves and its numbers have an adjoint:
+It is a projector of an image with a round spot, so that no outline moves and its
+parameters have an adjoint:
 
-    picture = colour exp(-r^2 / (2 s^2)) picture's area / (2 pi s^2),        width = 2 s sqrt(2 ln 2)
+    image = color exp(-r^2 / (2 s^2)) image's area / (2 pi s^2)
+    width = 2 s sqrt(2 ln 2)
 """
 
 from __future__ import annotations
@@ -12,12 +14,24 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch.controls.projector.projector import LUMENS, TIMES, ProjectorControl
-from advsearch.extend import Choice, Control, Parameter, Value, Values, color
+from advsearch.extend import (
+    Choice,
+    Control,
+    Fixed,
+    OneOf,
+    Parameter,
+    Range,
+    Value,
+    Values,
+    color,
+)
 
 OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
 WIDTH = 0.3  # object sizes
@@ -25,6 +39,7 @@ WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Diameter in which half of a round Gaussian of standard deviation 1 lies."""
 
 
+NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})
 _lit = partial(Parameter.number, Parameter.LIT)
 
 
@@ -34,19 +49,50 @@ class SpotControl(ProjectorControl):
     kind = "spot"
     amount = "lumens"
     parameters = (
-        _lit("x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, "
-                                                    "seen from the light.",
-             (-0.5, 0.5)),
-        _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
-        _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of "
-                                                         "its light falls.", (0.05, 0.6),
-             log=True),
+        _lit(
+            "x",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of its middle to the right, seen from the light.",
+            (-0.5, 0.5),
+        ),
+        _lit(
+            "y",
+            "object sizes",
+            -10.0,
+            10.0,
+            0.0,
+            "Shift of its middle upwards.",
+            (-0.5, 0.5),
+        ),
+        _lit(
+            "width",
+            "object sizes",
+            0.02,
+            10.0,
+            WIDTH,
+            "Diameter in which half of its light falls.",
+            (0.05, 0.6),
+            log=True,
+        ),
         *Parameter.colors("of its light.", (0.0, 1.0)),
-        _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the "
-                                           "place", "All of its light.",
-             (0.0, LUMENS)),
-        *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
-    )  # fmt: skip
+        _lit(
+            "lumens",
+            "lumens",
+            0.0,
+            1e6,
+            "0, or what is 20 times as bright as the place",
+            "All of its light.",
+            (0.0, LUMENS),
+        ),
+        *(
+            parameter
+            for parameter in ProjectorControl.parameters
+            if parameter.name in OF_THE_SOURCE
+        ),
+    )
     choices = (
         Choice(
             "resolution",
@@ -63,17 +109,33 @@ class SpotControl(ProjectorControl):
         ),
     )
 
-    # its numbers are a handful, and there is no picture among them
-    spec = Control.spec
-    budget_of = Control.budget_of
-    values = Control.values
-    describe = Control.describe
-    kept_pictures = Control.kept_pictures
+    # Its parameters are a few numbers, and there is no image among them: as of any
+    # control.
+
+    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+        return Control.spec(self, parameter)
+
+    def budget_of(self, parameter: Parameter) -> Any:
+        return Control.budget_of(self, parameter)
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        return Control.values(self, u)
+
+    def describe(
+        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+    ) -> dict[str, Value]:
+        return Control.describe(self, u, so_far)
+
+    def kept_pictures(
+        self, values: Values, so_far: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        return Control.kept_pictures(self, values, so_far)
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
     def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter; of the lumens, up to what is bright in the scene."""
         if parameter.name != "lumens":
             return super().in_scene(parameter)
         area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
@@ -89,21 +151,22 @@ class SpotControl(ProjectorControl):
         return 0.0  # of the lumens; see `amount`
 
     def thrown(self, values: Values) -> Tensor:
-        half = (
+        """Return the round spot (h, w, 3) as it is thrown, linear."""
+        half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.metres
         )
         rows, columns = self.part.sides
-        across, up = (
-            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half) * half
+        right, up = (
+            torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)
         )
         deviation = values["width"] / WIDTH_OF_ONE
-        away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
+        squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = (
-            torch.exp(-0.5 * away / deviation**2)
-            * (2.0 * half) ** 2
+            torch.exp(-0.5 * squared / deviation**2)
+            * (2.0 * half_width) ** 2
             / (2.0 * math.pi * deviation**2)
         )
         return spot[..., None] * color.combine_channels(values)
@@ -111,6 +174,7 @@ class SpotControl(ProjectorControl):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return how bright the brightest point of the spot is."""
         brightest = float(self.thrown(values).detach().max())
         return {
             "lux": Value(
@@ -118,7 +182,7 @@ class SpotControl(ProjectorControl):
                 unit="lux, where it is brightest",
             ),
             "beside_ambient": Value(
-                value=float(brightest * float(self._beside(values))),
+                value=float(brightest * float(self._relative_to_ambient(values))),
                 unit="times the ambient light",
             ),
         }

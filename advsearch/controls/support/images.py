@@ -16,6 +16,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.color import levels_of, linear_to_srgb, srgb_to_linear
 from advsearch.scene.color import to_8_bit as to_8_bit
+from advsearch.scene.raster import Charts as Charts
 from advsearch.scene.raster import MeshSurface as MeshSurface
 from advsearch.scene.raster import pixels_in as pixels_in
 from advsearch.scene.raster import rasterised as rasterised
@@ -24,15 +25,17 @@ PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixe
 
 
 def resampled(image: Tensor, side: int) -> Tensor:
-    """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter;
-    values stay in [0, 1].
+    """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter.
+
+    Values stay in [0, 1].
     """
     return resized(image, side, side).contiguous().clamp(0.0, 1.0)
 
 
 def enlarged(pixels: Tensor, factor: int) -> Tensor:
-    """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as
-    the renderer does it.
+    """Return an image (h, w, 3) sRGB at a whole multiple of its size.
+
+    It is interpolated as the renderer does it.
     """
     larger = F.interpolate(
         planes(srgb_to_linear(pixels)),
@@ -44,8 +47,9 @@ def enlarged(pixels: Tensor, factor: int) -> Tensor:
 
 
 def coded(image: Tensor, quality: int) -> Tensor:
-    """Save as a JPEG file and read it again, chroma subsampled; the derivative is that
-    of the unchanged picture.
+    """Save as a JPEG file and read it again, chroma subsampled.
+
+    The derivative is that of the unchanged picture.
 
     For changes that are smooth over three pixels or more this is within about a third
     of what the file does with them (measured at qualities of 7 to 25); of finer ones
@@ -64,27 +68,31 @@ def coded(image: Tensor, quality: int) -> Tensor:
 
 
 def planes(image: Tensor) -> Tensor:
-    """(H, W, C) to (1, C, H, W)."""
+    """Reshape (H, W, C) to (1, C, H, W)."""
     return image.permute(2, 0, 1)[None]
 
 
 def picture(stack: Tensor) -> Tensor:
-    """(1, C, H, W) to (H, W, C)."""
+    """Reshape (1, C, H, W) to (H, W, C)."""
     return stack[0].permute(1, 2, 0)
 
 
 def warped(image: Tensor, shift: Tensor) -> Tensor:
-    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2)
-    pixels to the right and down; places outside are mirrored inwards.
+    """Look every pixel of an image (H, W, C) up at another position.
+
+    `shift` is (H, W, 2), pixels to the right and down; positions outside are mirrored
+    inwards.
     """
     height, width = image.shape[:2]
     rows, columns = torch.meshgrid(
         torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
     )
-    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
+    positions = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(
         image.device
     )
-    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    grid = (
+        positions * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    )
     return picture(
         F.grid_sample(
             planes(image), grid[None], padding_mode="reflection", align_corners=False
@@ -109,8 +117,11 @@ def resized(
 def drawn(
     height: int, width: int, seed: int, stream: str, *, normal: bool = True
 ) -> Tensor:
-    """Return the noise (height, width, 3) of a stream of random numbers: standard
-    normal, or uniform in [0, 1).
+    """Return the noise (height, width, 3) of a stream of random numbers.
+
+    Standard normal, or uniform in [0, 1).
     """
-    source = torch.Generator().manual_seed(seeds.stream(seed, stream))
-    return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)
+    generator = torch.Generator().manual_seed(seeds.stream(seed, stream))
+    return (torch.randn if normal else torch.rand)(
+        height, width, 3, generator=generator
+    )

@@ -14,8 +14,10 @@ NORMS = ("linf", "l2")
 def radius(
     norm: str, epsilon: float | None, count: int, default: float = DEFAULT_EPSILON
 ) -> float:
-    """Return the radius of a ball over `count` colors, the default where none is given:
-    in an L2 ball so large that its edge has the same root-mean-square.
+    """Return the radius of a ball over `count` colors.
+
+    The default L2 ball is so large that its edge has the same root mean square as that
+    of the default L-infinity ball.
     """
     if epsilon is not None:
         return float(epsilon)

@@ -80,15 +80,16 @@ class PictureControl(Control):
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)
         picture = self._picture
-        shown = (
+        image = (
             values[self.shown].reshape(*self.sides, 3)
             if picture is None
             else picture.to(u.device, copy=True)
         )
-        return values | {self.shown: shown}
+        return values | {self.shown: image}
 
     def read_picture(self) -> Tensor | None:
         """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
+
         Raises FileFormatError: it cannot be read.
         """
         if self.chosen["picture"] is None:
@@ -101,10 +102,12 @@ class PictureControl(Control):
     def describe(
         self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING
     ) -> dict[str, Value]:
+        """Return how much a searched image changes, and the other values."""
         described = super().describe(u, so_far)
         if not self.free:
             return described
-        here, start = (
-            self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device))
+        image, start_image = (
+            self.values(point)[self.shown]
+            for point in (u.detach(), self.start.to(u.device))
         )
-        return {**changed(self.name, here - start), **described}
+        return {**changed(self.name, image - start_image), **described}

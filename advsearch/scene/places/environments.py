@@ -36,11 +36,13 @@ def import_place(spec: str) -> EnvironmentAsset:
         UnknownNameError: the place has no such light, mesh or variant, or there is no
             such bundled environment.
     """
-    name, chosen = split_light(spec)
+    name, requested_light = split_light(spec)
     path = Path(name)
     with reading(path):
         file = read_place_file(path)
-        light_name = next(iter(file.lights)) if chosen is None else chosen
+        light_name = (
+            next(iter(file.lights)) if requested_light is None else requested_light
+        )
         if light_name not in file.lights:
             raise UnknownNameError(
                 f"light of {path}:",
@@ -69,7 +71,7 @@ def import_place(spec: str) -> EnvironmentAsset:
     return replace(
         lit,
         name=place.name
-        if chosen is None
+        if requested_light is None
         else safe_name(Path(f"{place.name}-{light_name}.x")),
         source=spec,
         warnings=(*lit.warnings, *place.notes),

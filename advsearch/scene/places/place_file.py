@@ -44,17 +44,16 @@ T = TypeVar("T")
 
 
 def is_place_file(spec: object) -> bool:
-    """Whether an environment is asked for as the file of a place, perhaps with one of
-    its lights: ``a.yaml#night``.
-    """
+    """Return whether a spec is the file of a place: ``a.yaml``, ``a.yaml#night``."""
     return isinstance(spec, (str, Path)) and split_light(str(spec))[0].lower().endswith(
         SUFFIXES
     )
 
 
 def split_light(spec: str) -> tuple[str, str | None]:
-    """Return the file and the light of ``place.yaml#night``; None where it names no
-    light.
+    """Return the file and the light of ``place.yaml#night``.
+
+    None where it names no light.
     """
     file, mark, light = spec.rpartition("#")
     return (
@@ -65,8 +64,9 @@ def split_light(spec: str) -> tuple[str, str | None]:
 
 
 def read_place_file(path: Path) -> PlaceFile:
-    """Read the YAML file of a place. Raises FileFormatError: it is missing, is not
-    YAML, or says something else.
+    """Read the YAML file of a place.
+
+    Raises FileFormatError: it is missing, is not YAML, or says something else.
     """
     content = parsed(
         path,
@@ -91,20 +91,24 @@ def read_place_file(path: Path) -> PlaceFile:
 
 
 def find_beside(path: Path, name: str) -> Path:
-    """Return a file that the file of a place names. Raises FileFormatError: it leads
-    out of the folder.
+    """Return a file that the file of a place names.
+
+    Raises FileFormatError: it leads out of the folder.
     """
-    beside = path.parent / name
-    if "\0" in name or not is_inside(beside, path.parent):
+    sibling = path.parent / name
+    if "\0" in name or not is_inside(sibling, path.parent):
         raise FileFormatError(
             f"{path}: {name[:200]!r} {OUTSIDE}; put it beside the file"
         )
-    return beside
+    return sibling
 
 
 def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
-    """Read the meshes of a place. Raises FileFormatError, InputError: as for an
-    imported object; UnknownNameError: it has no such mesh or variant.
+    """Read the meshes of a place.
+
+    Raises:
+        FileFormatError, InputError: as for an imported object.
+        UnknownNameError: it has no such mesh or variant.
     """
     parts, notes = read_place_meshes(find_beside(path, file.mesh), variant)
     names = [part.name for part in parts]
@@ -119,16 +123,16 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for entry in file.solids
         for outline in entry.list_footprints()
     )
-    placed = [
+    marked = [
         replace(
             part,
             is_ground=part.name in file.ground,
-            solids=solids if number == 0 else (),
+            solids=solids if index == 0 else (),
         )
-        for number, part in enumerate(parts)
+        for index, part in enumerate(parts)
     ]
     return Place(
-        safe_name(Path(os.path.abspath(path)).parent), file, tuple(placed), tuple(notes)
+        safe_name(Path(os.path.abspath(path)).parent), file, tuple(marked), tuple(notes)
     )
 
 
@@ -137,8 +141,8 @@ def load_bundled_place(name: str, variant: str | None = None) -> Place:
     """Return a bundled place. Raises FileFormatError: the installation is damaged."""
     with resources.as_file(
         resources.files("advsearch.bundled") / "data" / "places" / name
-    ) as folder:
-        path = folder / "place.yaml"
+    ) as directory:
+        path = directory / "place.yaml"
         with reading(path):
             return read_place(path, read_place_file(path), variant)
 

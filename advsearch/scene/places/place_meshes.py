@@ -11,7 +11,7 @@ what faces up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple, TypeVar
@@ -63,7 +63,7 @@ REFLECTANCE = 0.08  # of a surface of specular 1 that faces the light
 DULL_COAT = 0.1  # width of the lobe of Mitsuba's clear coat, of gloss 0 and 1
 GLOSSY_COAT = 0.001
 VARIANTS = "KHR_materials_variants"
-READ_HERE = (
+PLACE_EXTENSIONS = (
     "KHR_materials_clearcoat",
     "KHR_materials_ior",
     "KHR_materials_specular",
@@ -121,9 +121,10 @@ class _Mappings(_Extension):
     mappings: list[_Mapping] = []
 
 
-def _read_extension(path: Path, model: type[M], held: object) -> M:
+def _read_extension(path: Path, model: type[M], content: object) -> M:
+    """Return an extension, checked; the default for None. Raises FileFormatError."""
     try:
-        return model.model_validate({} if held is None else held)
+        return model.model_validate({} if content is None else content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"]))[:80]
@@ -138,11 +139,11 @@ def _extension_of(entry: Entry, name: str) -> object:
     return entry.extensions.get(name) if isinstance(entry.extensions, dict) else None
 
 
-class DrawnPrimitive(NamedTuple):
+class PosedPrimitive(NamedTuple):
     """A primitive at one of its positions in the file."""
 
     material: int | None  # its own
-    shown_material: int | None  # the one that it has in the variant
+    variant_material: int | None  # the one that it has in the variant
     part: ImportedPart  # without surface
 
 
@@ -152,8 +153,9 @@ NameAndMaterial = tuple[str, int | None]
 def read_place_meshes(
     path: Path, variant: str | None
 ) -> tuple[list[MeshPart], list[str]]:
-    """Read the meshes of a place, in metres, z up, with what they emit in cd/m2, and
-    notes on what is left out.
+    """Read the meshes of a place, and notes on what is left out.
+
+    They are in metres, z up, with what they emit in cd/m2.
 
     Args:
         path: the glTF file.
@@ -168,20 +170,13 @@ def read_place_meshes(
     notes = Notes(path)
     file = GltfFile(path, read_mesh_bytes(path, "environment", SUFFIXES))
     header = file.header
-    number = None if variant is None else _find_variant(path, header, variant)
+    variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
-        drawn, surfaces = _read_primitives(file, number, notes)
-    used = [name for name in header.extensionsUsed if name not in READ_HERE]
-    required = [name for name in header.extensionsRequired if name not in READ_HERE]
-    left_out(
-        header.model_copy(
-            update={"extensionsUsed": used, "extensionsRequired": required}
-        ),
-        notes,
-    )
-    _note_left_out(header, drawn, notes)
-    check_faces(path, sum(len(primitive.part.faces) for primitive in drawn))
-    groups = _group_by_material(header, drawn)
+        primitives, surfaces = _read_primitives(file, variant_index, notes)
+    left_out(_without_supported_extensions(header), notes)
+    _note_left_out(header, primitives, notes)
+    check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
+    groups = _group_by_material(header, primitives)
     if not groups:
         raise FileFormatError(
             f"{path}: expected meshes with faces, got none; export triangles"
@@ -195,11 +190,22 @@ def read_place_meshes(
     return parts, list(notes)
 
 
+def _without_supported_extensions(header: Header) -> Header:
+    """Return the header without the extensions that only places support."""
+    used = [name for name in header.extensionsUsed if name not in PLACE_EXTENSIONS]
+    required = [
+        name for name in header.extensionsRequired if name not in PLACE_EXTENSIONS
+    ]
+    return header.model_copy(
+        update={"extensionsUsed": used, "extensionsRequired": required}
+    )
+
+
 def _note_left_out(
-    header: Header, drawn: Sequence[DrawnPrimitive], notes: Notes
+    header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
-    """Say what the file has that an object would have, and a place has not."""
-    if any(primitive.part.colors is not None for primitive in drawn):
+    """Note what an object of the file would have, and a place does not."""
+    if any(primitive.part.colors is not None for primitive in primitives):
         notes.say(
             " has colours of vertices, which are left out; paint them into a texture"
         )
@@ -215,17 +221,17 @@ def _note_left_out(
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
-    held = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
-    names = [entry.name for entry in held.variants]
+    extension = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
+    names = [entry.name for entry in extension.variants]
     if variant not in names:
         raise UnknownNameError(f"variant of {path.name}:", variant, names)
     return names.index(variant)
 
 
-def _shown_material(
+def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
-    """Return the material that a primitive has in a variant, by its number."""
+    """Return the index of the material that a primitive has in a variant."""
     extension = _extension_of(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material
@@ -242,56 +248,91 @@ def _shown_material(
 
 def _read_primitives(
     file: GltfFile, variant: int | None, notes: Notes
-) -> tuple[list[DrawnPrimitive], dict[int | None, ImportedSurface]]:
-    """Return what the file's nodes draw, and the surface of each material that is
-    shown.
+) -> tuple[list[PosedPrimitive], dict[int | None, ImportedSurface]]:
+    """Read the primitives that the file's nodes show, and the surfaces they use.
+
+    Args:
+        file: the glTF file.
+        variant: index of a variant of its materials; None for none.
+        notes: to which what is left out is added.
+
+    Returns:
+        The primitives in the pose of each node, and the surface of each material.
     """
     header = file.header
-    path = file.path
-    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
-    drawn_meshes = [
-        (mesh, pose)
-        for node, pose in poses
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
+    posed_meshes = []
+    for node, pose in sorted(gltf_skeleton.poses(header), key=lambda item: item[0]):
+        mesh = header.nodes[node].mesh
+        if mesh is not None:
+            posed_meshes.append((mesh, pose))
+    used_meshes = list(dict.fromkeys(mesh for mesh, _ in posed_meshes))
+    pieces = _read_pieces(file, used_meshes, variant)
+    fitted = _fit_surfaces(file, pieces, notes)
+    primitives: list[PosedPrimitive] = []
+    for mesh, pose in posed_meshes:
+        for index, primitive in enumerate(header.meshes[mesh].primitives):
+            piece = pieces.get((mesh, index))
+            if piece is not None:
+                part = placed(_fit_uvs(piece.part, *fitted[piece.material][1:]), pose)
+                primitives.append(
+                    PosedPrimitive(primitive.material, piece.material, part)
+                )
+    surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
+    return primitives, surfaces
+
+
+def _fit_uvs(part: ImportedPart, scale: Doubles, shift: Doubles) -> ImportedPart:
+    """Return a part with its UVs in the texture of its surface, v = 0 at the bottom."""
+    uvs = part.uvs
+    if uvs is None:
+        return part
+    uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+    return replace(part, uvs=uvs)
+
+
+def _read_pieces(
+    file: GltfFile, meshes: Sequence[int], variant: int | None
+) -> dict[tuple[int, int], Piece]:
+    """Read the primitives of meshes, by the mesh and the index in it.
+
+    Those without faces are left out.
+    """
+    header = file.header
     pieces: dict[tuple[int, int], Piece] = {}
-    for mesh in dict.fromkeys(mesh for mesh, _ in drawn_meshes):
-        for number, primitive in enumerate(header.meshes[mesh].primitives):
-            shown = primitive.model_copy(
-                update={"material": _shown_material(path, header, primitive, variant)}
-            )
-            piece = read_piece(file, shown, header.meshes[mesh].extras, False)
+    for mesh in meshes:
+        for index, primitive in enumerate(header.meshes[mesh].primitives):
+            material = _select_material(file.path, header, primitive, variant)
+            varied = primitive.model_copy(update={"material": material})
+            piece = read_piece(file, varied, header.meshes[mesh].extras, False)
             if piece is not None and len(piece.part.faces):
-                pieces[mesh, number] = piece
+                pieces[mesh, index] = piece
+    return pieces
+
+
+def _fit_surfaces(
+    file: GltfFile, pieces: Mapping[tuple[int, int], Piece], notes: Notes
+) -> dict[int | None, tuple[ImportedSurface, Doubles, Doubles]]:
+    """Return the surface of each material, with the scale and shift of its UVs.
+
+    Raises FileFormatError, InputError: there are too many materials or texels.
+    """
     by_material: dict[int | None, list[Piece]] = {}
     for piece in pieces.values():
         by_material.setdefault(piece.material, []).append(piece)
-    _check_materials(path, len(by_material))
-    readers = GltfSurfaces(file, notes, TEXTURE_LIMIT)
+    _check_materials(file.path, len(by_material))
+    surfaces = GltfSurfaces(file, notes, TEXTURE_LIMIT)
     fitted: dict[int | None, tuple[ImportedSurface, Doubles, Doubles]] = {}
     texels = 0
     for material, members in by_material.items():
-        fitted[material] = readers.surface(material, members)
+        fitted[material] = surfaces.surface(material, members)
         texels += _count_texels(fitted[material][0])
         check_most(
-            path,
+            file.path,
             texels,
             MOST_TEXELS,
             "textures of at most {} texels, counted for each material",
         )
-    drawn: list[DrawnPrimitive] = []
-    for mesh, pose in drawn_meshes:
-        for number, primitive in enumerate(header.meshes[mesh].primitives):
-            if (mesh, number) not in pieces:
-                continue
-            piece = pieces[mesh, number]
-            _, scale, shift = fitted[piece.material]
-            uvs = piece.part.uvs
-            if uvs is not None:
-                uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
-            part = placed(replace(piece.part, uvs=uvs), pose)
-            drawn.append(DrawnPrimitive(primitive.material, piece.material, part))
-    return drawn, {material: surface for material, (surface, _, _) in fitted.items()}
+    return fitted
 
 
 def _check_materials(path: Path, count: int) -> None:
@@ -303,44 +344,50 @@ def _check_materials(path: Path, count: int) -> None:
 
 
 def _count_texels(surface: ImportedSurface) -> int:
-    held = (surface.texture, surface.normal_map, surface.emission)
+    images = (surface.texture, surface.normal_map, surface.emission)
     return sum(
-        texels.shape[0] * texels.shape[1] for texels in held if texels is not None
+        texels.shape[0] * texels.shape[1] for texels in images if texels is not None
     )
 
 
 def _group_by_material(
-    header: Header, drawn: Sequence[DrawnPrimitive]
+    header: Header, primitives: Sequence[PosedPrimitive]
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
-    """Return the primitives of each mesh, by its name and the material that it shows,
-    in the order of materials.
+    """Return the primitives of each mesh, by its name and the material in the variant.
+
+    In the order of materials.
     """
-    shown_by: dict[int | None, set[int | None]] = {}
-    for primitive in drawn:
-        shown_by.setdefault(primitive.material, set()).add(primitive.shown_material)
+    variant_materials: dict[int | None, set[int | None]] = {}
+    for primitive in primitives:
+        materials = variant_materials.setdefault(primitive.material, set())
+        materials.add(primitive.variant_material)
     groups: dict[NameAndMaterial, list[ImportedPart]] = {}
-    for own, shown, part in drawn:
-        is_covered = len(shown_by[own]) > 1 and shown != own  # in part
-        name = _name_material(header, shown if is_covered else own)
-        groups.setdefault((name, shown), []).append(part)
-    return dict(
-        sorted(
-            groups.items(), key=lambda item: -1 if item[0][1] is None else item[0][1]
-        )
-    )
+    for material, variant_material, part in primitives:
+        # the variant changes a part of what has this material
+        is_split = len(variant_materials[material]) > 1
+        is_covered = is_split and variant_material != material
+        name = _name_material(header, variant_material if is_covered else material)
+        groups.setdefault((name, variant_material), []).append(part)
+
+    def material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
+        (_, material), _ = item
+        return -1 if material is None else material
+
+    return dict(sorted(groups.items(), key=material_order))
 
 
-def _name_material(header: Header, number: int | None) -> str:
+def _name_material(header: Header, index: int | None) -> str:
     return (
         UNNAMED
-        if number is None
-        else header.materials[number].name or f"material {number}"
+        if index is None
+        else header.materials[index].name or f"material {index}"
     )
 
 
 def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
+    """Return one mesh of a place from its parts and their surface."""
     color = np.full(3, NEUTRAL, np.float32) if surface.color is None else surface.color
     base = (
         np.broadcast_to(color, (2, 2, len(color)))
@@ -364,16 +411,16 @@ def _make_part(
 
 
 def _with_finish(
-    path: Path, header: Header, number: int | None, part: MeshPart
+    path: Path, header: Header, index: int | None, part: MeshPart
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material."""
-    entry = MaterialEntry() if number is None else header.materials[number]
+    entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
     ior = finish.KHR_materials_ior.ior
-    facing = (
+    facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
     )
-    specular = min(round(facing / REFLECTANCE, 9), 1.0)
+    specular = min(round(facing_reflectance / REFLECTANCE, 9), 1.0)
     coat = finish.KHR_materials_clearcoat
     material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)
     part = replace(part, material=material)
@@ -391,7 +438,7 @@ def _with_finish(
 
 
 def _join(members: Sequence[ImportedPart]) -> Mesh:
-    """Return parts of a file as one mesh, z up, its front along +x."""
+    """Join parts of a file to one mesh, z up, its front along +x."""
     turn = compute_turn("y", "+z")
     vertices = list[Doubles]()
     faces = list[Ints]()
@@ -399,12 +446,16 @@ def _join(members: Sequence[ImportedPart]) -> Mesh:
     uvs = list[Doubles]()
     count = 0
     for part in map(_with_normals, members):
+        part_normals = part.normals
+        if part_normals is None:
+            part_normals = np.zeros_like(part.vertices)
+        part_uvs = part.uvs
+        if part_uvs is None:
+            part_uvs = np.zeros((len(part.vertices), 2))
         vertices.append(part.vertices)
         faces.append(part.faces + count)
-        normals.append(
-            np.zeros_like(part.vertices) if part.normals is None else part.normals
-        )
-        uvs.append(np.zeros((len(part.vertices), 2)) if part.uvs is None else part.uvs)
+        normals.append(part_normals)
+        uvs.append(part_uvs)
         count += len(part.vertices)
     directions = np.concatenate(normals)
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)

@@ -31,20 +31,21 @@ class _Entry(BaseModel):
 
 
 def _is_convex(corners: Doubles) -> bool:
-    """Whether corners (K, 2), in turn, turn to one side only, and hold an area."""
+    """Return whether corners (K, 2), in turn, turn to one side only, and hold an area."""
     edges = np.roll(corners, -1, axis=0) - corners
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
-    least = float(turns.min())
-    most = float(turns.max())
-    rounding = 1e-9 * max(-least, most)
-    return rounding > 0.0 and (least >= -rounding or most <= rounding)
+    smallest = float(turns.min())
+    largest = float(turns.max())
+    rounding = 1e-9 * max(-smallest, largest)
+    return rounding > 0.0 and (smallest >= -rounding or largest <= rounding)
 
 
 class SolidEntry(_Entry):
-    """What nothing else can be in: a convex outline on the ground, or a round one at
-    some positions.
+    """What nothing else can be in.
+
+    A convex outline on the ground, or a round one at some positions.
     """
 
     name: Name  # as a sentence has it: "a house"
@@ -63,6 +64,7 @@ class SolidEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
+        """Check that an entry has one convex outline, or a radius and positions."""
         is_round = self.at is not None and self.radius is not None
         if is_round == (self.outline is not None) or (self.at is None) != (
             self.radius is None
@@ -110,8 +112,9 @@ class ValidEntry(_Entry):
 
 
 class PictureEntry(_Entry):
-    """What stands around, where the maps of the light show it: it fits the ground from
-    near that place only.
+    """What stands around, where the maps of the light show it.
+
+    It fits the ground from near that place only.
     """
 
     height: Positive  # above the ground from which the maps were taken
