@@ -181,8 +181,8 @@ def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
     ]
     loose = [file for file in photographs if not ALIGNED_NAME.fullmatch(file.stem)]
     if loose:
-        made_task = workbench.make_task(task)
-        if made_task and _needs_position(made_task):
+        task_object = workbench.make_task(task)
+        if task_object and _needs_position(task_object):
             raise InputError(
                 f"{loose[0].name}: the task asks where the object is, and only a "
                 "rendering says that; name the file rendering-NUMBER.jpg by the "
@@ -400,8 +400,8 @@ def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
         task = job.tasks[model_index]
         if rendering is None or not _needs_position(task):
             matching = [place for place in job.places if place.object == object_name]
-            scene_place = matching[0] if matching else job.places[0]
-            return task.truth(job.facts(scene_place, {}))
+            swept_scene = matching[0] if matching else job.places[0]
+            return task.truth(job.facts(swept_scene, {}))
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
             raise InputError(

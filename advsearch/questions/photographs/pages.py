@@ -95,8 +95,8 @@ class PhotographPages:
                 photograph.
         """
         sent_key = headers.get(KEY, "").encode("utf-8", "replace")
-        is_own_page = hmac.compare_digest(key.encode(), sent_key)
-        if headers.get("Origin") is None or not is_own_page:
+        has_key = hmac.compare_digest(key.encode(), sent_key)
+        if headers.get("Origin") is None or not has_key:
             raise markup.Refused(
                 HTTPStatus.FORBIDDEN,
                 "a photograph is sent by the page that this server shows; open it anew",
