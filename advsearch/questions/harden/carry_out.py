@@ -100,13 +100,13 @@ def run_hardening(
         python_arguments = {"beside": beside}
     course_arguments = dict(python_arguments)
     if config.data:
-        course_arguments["own"] = read_coco(Path(config.data), loaded)
+        course_arguments["custom_items"] = read_coco(Path(config.data), loaded)
     course = COURSES[config.task_name](work, student, optimiser, **course_arguments)
     check_same_arguments(context.run, {"optimiser": optimiser, **python_arguments})
     workbench.check_made_of(context.run, [loaded])
 
     hardening = Hardening(context.run, course)
-    worker = "advsearch.questions.harden.scenes:scenes_of"
+    worker = "advsearch.questions.harden.scenes:load_scene_work"
     with context.until_interrupted():
         with workbench.executor_for(config, worker, context.progress) as work.executor:
             hardening.carry_out(context)
@@ -228,7 +228,7 @@ class Hardening:
         scenes.check_disjoint(
             splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
         )
-        gc.freeze()  # for the same reason as in `scenes_of`
+        gc.freeze()  # for the same reason as in `load_scene_work`
         try:
             for measurement in MEASUREMENTS:
                 if measurement == "after":
