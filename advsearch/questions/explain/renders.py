@@ -117,8 +117,9 @@ class Renders:
     def confirm_rule(
         self, counted_rules: Sequence[rules.CountedRule], index: int
     ) -> Confirmation | None:
-        """Render fresh configurations inside a rule and outside those before it, in the
-        scene of each sweep.
+        """Confirm a rule by fresh configurations that no earlier rule covers.
+
+        They are rendered in the scene of each sweep.
 
         They confirm it if they alone, with the rows elsewhere, tell it. None where
         nothing was rendered.

@@ -396,6 +396,7 @@ class Hardening:
         return rows
 
     def _split_rows(self) -> dict[str, SplitSide]:
+        """Describe the parts of the split."""
         training_views, validation_views = self.course.views
         n_views = {
             TRAINING: training_views,

@@ -35,7 +35,8 @@ def varied(
     mean = float(radiance.mean()) + 1e-6
     radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
     if rng.random() < 0.5:
-        lobe = sample_lobe(*radiance.shape[:2], rng)
+        height, width = radiance.shape[:2]
+        lobe = sample_lobe(height, width, rng)
         radiance = radiance + mean * lobe[..., None].astype(np.float32)
     return replace(
         environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32)

@@ -350,6 +350,7 @@ class DetectorCourse(Course):
         }
 
     def score(self, held_back: Sequence[Example]) -> Score:
+        """Evaluate the student on plain and on adversarial images."""
         plain = []
         worst = []
         for item in held_back:

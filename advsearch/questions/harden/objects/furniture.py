@@ -33,9 +33,7 @@ Place = tuple[float, float, float]
 def _post(
     tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]
 ) -> list[Patch]:
-    """A straight post between two points, scaled from the first to the second end
-    value.
-    """
+    """Create a straight post between two points, scaled from one end to the other."""
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
@@ -123,9 +121,11 @@ def chair(draw: Draw) -> Instance:
 
     fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        clouded(fabric, 0.8, 1.5, offset), stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, hexed("efe6d4"), 4.0), dots(solid(fabric), hexed("f4efe4"), 6.0),
-    )  # fmt: skip
+        clouded(fabric, 0.8, 1.5, offset),
+        stripes(fabric, shade(fabric, 1.5), 6.0),
+        checks(fabric, hexed("efe6d4"), 4.0),
+        dots(solid(fabric), hexed("f4efe4"), 6.0),
+    )
     seat_paint = cover if draw.chance(0.25) else grain(0)
     paints = {
         "up": grain(2),
@@ -147,6 +147,7 @@ def _chair_back(
     leg: float,
     section: Array,
 ) -> list[Patch]:
+    """Create the back of a chair of one of several kinds."""
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
     foot = seat - 2.0
@@ -220,22 +221,30 @@ def _shade(
     )
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
-        ("shade", shapes.dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner),
+        ("shade", shapes.dense(outer, 2.0)),
+        ("rim", [outer[-1], inner[0]]),
+        ("lining", inner),
         ("rim", [inner[-1], outer[0]]),
-    ]  # fmt: skip
+    ]
     return shapes.lathe(pieces, 56)
 
 
 def _lamp_base(
     draw: Draw, style: str, low: float, radius: float, stem: float
 ) -> list[Patch]:
+    """Create the base of a lamp of one of several kinds."""
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
     top = [(stem, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, 1.2, 3.2)
         corners = [
-            under[-1], (radius, 0.4), (radius * 0.96, thick), (stem * 2.0, thick * 1.4), (stem, thick * 2.2), top[0],
-        ]  # fmt: skip
+            under[-1],
+            (radius, 0.4),
+            (radius * 0.96, thick),
+            (stem * 2.0, thick * 1.4),
+            (stem, thick * 2.2),
+            top[0],
+        ]
         side = shapes.dense(shapes.rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
         return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
     belly = radius * draw(1.12, 0.95, 1.4)
@@ -244,8 +253,13 @@ def _lamp_base(
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
     knots = [
-        (radius * 0.96, 1.2), (radius * 0.8, 2.4), (belly, at), *waist, (stem * 1.5, 0.86 * low), (stem, 0.93 * low),
-    ]  # fmt: skip
+        (radius * 0.96, 1.2),
+        (radius * 0.8, 2.4),
+        (belly, at),
+        *waist,
+        (stem * 1.5, 0.86 * low),
+        (stem, 0.93 * low),
+    ]
     body = shapes.spline(knots, 34)
     ring = shapes.rounded(
         [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3
@@ -265,6 +279,7 @@ def _lamp_base(
 
 @family(metres=0.01)
 def lamp(draw: Draw) -> Instance:
+    """Make a table lamp of random proportions, shade and base."""
     total = draw(48.0, 42.0, 58.0)
     tall = draw(20.0, 14.0, 24.0)
     wide = draw(16.5, 12.0, 19.0)
@@ -323,7 +338,12 @@ def lamp(draw: Draw) -> Instance:
     body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
-        "shade": cloth, "rim": solid(shade(linen, 0.8)), "lining": solid("f4f0e4"), "bulb": solid("fbf6e6"),
-        "body": body, "foot": solid(metal), "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
-    }  # fmt: skip
+        "shade": cloth,
+        "rim": solid(shade(linen, 0.8)),
+        "lining": solid("f4f0e4"),
+        "bulb": solid("fbf6e6"),
+        "body": body,
+        "foot": solid(metal),
+        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+    }
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})

@@ -59,6 +59,7 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
 
 @family(metres=0.01)
 def teapot(draw: Draw) -> Instance:
+    """Make a teapot with spout, handle and lid of random proportions."""
     radius = draw(7.2, 6.4, 8.0)
     height = draw(10.2, 8.0, 12.5)
     foot = radius * draw(0.58, 0.5, 0.75)
@@ -66,17 +67,23 @@ def teapot(draw: Draw) -> Instance:
     at = draw(0.45, 0.35, 0.58)
     full = draw(0.9, 0.82, 0.97)
     knots = [
-        (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
-        (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
-    ]  # fmt: skip
+        (foot, 0.5),
+        (radius * full, 0.5 * at * height),
+        (radius, at * height),
+        (radius * (0.97 * full), (0.42 * at + 0.58) * height),
+        (mouth, height),
+    ]
     side = shapes.spline(knots, 26)
     dome = draw(1.5, 0.7, 2.4)
     r = draw(1.0, 0.7, 1.4)
     top = height + dome + 0.2
     rim = [
-        (mouth, height), (mouth * 0.97, height + 0.02), (mouth * 0.94, height - 0.12), (mouth * 0.94, height + 0.05),
+        (mouth, height),
+        (mouth * 0.97, height + 0.02),
+        (mouth * 0.94, height - 0.12),
+        (mouth * 0.94, height + 0.05),
         (mouth * 0.97, height + 0.05),
-    ]  # fmt: skip
+    ]
     lid = shapes.spline(
         [
             rim[-1],
@@ -87,13 +94,25 @@ def teapot(draw: Draw) -> Instance:
         10,
     )
     knob = shapes.spline(
-        [(0.45, top), (0.5, top + 0.3), (r, top + 0.45 + r * 0.6), (0.7 * r, top + 0.45 + 1.35 * r),
-         (0.0, top + 0.45 + 1.6 * r)], 12,
-    )  # fmt: skip
+        [
+            (0.45, top),
+            (0.5, top + 0.3),
+            (r, top + 0.45 + r * 0.6),
+            (0.7 * r, top + 0.45 + 1.35 * r),
+            (0.0, top + 0.45 + 1.6 * r),
+        ],
+        12,
+    )
     profile: list[tuple[str, Points]] = [
-        ("base", [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]),
-        ("body", [(foot * 0.97, 0.0), *side]), ("body", rim), ("lid", lid), ("knob", [lid[-1], *knob]),
-    ]  # fmt: skip
+        (
+            "base",
+            [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)],
+        ),
+        ("body", [(foot * 0.97, 0.0), *side]),
+        ("body", rim),
+        ("lid", lid),
+        ("knob", [lid[-1], *knob]),
+    ]
     body = shapes.lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
     high = height * 0.84
@@ -102,10 +121,13 @@ def teapot(draw: Draw) -> Instance:
     reach = radius * draw(0.72, 0.5, 0.9)
     lift = draw(0.05, -0.02, 0.2) * height
     knots = [
-        (top_root, high), (radius + 0.35 * reach, high + lift), (radius + 0.9 * reach, high - 0.1 * (high - low)),
-        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)), (radius + 0.4 * reach, low + 0.08 * (high - low)),
+        (top_root, high),
+        (radius + 0.35 * reach, high + lift),
+        (radius + 0.9 * reach, high - 0.1 * (high - low)),
+        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)),
+        (radius + 0.4 * reach, low + 0.08 * (high - low)),
         (low_root, low),
-    ]  # fmt: skip
+    ]
     section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
     grip = shapes.sweep(
         "handle",
@@ -147,14 +169,19 @@ def teapot(draw: Draw) -> Instance:
     paint = natural(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
     paints = {
-        "base": solid("a98663"), "body": paint, "lid": draw.pick(paint, trim), "spout": draw.pick(glaze, paint),
-        "handle": draw.pick(glaze, trim), "knob": solid(second) if draw.chance(0.5, True) else trim,
-    }  # fmt: skip
+        "base": solid("a98663"),
+        "body": paint,
+        "lid": draw.pick(paint, trim),
+        "spout": draw.pick(glaze, paint),
+        "handle": draw.pick(glaze, trim),
+        "knob": solid(second) if draw.chance(0.5, True) else trim,
+    }
     return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
 
 
 @family(metres=0.01)
 def frying_pan(draw: Draw) -> Instance:
+    """Make a frying pan with a random handle."""
     base = draw(10.5, 9.0, 11.5)
     rim = draw(13.0, 12.2, 14.5)
     depth = draw(4.2, 2.8, 5.5)

@@ -72,8 +72,9 @@ def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
 
 @family(metres=0.01)
 def hammer(draw: Draw) -> Instance:
-    """The handle runs along -x from the head at the origin; the head lies along y, its
-    striking face at -y.
+    """Make a hammer whose handle runs along -x, and whose head lies along y.
+
+    The head is at the origin, and its striking face at -y.
     """
     half = draw(1.35, 1.15, 1.7)
     length = draw(27.0, 20.0, 31.0)
@@ -202,9 +203,7 @@ def hammer(draw: Draw) -> Instance:
 def _weights(
     draw: Draw, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
-    """One weight on the +x end of the bar, from x = at outwards, built along z and laid
-    down afterwards.
-    """
+    """Create the weight on the +x end of the bar, built along z and rotated afterwards."""
     if style == "hex":
         path = [
             (0, 0, at),
@@ -256,6 +255,7 @@ def _weights(
 
 @family(metres=0.01)
 def dumbbell(draw: Draw) -> Instance:
+    """Make a dumbbell with weights of random shape."""
     style = draw.pick("hex", "plates", "hex", "round", "globe")
     radius = draw(4.6, 3.6, 6.2)
     grip = draw(5.6, 5.0, 7.0)
