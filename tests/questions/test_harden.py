@@ -109,8 +109,8 @@ def test_a_run_trains_measures_and_goes_on(
 
 
 def drawing(number: int, control: str, plain: int = 0, beside: tuple[str, ...] = ()) -> Wanted:
-    how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "beside": beside}
-    return partial(SceneWork.drawn, side=TRAINING, number=number, **how)
+    how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "varying_controls": beside}
+    return partial(SceneWork.drawn, split=TRAINING, number=number, **how)
 
 
 def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierCourse:

@@ -119,27 +119,29 @@ class SceneWork:
     def drawn(
         self,
         *,
-        side: str,
+        split: str,
         number: int,
         controls: Sequence[str],
         views: int,
         plain: int,
         shared: bool = False,
-        beside: Sequence[str] = (),
+        varying_controls: Sequence[str] = (),
     ) -> list[Lesson]:
         """Make lessons of a scene.
 
         Args:
-            side: name of the split.
+            split: name of the split.
             number: of the scene.
             controls: that make the views harder together.
             views: number of views that are made harder.
             plain: number of further views of the plain scene.
             shared: whether the views share one adversarial texture.
-            beside: further controls that vary at random.
+            varying_controls: further controls that vary at random.
         """
-        problem, seed = self.problem(self.splits[side], number, controls, beside)
-        tries = TRIES_TO_CHOOSE if side == VALIDATION else None
+        problem, seed = self.problem(
+            self.splits[split], number, controls, varying_controls
+        )
+        tries = TRIES_TO_CHOOSE if split == VALIDATION else None
         return lessons(problem, views, seed, plain=plain, tries=tries, shared=shared)
 
     def attacked(
@@ -245,35 +247,35 @@ class SceneWork:
 
     def problem(
         self,
-        side: SceneSide,
+        split: SceneSide,
         number: int,
         controls: Sequence[str],
-        beside: Sequence[str] = (),
+        varying_controls: Sequence[str] = (),
     ) -> tuple[Problem, int]:
         """Return the problem of a scene, and the root seed of its samples.
 
         Args:
-            side: the split.
+            split: the split.
             number: of the scene.
             controls: that are searched.
-            beside: that vary at random.
+            varying_controls: that vary at random.
         """
-        name, scene = side.scene(number, workbench.scene_settings(self.config))
-        if side.name != HELD_OUT:
+        name, scene = split.scene(number, workbench.scene_settings(self.config))
+        if split.name != HELD_OUT:
             check_unmeasured(scene.description.object, self._held_out_fingerprints)
         control_types = {
             control.partition(":")[0].partition(".")[0]
-            for control in (*controls, *beside)
+            for control in (*controls, *varying_controls)
         }
         over = {
             control_type: ranges
             for control_type, ranges in OVER.items()
             if control_type not in control_types
         }
-        over |= {control: self.config.controls[control] for control in beside}
+        over |= {control: self.config.controls[control] for control in varying_controls}
         config = self.attack(controls, name, over=over)
         problem = workbench.problem_of(config, scene, self.model, differentiated=False)
-        return problem, seeds.stream(side.seed, "views", number)
+        return problem, seeds.stream(split.seed, "views", number)
 
     def attack(
         self, controls: Sequence[str], name: str, **changes: object

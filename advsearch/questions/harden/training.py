@@ -140,7 +140,7 @@ class ClassifierCourse(Course):
                         n_views,
                         1,
                         shared=shares_texture,
-                        beside=varying_controls,
+                        varying_controls=varying_controls,
                     )
                 )
         return jobs
@@ -224,7 +224,7 @@ def _lesson_job(
     """Return the job that makes lessons of a scene; see `SceneWork.drawn`."""
     return partial(
         SceneWork.drawn,
-        side=split,
+        split=split,
         number=number,
         controls=controls,
         views=views,
@@ -289,7 +289,7 @@ class Gradients:
             part: Sequence[TextureLesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor]:
             return lessons.slopes(
-                part, twin.quickly, lambda images: _changed(images, seed)
+                part, twin.quickly, lambda images: _augment(images, seed)
             )
 
         def weight_gradients(
@@ -439,10 +439,10 @@ def _augmented_images(
             if not isinstance(lesson, TextureLesson)
         ],
     ]
-    return torch.cat([_changed(torch.stack(group), seed) for group in groups if group])
+    return torch.cat([_augment(torch.stack(group), seed) for group in groups if group])
 
 
-def _changed(images: Tensor, seed: int) -> Tensor:
+def _augment(images: Tensor, seed: int) -> Tensor:
     """Augment images (N, H, W, 3), equally for equal N and seed."""
     generator = torch.Generator().manual_seed(seed)
     return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)

@@ -486,9 +486,9 @@ def _plate(t: Texels, ground: Array) -> Array:
         & (np.floor(cell) != 3)
         & (t.xyz[:, 0] > -1.0)
     )
-    place = np.abs(cell % 1.0 - 0.5)
-    strokes = (np.abs(place - 0.27) < 0.09) | (
-        (place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
+    cell_fraction = np.abs(cell % 1.0 - 0.5)
+    strokes = (np.abs(cell_fraction - 0.27) < 0.09) | (
+        (cell_fraction < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
     )
     return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
 

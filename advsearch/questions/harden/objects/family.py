@@ -33,14 +33,14 @@ class AtlasPlace:
     Attributes:
         x, y: left and bottom in texels.
         width, height: in texels, gutters included.
-        turned: whether the chart is rotated by 90 degrees.
+        is_rotated: whether the chart is rotated by 90 degrees.
     """
 
     x: int
     y: int
     width: int
     height: int
-    turned: bool
+    is_rotated: bool
 
 
 @dataclass
@@ -116,7 +116,7 @@ def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[AtlasPl
             "use fewer patches"
         )
     return [
-        replace(rectangle, turned=height > width)
+        replace(rectangle, is_rotated=height > width)
         for rectangle, (width, height) in zip(best, exact, strict=True)
     ]
 
@@ -137,7 +137,7 @@ def painted(
         # Texels are in rows from the bottom.
         a = np.tile(_texel_centers(rectangle.width), rectangle.height)
         b = np.repeat(_texel_centers(rectangle.height), rectangle.width)
-        u, v = (b, 1.0 - a) if rectangle.turned else (a, b)
+        u, v = (b, 1.0 - a) if rectangle.is_rotated else (a, b)
         color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
         area = np.s_[
             rectangle.y : rectangle.y + rectangle.height,
@@ -195,7 +195,7 @@ def joined(
 def _atlas_coordinates(patch: Patch, rectangle: AtlasPlace, side: int) -> Array:
     """Return the texture coordinates (V, 2) of a patch's vertices in the atlas."""
     chart_uvs = patch.uvs
-    if rectangle.turned:
+    if rectangle.is_rotated:
         chart_uvs = np.stack([1.0 - patch.uvs[:, 1], patch.uvs[:, 0]], axis=1)
     inner_size = np.array([rectangle.width - 2 * GUTTER, rectangle.height - 2 * GUTTER])
     corner = np.array([rectangle.x, rectangle.y])

@@ -10,6 +10,7 @@ import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.questions.harden.objects.family import Instance, family, finish
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
+    Color,
     Draw,
     Paint,
     between,
@@ -27,11 +28,11 @@ from advsearch.questions.harden.objects.textures import (
     wood,
 )
 
-Place = tuple[float, float, float]
+Point = tuple[float, float, float]
 
 
 def _post(
-    tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]
+    tag: str, low: Point, high: Point, section: Array, ends: tuple[float, float]
 ) -> list[Patch]:
     """Create a straight post between two points, scaled from one end to the other."""
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
@@ -91,23 +92,30 @@ def chair(draw: Draw) -> Instance:
         )
     if draw.chance(0.55, True):
         low = seat * draw(0.36, 0.25, 0.6)
-        ahead, aside = (one + splay * (1.0 - low / seat) for one in (x, y))
+        spread = splay * (1.0 - low / seat)
+        front_x = x + spread
+        side_y = y + spread
         thin = (0.55 * leg, 0.55 * leg)
         thinner = (0.5 * leg, 0.5 * leg)
         for sy in (-1.0, 1.0):
             patches += _post(
                 "along",
-                (-ahead, sy * aside, low),
-                (ahead, sy * aside, low),
+                (-front_x, sy * side_y, low),
+                (front_x, sy * side_y, low),
                 section,
                 thin,
             )
         patches += _post(
-            "cross", (0.0, -aside, low), (0.0, aside, low), section, thinner
+            "cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner
         )
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
-    turned = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
+    rotated = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
+    paints = _chair_paints(draw, total)
+    return Instance(rotated, paints, finish(draw, 0.45, 0.2))
 
+
+def _chair_paints(draw: Draw, total: float) -> dict[str, Paint]:
+    """Sample the paints of a chair of a height."""
     offset = draw.offset()
     timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
     paint_color = draw.colour(
@@ -127,14 +135,13 @@ def chair(draw: Draw) -> Instance:
         dots(solid(fabric), hexed("f4efe4"), 6.0),
     )
     seat_paint = cover if draw.chance(0.25) else grain(0)
-    paints = {
+    return {
         "up": grain(2),
         "along": grain(0),
         "cross": grain(1),
         "seat": seat_paint,
         "cushion": cover,
     }
-    return Instance(turned, paints, finish(draw, 0.45, 0.2))
 
 
 def _chair_back(
@@ -277,6 +284,30 @@ def _lamp_base(
     )
 
 
+def _shade_paint(
+    draw: Draw, linen: Color, offset: Array, low: float, total: float
+) -> Paint:
+    """Sample the paint of a lamp's shade between two heights."""
+    weave = clouded(linen, 0.93, 1.2, offset)
+    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
+    if kind == "band":
+        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
+            weave = over(weave, band, solid(accent))
+    elif kind == "stripes":
+        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
+    elif kind == "dots":
+        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
+    elif kind == "rings":
+        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
+    elif kind == "gradient":
+        weave = gradient(linen, shade(linen, 0.6), low, total)
+    else:
+        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
+            weave = over(weave, hem, solid(shade(linen, 0.75)))
+    return natural(draw, total, weave, 0.3)
+
+
 @family(metres=0.01)
 def lamp(draw: Draw) -> Instance:
     """Make a table lamp of random proportions, shade and base."""
@@ -314,24 +345,7 @@ def lamp(draw: Draw) -> Instance:
     linen = draw.colour(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
     )
-    weave = clouded(linen, 0.93, 1.2, offset)
-    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
-    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
-    if kind == "band":
-        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
-            weave = over(weave, band, solid(accent))
-    elif kind == "stripes":
-        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
-    elif kind == "dots":
-        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
-    elif kind == "rings":
-        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
-    elif kind == "gradient":
-        weave = gradient(linen, shade(linen, 0.6), low, total)
-    else:
-        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
-            weave = over(weave, hem, solid(shade(linen, 0.75)))
-    cloth = natural(draw, total, weave, 0.3)
+    cloth = _shade_paint(draw, linen, offset, low, total)
     clay = draw.colour(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )

@@ -105,12 +105,12 @@ def _grooved(
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    away, pentagon = football_seams(shapes.unit(t.xyz))
+    seam_distance, pentagon = football_seams(shapes.unit(t.xyz))
     base = (
         mix(light, dark, pentagon.astype(np.float64))
         * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
     )
-    return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
+    return mix(hexed("3a3a3a"), base, step(seam_distance, 0.012, 0.016))
 
 
 @painter
@@ -411,9 +411,9 @@ def _front(
         lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
         color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
         if title != "picture":
-            away = np.hypot(x, y + 0.16 * height)
-            seal = step(0.14 * width - away, 0.0, 0.12) - step(
-                0.1 * width - away, 0.0, 0.12
+            center_distance = np.hypot(x, y + 0.16 * height)
+            seal = step(0.14 * width - center_distance, 0.0, 0.12) - step(
+                0.1 * width - center_distance, 0.0, 0.12
             )
             color = mix(color, gold, seal * top)
         return color
@@ -421,7 +421,8 @@ def _front(
     return paint
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ---- stop sign
+# ----------------------------------------------------------------------------------
 # A stop sign as it stands at road works, on a low stand. Units are metres; it is read
 # from +x.
 #

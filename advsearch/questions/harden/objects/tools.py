@@ -45,8 +45,9 @@ def _claw(
     return patches
 
 
-def _along_y(*places: float) -> Array:
-    return np.array([(0.0, place, 0.0) for place in places])
+def _along_y(*positions: float) -> Array:
+    """Return points (K, 3) on the y axis."""
+    return np.array([(0.0, y, 0.0) for y in positions])
 
 
 def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:

@@ -44,9 +44,15 @@ def handle(
     profile: Array,
     inset: float,
 ) -> list[Patch]:
-    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that
-    reaches so far out between the heights of its roots, inset in the wall: "round",
-    "ear" (widest at the top), "square" or "loop" (small).
+    """Create a handle in the x-z plane, on the +x side of a wall.
+
+    Args:
+        draw: samples its thickness.
+        style: "round", "ear" (widest at the top), "square" or "loop" (small).
+        low, high: heights of its roots.
+        reach: its extent from the wall.
+        profile: of the wall (K, 2).
+        inset: depth of the roots inside the wall.
     """
     at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
@@ -162,13 +168,25 @@ def mug(draw: Draw) -> Instance:
 
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
-    grip_low = height * (
-        draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3)
-    )
+    if style == "loop":
+        grip_low = height * draw(0.3, 0.34, 0.42)
+    else:
+        grip_low = height * draw(0.2, 0.16, 0.3)
     grip = handle(
         draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall
     )
 
+    paints = _mug_paints(draw, height)
+    patches = shapes.placed(
+        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
+    )
+    return Instance(
+        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
+    )
+
+
+def _mug_paints(draw: Draw, height: float) -> dict[str, Paint]:
+    """Sample the paints of a mug."""
     offset = draw.offset()
     clay = draw.colour(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
@@ -182,26 +200,19 @@ def mug(draw: Draw) -> Instance:
     outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
     inner = outer
     if not draw.chance(0.15):
-        inner = (
-            solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
-            if draw.chance(0.5, True)
-            else glaze
-        )
-    raw = solid("a98663")
-    paints = {
-        "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw)
-        if draw.chance(0.4, True)
-        else outer,
+        inner = glaze
+        if draw.chance(0.5, True):
+            inner = solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
+    raw_clay = solid("a98663")
+    outside = outer
+    if draw.chance(0.4, True):
+        outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
+    return {
+        "outside": outside,
         "inside": inner,
-        "base": raw,
+        "base": raw_clay,
         "handle": draw.pick(glaze, outer, accent),
     }
-    patches = shapes.placed(
-        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
-    )
-    return Instance(
-        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
-    )
 
 
 @family(metres=0.01)
@@ -371,8 +382,8 @@ def _labelled(
             (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - at + 180.0) % 360.0 - 180.0
         )
         radius = float(np.hypot(xyz[:, 0], xyz[:, 1]).max())
-        away = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
-        return step(0.09 * span - away, 0.0, 0.08)
+        center_distance = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
+        return step(0.09 * span - center_distance, 0.0, 0.08)
 
     return over(label, seal, solid("b08d3c"))
 
@@ -510,29 +521,33 @@ def wine_glass(draw: Draw) -> Instance:
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
     ]
     body = shapes.lathe(profile, 52)
-    height = stem_top + deep
+    paints = _glass_paints(draw, stem_top, deep)
+    return Instance(
+        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
+    )
+
+
+def _glass_paints(draw: Draw, stem_top: float, depth: float) -> dict[str, Paint]:
+    """Sample the paints of a glass with a stem of a height and a bowl of a depth."""
+    height = stem_top + depth
     tint = draw.colour(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
     )
     drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
-    level = stem_top + deep * draw(0.48, 0.3, 0.62)
+    level = stem_top + depth * draw(0.48, 0.3, 0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
     outside = inside = plain
     if draw.chance(0.5, True):
         wine = clouded(drink, 0.8, 3.0, draw.offset())
-        outside = over(plain, between(stem_top + 0.06 * deep, level, soft=0.1), wine)
+        outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
     outside = natural(draw, height, outside, 0.3)
     if draw.chance(0.2, True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
         )
-    foot_paint = (
-        draw.pick(plain, outside, plain)
-        if draw.chance(0.7, True)
-        else anything(draw, height)
-    )
-    paints = {"foot": foot_paint, "bowl": outside, "inside": inside}
-    return Instance(
-        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
-    )
+    if draw.chance(0.7, True):
+        foot_paint = draw.pick(plain, outside, plain)
+    else:
+        foot_paint = anything(draw, height)
+    return {"foot": foot_paint, "bowl": outside, "inside": inside}
