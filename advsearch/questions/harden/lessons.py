@@ -168,16 +168,14 @@ def lessons(
     has_matrix = bool(views) and problem.is_linear
     right = tuple(int(index) for index in problem.truth())
     render = problem.renderer.like(quick=True)
-    made_lessons = list[Lesson]()
+    all_lessons = list[Lesson]()
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
         if has_matrix:
-            made_lessons += _texture_lessons(problem, views, seed, right, shared)
+            all_lessons += _texture_lessons(problem, views, seed, right, shared)
         else:
-            made_lessons += _rendered_lessons(
-                problem, render, views, seed, right, tries
-            )
-        made_lessons += _plain_lessons(problem, render, plain, seed, right)
-    return made_lessons
+            all_lessons += _rendered_lessons(problem, render, views, seed, right, tries)
+        all_lessons += _plain_lessons(problem, render, plain, seed, right)
+    return all_lessons
 
 
 def _texture_lessons(

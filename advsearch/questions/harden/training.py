@@ -115,10 +115,10 @@ class ClassifierCourse(Course):
         if split == TRAINING:
             jobs += self._further_jobs(places)
         lessons_of_job = dict(self.work.each(title, jobs))
-        drawn_lessons: list[Lesson] = []
+        sampled_lessons: list[Lesson] = []
         for index in range(len(jobs)):
-            drawn_lessons += lessons_of_job[index]
-        return drawn_lessons
+            sampled_lessons += lessons_of_job[index]
+        return sampled_lessons
 
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Wanted]:
         """Return the jobs of the controls that have a matrix of light transport."""

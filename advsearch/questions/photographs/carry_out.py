@@ -401,7 +401,9 @@ def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
         """Return the ground truth of an image of the sweep, or of the object in view."""
         task = job.tasks[model_index]
         if rendering is None or not _needs_position(task):
-            matching = [place for place in job.places if place.object == object_name]
+            matching = [
+                candidate for candidate in job.places if candidate.object == object_name
+            ]
             swept_scene = matching[0] if matching else job.places[0]
             return task.truth(job.facts(swept_scene, {}))
         number = int(rendering)

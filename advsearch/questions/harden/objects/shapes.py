@@ -452,17 +452,16 @@ def vessel(
     """
     normal = _profile_normals([outside])[0]
     inner = outside - wall * normal
-    kept_indices = np.arange(len(outside))
+    remaining = np.arange(len(outside))
     # points at which it runs backwards, as in tight bends, go; the last one stays
-    while len(kept_indices) > 2:
+    while len(remaining) > 2:
         is_backward = (
-            np.diff(inner[kept_indices], axis=0)
-            * np.diff(outside[kept_indices], axis=0)
+            np.diff(inner[remaining], axis=0) * np.diff(outside[remaining], axis=0)
         ).sum(axis=1) <= 0.0
         if not is_backward.any():
             break
-        kept_indices = np.append(kept_indices[:-1][~is_backward], kept_indices[-1])
-    inner = inner[kept_indices][::-1]
+        remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
+    inner = inner[remaining][::-1]
     lip_angle = np.pi * np.arange(1, 6) / 6
     lip_center = outside[-1] - wall / 2 * normal[-1]
     lip_across = wall / 2 * normal[-1]
