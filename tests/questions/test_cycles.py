@@ -107,7 +107,7 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
 def test_what_blender_can_not_render_is_said(
     folder: Path, renderer: Renderer, does: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cycles, "LONGEST", 1 if "sleep" in does else cycles.LONGEST)
+    monkeypatch.setattr(cycles, "MAX_RENDER_SECONDS", 1 if "sleep" in does else cycles.MAX_RENDER_SECONDS)
     (folder / "does.py").write_text(does)
     inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     with pytest.raises(BlenderError, match=words):

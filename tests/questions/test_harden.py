@@ -56,7 +56,7 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
         done.append((config.object, config.steps))
         return "found" if config.object == "book" else "robust"
 
-    monkeypatch.setattr(harden_scenes, "attacked", attacked)
+    monkeypatch.setattr(harden_scenes, "attack_scene", attacked)
     monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
     monkeypatch.setattr(training, "PLAIN_SCENES", 1)
     monkeypatch.setattr(training, "RENDERED_SCENES", 2)
@@ -110,8 +110,8 @@ def test_a_run_trains_measures_and_goes_on(
 
 
 def drawing(number: int, control: str, plain: int = 0, beside: tuple[str, ...] = ()) -> Wanted:
-    how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "beside": beside}
-    return partial(SceneWork.drawn, side=TRAINING, number=number, **how)
+    how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "varying_controls": beside}
+    return partial(SceneWork.drawn, split=TRAINING, number=number, **how)
 
 
 def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierCourse:
@@ -176,7 +176,7 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]
     wanted = [drawing(1, "texture", plain=1), drawing(0, "pose"), looking]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
     shared = config.model_copy(update={"workers": 1})
-    with executor_for(shared, "advsearch.questions.harden.scenes:scenes_of", NullProgress()) as pool:
+    with executor_for(shared, "advsearch.questions.harden.scenes:load_scene_work", NullProgress()) as pool:
         assert pool is not None
         there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
     assert there.pop(2) == here.pop() == {"before": [True] * 2, "after": [True] * 2}

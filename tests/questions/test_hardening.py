@@ -384,7 +384,7 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
             seen.append((owners, seed, images.requires_grad))
         return images
 
-    monkeypatch.setattr("advsearch.questions.harden.training._changed", changed)
+    monkeypatch.setattr("advsearch.questions.harden.training._augment", changed)
     made = student()
     with one_thread_each() as pool:
         Gradients(made, student().model, pool).take(batch, None, 7)

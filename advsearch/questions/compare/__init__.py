@@ -46,25 +46,24 @@ ALWAYS = (
 
 
 class CompareConfig(SweepConfig):
-    """Everything that decides what `compare` does: which stored sweeps it reads, or the
-    sweep that it makes first.
-    """
+    """Settings of `compare`: the stored sweeps that it reads, or the sweep that it runs."""
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
-        *(
-            "model",
-            "adversarial_of",
-            "surface",
-            "aov",
-            "metrics",
-            "log",
-            "trials",
-            "verify_spp",
-            "path",
-            "shutter",
-        ),
-        *("rolling", "fps", "must_change", "must_not_change"),
+        "model",
+        "adversarial_of",
+        "surface",
+        "aov",
+        "metrics",
+        "log",
+        "trials",
+        "verify_spp",
+        "path",
+        "shutter",
+        "rolling",
+        "fps",
+        "must_change",
+        "must_not_change",
     )
 
     # fmt: off
@@ -72,7 +71,8 @@ class CompareConfig(SweepConfig):
         ..., "compare",
         "what is compared, separated by commas: sweeps that are stored (one of several "
         "models, or several of the same "
-        "draws), or models, where `object` says what they are shown", "names or folders of runs of sweep, or models",
+        "draws), or models, where `object` says what they are shown",
+        "names or folders of runs of sweep, or models",
     )
     pictures: int = setting(
         6, "compare", "pictures of what one side alone gets right that are shown, for "
@@ -97,15 +97,13 @@ class CompareConfig(SweepConfig):
 
     @field_validator("object", mode="wrap")
     @classmethod
-    def _or_empty(cls, value: Any, read: ValidatorFunctionWrapHandler) -> Any:
-        """Accept no object, which files have as an empty text."""
+    def _accept_no_object(cls, value: Any, read: ValidatorFunctionWrapHandler) -> Any:
+        """Accept no object, which files store as an empty string."""
         return "" if value in ("", None) else read(value)
 
     @model_validator(mode="after")
-    def _of_stored_or_made(self) -> CompareConfig:
-        """Refuse what says how pictures are made where stored ones are compared, and a
-        single model.
-        """
+    def _check_settings(self) -> CompareConfig:
+        """Reject settings of a sweep where stored ones are compared, and a single model."""
         if not self.object:
             for declared in settings.settings(type(self)):
                 if (
@@ -126,10 +124,8 @@ class CompareConfig(SweepConfig):
 
     @property
     def title(self) -> tuple[str, ...]:
-        return "-".join(
-            Path(name).stem
-            for name in settings.split_names(self.object or self.compared)
-        ), self.command
+        names = settings.split_names(self.object or self.compared)
+        return "-".join(Path(name).stem for name in names), self.command
 
     def sweep(self) -> SweepConfig:
         """Return the sweep of the models that has to be made first."""
@@ -149,8 +145,7 @@ class CompareConfig(SweepConfig):
     claims=claims,
 )
 def compare(context: RunContext[CompareConfig]) -> CompareResult:
-    """Compare models, objects or adversarial scenes on the same pictures, pair by pair
-    (docs/compare.md).
+    """Compare models, objects or adversarial scenes pair by pair (docs/compare.md).
 
     All other arguments are the settings of `advsearch compare`. The run is kept, in
     `run` or under runs/. Models that exist in Python alone are swept first
@@ -219,13 +214,13 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
     environments = settings.names_together(
         side.sweep.summary.environment for side in sides
     )
+    objects = settings.names_together(side.labels["object"] for side in sides)
+    models = settings.names_together(side.labels["model"] for side in sides)
     return {
         "environment": environments or config.lit_by,
         "controls": sides[0].sweep.summary.controls,
-        "object": settings.names_together(side.labels["object"] for side in sides)
-        or config.object,
-        "model": settings.names_together(side.labels["model"] for side in sides)
-        or config.compared,
+        "object": objects or config.object,
+        "model": models or config.compared,
         "task": sides[0].sweep.summary.task,
     }
 
@@ -248,8 +243,11 @@ def count_side(side: Side) -> ComparedSide:
 
 
 def find_cautions(sides: Sequence[Side], differ: Sequence[str]) -> list[str]:
-    """Return what a reader has to know of sides whose sweeps differ in some
-    settings.
+    """Return warnings about the sides of a comparison.
+
+    Args:
+        sides: what is compared.
+        differ: the settings in which their sweeps differ.
     """
     if not sides:
         return []

@@ -1,4 +1,4 @@
-"""Small images of pairs that one side alone gets right."""
+"""Collect small images of pairs that only one side gets right."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from advsearch.questions.compare.sides import Side
 
 
 class MissingImage(NamedTuple):
-    """An image to render: of a side, with a number; and the name of its file in the run
-    directory.
+    """An image that has to be rendered.
+
+    Attributes:
+        side: that it belongs to.
+        number: of the image in the side's sweep.
+        file: relative to the run directory.
     """
 
     side: Side
@@ -25,8 +29,7 @@ class MissingImage(NamedTuple):
 
 @dataclass
 class PairImages:
-    """Images of pairs in the directory of the run: those that sweeps have stored, or
-    rendered again.
+    """Copies images of pairs into the run directory, or renders them again.
 
     Attributes:
         context: of the experiment.
@@ -40,24 +43,13 @@ class PairImages:
     _unavailable: set[str] = field(default_factory=set)
 
     def list_pairs(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
-        """Yield pairs that one side alone gets right, where the margins are farthest
-        apart first.
+        """Yield pairs that only one side gets right, those with the largest margin gap first.
 
         There are at most as many of each side as the settings say, with images as far
         as these are available; `pair` is the number of the two sides.
         """
         run = self.context.run
-        margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
-        rows = [
-            *find_smallest(
-                -margin_gap[first.is_right & ~second.is_right],
-                self.context.config.pictures,
-            ),
-            *find_smallest(
-                margin_gap[~first.is_right & second.is_right],
-                self.context.config.pictures,
-            ),
-        ]
+        rows = select_examples(first, second, self.context.config.pictures)
         shares_images = first.sweep.folder == second.sweep.folder and first.rows[
             "number"
         ].equals(second.rows["number"])
@@ -92,9 +84,7 @@ class PairImages:
             )
 
     def _render(self, missing: Sequence[MissingImage]) -> None:
-        """Render images again, those of one sweep after the other, so that its scenes
-        are loaded once.
-        """
+        """Render images again, sweep by sweep, so that each scene is loaded once."""
         if missing:
             self.context.progress.stage(
                 "rendering pictures again",
@@ -108,15 +98,14 @@ class PairImages:
             self.context.progress.advance(1)
 
     def _render_image(self, image: MissingImage) -> None:
+        """Render an image again; add a warning if its scene or model is not available."""
         sweep = image.side.sweep
         if str(sweep.folder) in self._unavailable:
             return
         try:
             scenes = sweep.scenes
-        except (
-            InputError,
-            errors.ModelError,
-        ) as error:  # a scene or a model is no longer available
+        except (InputError, errors.ModelError) as error:
+            # A scene or a model is no longer available.
             self._unavailable.add(str(sweep.folder))
             self.warnings.append(
                 f"Pictures of {sweep.folder.name} are not shown: {error}"
@@ -124,6 +113,20 @@ class PairImages:
             return
         self.context.run.write_file(image.file, scenes.thumbnail(image.number))
         self.n_rendered += 1
+
+
+def select_examples(first: Side, second: Side, limit: int) -> list[int]:
+    """Return the indices of pairs that only one side gets right, at most `limit` each.
+
+    Those with the largest difference of the margins come first.
+    """
+    margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
+    only_first = first.is_right & ~second.is_right
+    only_second = ~first.is_right & second.is_right
+    return [
+        *find_smallest(-margin_gap[only_first], limit),
+        *find_smallest(margin_gap[only_second], limit),
+    ]
 
 
 def find_smallest(values: pd.Series, limit: int) -> list[int]:

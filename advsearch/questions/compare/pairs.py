@@ -1,6 +1,4 @@
-"""Two sides, counted pair by pair: in all, by each parameter, and where one side is
-worse.
-"""
+"""Count the pairs of two sides: in all, by parameter, and by rules."""
 
 from __future__ import annotations
 
@@ -71,9 +69,7 @@ def compare_sides(
 
 
 def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPart]:
-    """Yield the counts of the pairs for each value, or each part of the range, of a
-    parameter.
-    """
+    """Yield the counts of pairs for each value of a parameter, or part of its range."""
     column = first.rows[name]
     unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
     units = first.rows["unit"].to_numpy()
@@ -88,8 +84,11 @@ def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPar
 def count_pairs(
     first_right: BoolArray, second_right: BoolArray, units: IntArray
 ) -> dict[str, Any]:
-    """Return the fields of `PairCounts` from what both sides say of pairs (n,), which
-    are of units (n,).
+    """Return the fields of `PairCounts`.
+
+    Args:
+        first_right, second_right: whether each side is right (n,).
+        units: the unit of each pair (n,); pairs of one unit are not independent.
     """
     difference, interval, _ = statistics.clustered.paired_by_unit(
         first_right, second_right, units
@@ -115,9 +114,7 @@ def count_pairs(
 def split_by_value(
     column: pd.Series, edges: Sequence[float] | None
 ) -> Iterator[tuple[Any, BoolArray]]:
-    """Yield the values of a parameter, or the parts of its range between edges, and
-    which rows (n,) have them.
-    """
+    """Yield each value of a parameter, or part of its range, and the mask (n,) of its rows."""
     if column.dtype == "category":
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
@@ -133,8 +130,7 @@ def split_by_value(
 
 
 def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
-    """Find where one side alone is right more often than elsewhere; None of too few
-    pairs.
+    """Find rules under which only one side is right more often; None for too few pairs.
 
     Args:
         table: of pairs (`rules`); `correct` is False where that side alone is right.

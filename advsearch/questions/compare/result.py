@@ -81,8 +81,9 @@ class PairCounts(results.Fields):
 
 
 class PairRule(CountOf):
-    """Values under which one side alone is right more often than elsewhere, counted on
-    pairs that did not choose it.
+    """Values under which only one side is right more often than elsewhere.
+
+    They are counted on pairs that did not choose them.
     """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
@@ -90,7 +91,7 @@ class PairRule(CountOf):
 
 
 class PairPart(PairCounts):
-    """The pairs with one value, or one part of the range, of one parameter."""
+    """Counts of the pairs with one value of a parameter, or in one part of its range."""
 
     parameter: str
     unit: str
@@ -190,13 +191,16 @@ NOTE_OF_UNITS = (
     "weigh the same."
 )
 
-SIGNIFICANCE = 0.05  # A p-value up to this is called a difference
-MAX_TABLES = 4  # parameters that a terminal shows; the page has all
-MAX_PICTURES = 3  # of what one side alone gets right, likewise
+SIGNIFICANCE = 0.05
+"""A p-value up to this is called a difference."""
+MAX_TABLES = 4
+"""Parameters that a terminal shows; the page has all."""
+MAX_PICTURES = 3
+"""Pairs of each side that a terminal shows; the page has all."""
 
 
 def shown(result: CompareResult) -> ShownResult:
-    """Return what is shown of a comparison."""
+    """Return the view of a comparison."""
     columns: dict[str, views.Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
@@ -213,27 +217,25 @@ def shown(result: CompareResult) -> ShownResult:
     ]
     for pair in result.pairs:
         sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
-    said = (
-        headline(result.pairs[0])
-        if result.pairs
-        else ("Interrupted before anything was compared.")
-    )
+    summary = "Interrupted before anything was compared."
+    if result.pairs:
+        summary = headline(result.pairs[0])
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
-    return ShownResult(said, sections, facts, says_interrupted=not result.pairs)
+    return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
 
 
 def cost_text(seconds: float) -> str:
     """Return the time of a prediction; empty where it is not known."""
     if math.isnan(seconds):
         return ""
-    return (
-        f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
-    )
+    if seconds < 0.1:
+        return f"{1000.0 * seconds:.2g} ms"
+    return wording.seconds_text(seconds)
 
 
 def headline(pair: ComparedPair) -> str:
-    """Return the first thing that a reader should know of two sides, in a sentence."""
+    """Summarise the difference of two sides in a sentence."""
     first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
     of_units = (
         "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
@@ -253,12 +255,12 @@ def points_text(interval: results.Interval) -> str:
 
 
 def alone_text(pair: ComparedPair) -> str:
-    """Return what the pairs say that one side alone gets right, in a sentence."""
+    """Describe in a sentence the pairs that only one side gets right."""
     if not pair.first_only and not pair.second_only:
         return "Both are right about the same pictures."
-    reservation = (
-        "" if pair.p <= SIGNIFICANCE else (". That there is a difference is not shown")
-    )
+    reservation = ""
+    if pair.p > SIGNIFICANCE:
+        reservation = ". That there is a difference is not shown"
     p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
     return (
@@ -269,6 +271,7 @@ def alone_text(pair: ComparedPair) -> str:
 
 
 def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
+    """Yield the sections about one pair of sides."""
     sentences = [headline(pair), alone_text(pair)] if has_others else [alone_text(pair)]
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
@@ -286,8 +289,9 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
 
 
 def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
-    """Yield a table for each parameter; a terminal shows those over which the
-    difference varies most.
+    """Yield a table for each parameter.
+
+    A terminal shows those over which the difference varies most.
     """
     tables: dict[str, list[PairPart]] = {}
     for part in pair.parts:
@@ -316,6 +320,7 @@ def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
 
 
 def _part_cells(part: PairPart) -> list[str]:
+    """Return the cells of a row of a parameter's table."""
     accuracies = [wording.percent(accuracy) for accuracy in part.accuracies]
     difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
     alone = [str(part.first_only), str(part.second_only)]
@@ -336,8 +341,13 @@ def _rule_texts(pair: ComparedPair) -> Iterator[str]:
 def _worse_texts(
     rules: Sequence[PairRule] | None, n_alone: int, name: str, other: str
 ) -> Iterator[str]:
-    """Yield where the other side is worse than one that alone gets so many pairs
-    right.
+    """Yield the rules under which one side is worse than another.
+
+    Args:
+        rules: under which only `name` is right; None if they were not sought.
+        n_alone: pairs that only `name` gets right.
+        name: of the better side.
+        other: of the worse side.
     """
     if rules is None or not n_alone:
         return
@@ -353,9 +363,28 @@ def _worse_texts(
         )
 
 
+def _values_text(example: PairPicture) -> str:
+    """Return the values of a pair's parameters: ``elevation 12.3, object mug``."""
+    texts = []
+    for name, value in example.values.items():
+        value_text = value if isinstance(value, str) else format(value, ".3g")
+        texts.append(f"{name} {value_text}")
+    return ", ".join(texts)
+
+
+def _captions(example: PairPicture, pair: ComparedPair) -> list[str]:
+    """Return what each side predicts, and which is right."""
+    captions = []
+    for side, answer in zip((pair.first, pair.second), example.answers, strict=True):
+        suffix = " (right)" if side == example.right else ""
+        captions.append(f"{side}: {answer}{suffix}")
+    return captions
+
+
 def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
-    """Yield the pictures of the pairs that one side alone gets right, for a terminal
-    and for a page.
+    """Yield the images of pairs that only one side gets right.
+
+    One part is for a terminal, and one for a page.
     """
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []
@@ -364,15 +393,8 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     for example in pair.shown:
         if example.right != name:
             continue
-        values = ", ".join(
-            f"{key} {value if isinstance(value, str) else format(value, '.3g')}"
-            for key, value in example.values.items()
-        )
-        answers = zip((pair.first, pair.second), example.answers, strict=True)
-        captions = [
-            f"{side}: {answer}{' (right)' if side == name else ''}"
-            for side, answer in answers
-        ]
+        values = _values_text(example)
+        captions = _captions(example, pair)
         line = "; ".join([*captions, values])
         lines.append([line, *example.pictures])
         if not example.pictures:

@@ -1,4 +1,4 @@
-"""What is compared, read from stored sweeps.
+"""Read the sides of a comparison from stored sweeps.
 
 Images of a sweep are numbered, and the draw of an image follows from its number. So
 sweeps with the same seed, grid and controls have the same draws, and images with the
@@ -17,33 +17,35 @@ import pandas as pd
 
 from advsearch.extend import InputError, errors, rules, wording, workbench
 
-# decide what is drawn
 DRAW_SETTINGS = ("grid", "controls", "samples", "sampler", "seed")
-# what may tell sides apart, as rows have it
+"""Settings that decide which configurations are drawn."""
 SIDE_COLUMNS = ("object", "model", "answer")
+"""Columns of rows in which sides may differ."""
 SIDE_SETTINGS = ("object", "model")
+"""Settings in which sides may differ."""
 SECONDARY_SETTINGS = (
-    *(
-        *DRAW_SETTINGS,
-        "label",
-        "labels",
-        "prompt",
-        "up",
-        "facing",
-        "size",
-        "unit",
-        "batch",
-        "keep_pictures",
-        "trials",
-    ),
-    *("verify_spp", "specialise", "value_range", "adversarial_of"),
+    *DRAW_SETTINGS,
+    "label",
+    "labels",
+    "prompt",
+    "up",
+    "facing",
+    "size",
+    "unit",
+    "batch",
+    "keep_pictures",
+    "trials",
+    "verify_spp",
+    "specialise",
+    "value_range",
+    "adversarial_of",
 )
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of
 no adversarial scene.
 """
 
-# of a value, relative to the largest in its column: values come from single precision
 TOLERANCE = 1e-4
+"""Relative to the largest value of a column: values come from single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class Side:
 
 
 def read_sides(folders: Sequence[Path]) -> list[Side]:
-    """Read what the sweeps in some folders compare, each side with a name of its own.
+    """Read the sides that sweeps compare, each with a different name.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has
     these without it and with it; along with other sweeps, only with it.
@@ -115,8 +117,9 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
 
 
 def name_sides(sides: Sequence[Side]) -> list[str]:
-    """Return a different name for each side: what tells it apart; if that is not
-    enough, with folders, or numbers.
+    """Return a different name for each side.
+
+    It says what differs; if that is not enough, also the directory, or a number.
     """
     columns = [
         column
@@ -132,7 +135,8 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     if len(set(names)) < len(names):
         folders = [side.sweep.folder.name for side in sides]
         names = [
-            ", ".join(filter(None, words)) for words in zip(folders, names, strict=True)
+            ", ".join(filter(None, name_parts))
+            for name_parts in zip(folders, names, strict=True)
         ]
     if len(set(names)) < len(names):
         names = [f"{number}: {name}" for number, name in enumerate(names, start=1)]
@@ -140,8 +144,11 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
 
 
 def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
-    """Read the sides of one sweep, without names yet; `is_only`: no other sweep is
-    compared.
+    """Yield the sides of one sweep, without names.
+
+    Args:
+        folder: the run directory of the sweep.
+        is_only: whether no other sweep is compared.
     """
     sweep = workbench.StoredSweep.read(folder)
     summary = sweep.summary
@@ -178,8 +185,10 @@ def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
 
 
 def check_same_draws(first: Side, second: Side) -> None:
-    """Check that the sweeps of two sides have the same draws. Raises InputError: they
-    have not.
+    """Check that the sweeps of two sides have the same draws.
+
+    Raises:
+        InputError: they have not.
     """
     if first.sweep.folder == second.sweep.folder:
         return
@@ -200,10 +209,10 @@ def check_same_draws(first: Side, second: Side) -> None:
     if first.labels["object"] != second.labels["object"]:
         return  # ranges may follow from the object
     for name in first.rows.attrs["units"]:
-        is_drawn = name not in (*SIDE_COLUMNS, "environment")
+        is_sampled = name not in (*SIDE_COLUMNS, "environment")
         is_shared = name in second.rows.attrs["units"]
         if (
-            is_drawn
+            is_sampled
             and is_shared
             and not has_same_values(first.rows[name], second.rows[name])
         ):
@@ -215,9 +224,7 @@ def check_same_draws(first: Side, second: Side) -> None:
 
 
 def has_same_values(first: pd.Series, second: pd.Series) -> bool:
-    """Return whether two columns (n,) have the same values, but for what single
-    precision rounds.
-    """
+    """Return whether two columns (n,) are equal up to single precision."""
     if first.dtype == "category" or second.dtype == "category":
         return bool((first.astype(object) == second.astype(object)).all())
     scale = float(np.nanmax(np.abs(first), initial=0.0))
@@ -227,9 +234,7 @@ def has_same_values(first: pd.Series, second: pd.Series) -> bool:
 
 
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
-    """Return the settings in which the sweeps of some sides differ and that decide
-    predictions.
-    """
+    """Return the names of the settings that decide predictions and differ between sides."""
     first, *others = (side.sweep.config.deciding() for side in sides)
     names = {name for other in others for name in other if other[name] != first[name]}
     names |= {

@@ -1,11 +1,13 @@
-"""Say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh
-renders.
+"""Find rules under which a model is wrong, from the rows of sweeps.
+
+Fresh renders confirm them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from advsearch.extend import (
     Config,
@@ -30,11 +32,14 @@ from advsearch.questions.explain.result import (
     triggering,
 )
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from advsearch.api.workbench import StoredSweep
+
 
 class ExplainConfig(Config):
-    """Everything that decides what `explain` does: whose rows it reads, and what it
-    renders to see whether it is so.
-    """
+    """Settings of `explain`: which sweeps it reads, and how much it renders."""
 
     command: ClassVar[str] = "explain"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
@@ -96,8 +101,7 @@ class ExplainConfig(Config):
     triggering=triggering,
 )
 def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
-    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by
-    renders (docs/explain.md).
+    """Find rules under which a model is wrong, and confirm them (docs/explain.md).
 
     Args:
         sweeps: name or folder of a run of `sweep` that has ended, or several, whose
@@ -109,30 +113,16 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     from advsearch.questions.explain.envelope import find_envelope
     from advsearch.questions.explain.importance import find_importance
     from advsearch.questions.explain.renders import Renders
-    from advsearch.questions.explain.rows import read_predictions
 
     config = context.config
     progress = context.progress
     progress.stage("reading rows")
-    folders = [
-        folder
+    sweeps = [
+        workbench.StoredSweep.read(path)
         for name in settings.split_names(config.sweeps)
-        for folder in find_sweeps(directory.find_run(name))
+        for path in find_sweeps(directory.find_run(name))
     ]
-    sweeps = [workbench.StoredSweep.read(folder) for folder in folders]
-    rows = read_predictions(sweeps)
-    rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
-    if len(rows) < rules.MIN_ROWS:
-        raise InputError(
-            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep "
-            "more configurations"
-        )
-    table = rules.make_table(rows, rows.attrs["units"])
-    if not table.attrs["units"]:
-        raise InputError(
-            "explain: expected rows in which something varies that all of "
-            "them have, got none"
-        )
+    rows, table = read_table(sweeps)
 
     choosing, counting = rules.split_in_halves(table, config.seed)
     progress.stage("seeking rules on one half of the rows")
@@ -177,10 +167,33 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     )
 
 
-def find_sweeps(folder: Path) -> list[Path]:
-    """Return the run directories of the sweeps of a run: itself, or parts of a
-    recipe.
+def read_table(sweeps: Sequence[StoredSweep]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the rows of sweeps that have the object in view, and what varies in them.
+
+    Raises:
+        InputError: there are too few rows, or nothing varies in all of them.
     """
+    from advsearch.extend import rules  # imports pandas
+    from advsearch.questions.explain.rows import read_predictions
+
+    rows = read_predictions(sweeps)
+    rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
+    if len(rows) < rules.MIN_ROWS:
+        raise InputError(
+            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep "
+            "more configurations"
+        )
+    table = rules.make_table(rows, rows.attrs["units"])
+    if not table.attrs["units"]:
+        raise InputError(
+            "explain: expected rows in which something varies that all of "
+            "them have, got none"
+        )
+    return rows, table
+
+
+def find_sweeps(folder: Path) -> list[Path]:
+    """Return the directories of the sweeps of a run: its own, or those of a recipe's parts."""
     result = read_result(folder)
     if result.command != "recipe":
         return [folder]

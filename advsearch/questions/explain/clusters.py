@@ -82,8 +82,10 @@ def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
 
 
 def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
-    """Return the largest mean silhouette over numbers of clusters, and the cluster of
-    each point.
+    """Cluster points (n, d) into the number of clusters with the largest mean silhouette.
+
+    Returns:
+        The mean silhouette, -1 if none can be computed; and the cluster of each point (n,).
     """
     k_means = rules.import_library("sklearn.cluster").KMeans
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score

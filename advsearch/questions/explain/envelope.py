@@ -18,17 +18,20 @@ from advsearch.extend import rules
 from advsearch.questions.explain.findings import count_right
 from advsearch.questions.explain.result import EnvelopeRow
 
-PEELED_SHARE = 0.05  # of the rows in the box, which are peeled off a side at a time
-MIN_INSIDE = 60  # Fewer rows, or drives, than this cannot show an accuracy of 95 %
-# By how much more the choosing rows have to show, since they were chosen by
+PEELED_FRACTION = 0.05
+"""Fraction of the rows in the box that one peel removes at one bound."""
+MIN_INSIDE = 60
+"""Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
 RESERVE = 0.01
+"""Additional accuracy of the choosing rows, which are biased since they chose the box."""
 
 
 def find_envelope(
     choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float
 ) -> EnvelopeRow | None:
-    """Find the largest box that promises an accuracy; None where no box of enough rows
-    does.
+    """Find the largest box of values inside which a model has an accuracy.
+
+    None if no box of enough rows has it.
 
     Args:
         choosing: rows that choose the box.
@@ -57,8 +60,9 @@ def find_envelope(
 def find_best_peel(
     box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
 ) -> rules.RuleConditions | None:
-    """Return the slightly smaller box whose rows are right most often; None where too
-    few rows are left in each.
+    """Return the slightly smaller box with the highest accuracy.
+
+    None if too few rows are left in each.
     """
     is_independent = choosing["unit"].is_unique
     best_box = None
@@ -75,8 +79,11 @@ def find_best_peel(
 def peel(
     box: rules.RuleConditions, inside: pd.DataFrame
 ) -> Iterator[rules.RuleConditions]:
-    """Yield boxes that are slightly smaller than a box with rows `inside`, in one
-    factor each.
+    """Yield boxes that are slightly smaller than `box`, in one factor each.
+
+    Args:
+        box: the conditions of the box.
+        inside: the rows inside it.
     """
     condition_of_factor = {condition.factor: condition for condition in box}
     for factor, unit in inside.attrs["units"].items():
@@ -94,9 +101,7 @@ def peel(
 def peel_factor(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield conditions without one of the names, or without the lowest or the highest
-    values of a column.
-    """
+    """Yield conditions without one name, or without the lowest or highest values."""
     if column.dtype == "category":
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
@@ -106,11 +111,9 @@ def peel_factor(
         return
 
     values = column.to_numpy()
-    low, high = (
-        float(f"{np.quantile(values, share):.3g}")
-        for share in (PEELED_SHARE, 1.0 - PEELED_SHARE)
-    )
-    # few different values: the smallest one goes
+    low = float(f"{np.quantile(values, PEELED_FRACTION):.3g}")
+    high = float(f"{np.quantile(values, 1.0 - PEELED_FRACTION):.3g}")
+    # With few different values the smallest one is removed.
     if low < values.min() or low >= values.max():
         low = float(values.min())
     yield replace(condition, low=low)

@@ -1,4 +1,4 @@
-"""Counts of right rows under rules, and what a reader has to know of them."""
+"""Count right rows under rules, and find warnings about them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from advsearch.questions.explain.result import ParameterWeight, RightOf, RuleNot
 
 
 def count_right(rows: pd.DataFrame) -> RightOf:
-    """Count right rows; their share is the mean over units."""
+    """Count right rows; the fraction is the mean over units."""
     return RightOf(
         right=int(rows["correct"].sum()),
         total=len(rows),
@@ -24,9 +24,7 @@ def count_right(rows: pd.DataFrame) -> RightOf:
 
 
 def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
-    """Return the fields of a rule: its conditions, and the counts inside and
-    elsewhere.
-    """
+    """Return the fields of a rule: conditions, and counts inside and elsewhere."""
     conditions = [condition.row for condition in rule.conditions]
     return {
         "conditions": conditions,
@@ -38,11 +36,11 @@ def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
 def describe_rejected(
     rule: rules.CountedRule | None, n_rows: int
 ) -> RuleNotTold | None:
-    """Return the result of a rule that is not told, found in so many rows."""
+    """Return the result of a rule that is not significant among `n_rows` rows."""
     if rule is None:
         return None
-    times = rule.find_needed_factor()
-    n_needed = None if times is None else round_up(times * n_rows)
+    factor = rule.find_needed_factor()
+    n_needed = None if factor is None else round_up(factor * n_rows)
     return RuleNotTold(
         **describe_rule(rule),
         chance=rule.p_value,
@@ -60,7 +58,7 @@ def round_up(count: float) -> int:
 def find_cautions(
     table: pd.DataFrame, importance: Sequence[ParameterWeight]
 ) -> list[str]:
-    """Return what a reader has to know of the rows of a table and of what decides."""
+    """Return warnings about the rows of a table and the importance of its factors."""
     cautions = []
     n_draws = table["unit"].nunique()
     if n_draws == 1:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,16 +34,14 @@ from scipy.stats import f as f_distribution
 from advsearch.extend import rules, statistics
 from advsearch.questions.explain.result import ParameterWeight
 
-MAX_GROUPS = 20  # of one factor
-ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' groups has on average, at least
+MAX_GROUPS = 20
+"""Of one factor."""
+ROWS_IN_A_CELL = 25
+"""Average rows of a cell of two factors' groups, at least."""
 SIGNIFICANCE = 0.01
-"""Probability that any pair is told to decide together where none does; each is tested
-at its part (Bonferroni).
-"""
+"""Probability that any pair is reported if no factors interact (Bonferroni)."""
 MIN_INFLATION = 0.1
-"""What chance adds for clusters, at least, of what it adds to independent predictions,
-though clusters deviate in nothing.
-"""
+"""Lower limit of the design effect of clusters."""
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float64]
@@ -50,8 +49,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
-    """Estimate what each factor of a table (`rules`) decides, and which pairs decide
-    more than each by itself.
+    """Estimate how much each factor, and each interacting pair, decides the predictions.
 
     Returns:
         The factors by falling share, without what chance adds to it; then the pairs,
@@ -86,12 +84,14 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
 
 
 def sort_by_share(weights: list[ParameterWeight]) -> list[ParameterWeight]:
+    """Sort weights by their fraction of the variance, the largest first."""
     return sorted(weights, key=lambda weight: -weight.share)
 
 
 def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
-    """Return the group of each row (n,): its name, or one of at most `n_groups` with
-    equally many rows.
+    """Return the group of each row (n,).
+
+    Each name is a group; numbers are cut into at most `n_groups` of equally many rows.
     """
     if column.dtype == "category":
         return np.asarray(column.cat.codes, dtype=np.int64)
@@ -109,8 +109,9 @@ def cross_groups(first: IntArray, second: IntArray) -> IntArray:
 
 
 class ClusteredPredictions:
-    """Yes/no predictions in clusters that have equal weight, so that few with many rows
-    do not decide.
+    """Right and wrong predictions in clusters of equal weight.
+
+    Clusters with many rows weigh no more than others.
 
     Attributes:
         correct: whether each prediction is right (n,).
@@ -132,9 +133,7 @@ class ClusteredPredictions:
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_share(self, group: IntArray) -> tuple[float, int]:
-        """Return the estimated share of the variance between groups, and the number of
-        groups that have rows.
-        """
+        """Return the fraction of the variance between groups, and the number of used groups."""
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
         used_weight = group_weight[is_used]
@@ -145,8 +144,9 @@ class ClusteredPredictions:
         return sum_of_squares / len(self.correct) / self.variance, len(group_rate)
 
     def measure(self, factors: list[str], group: IntArray) -> ParameterWeight:
-        """Estimate the share of the variance between groups, less what chance adds,
-        with its 95 % interval.
+        """Estimate the fraction of the variance between groups with its 95 % interval.
+
+        What chance adds to the fraction is subtracted.
         """
         share, n_groups = self.explained_share(group)
         expected_statistic = self.expected_statistic(group)
@@ -160,23 +160,15 @@ class ClusteredPredictions:
         if self.is_independent:
             design_effect = 1.0
             error_degrees = math.inf
-            corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(
-                n_rows - n_groups, 1
-            )
+            residual_degrees = max(n_rows - n_groups, 1)
+            corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees
         else:
             design_effect = expected_statistic / degrees
             error_degrees = float(self.n_clusters - n_groups)
             corrected_share = share - expected_statistic / n_rows
 
-        statistic = n_rows * share / design_effect
-        # A statistic below its degrees of freedom is smaller than by chance alone.
-        upper_statistic = max(statistic, float(degrees))
-        tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
-        lower_noncentrality = find_noncentrality(
-            statistic, degrees, error_degrees, 1.0 - tail
-        )
-        upper_noncentrality = find_noncentrality(
-            upper_statistic, degrees, error_degrees, tail
+        lower_noncentrality, upper_noncentrality = noncentrality_interval(
+            n_rows * share / design_effect, degrees, error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
@@ -206,7 +198,7 @@ class ClusteredPredictions:
         )
         residual = self.weight * (self.correct - group_rate[group])
 
-        # A cell is one cluster inside one group.
+        # A cell is a cluster inside a group.
         cell_id, cell = np.unique(
             group * self.n_clusters + self.cluster, return_inverse=True
         )
@@ -225,14 +217,9 @@ class ClusteredPredictions:
         squared_residual = np.bincount(
             cell_group, cell_residual**2, minlength=len(group_weight)
         )[is_used]
-        variance_of_group = (
-            squared_residual
-            * clusters_per_group
-            / (clusters_per_group - 1)
-            / group_weight[is_used]
+        within_groups = within_group_variance(
+            squared_residual, clusters_per_group, group_weight[is_used]
         )
-        within_groups = float(variance_of_group.sum())
-
         cluster_residual = np.bincount(cell_cluster, cell_residual)
         sum_of_squares = float((cluster_residual**2).sum())
         between_clusters = (
@@ -246,8 +233,9 @@ class ClusteredPredictions:
     def interaction_p_value(
         self, joint_group: IntArray, first_group: IntArray, second_group: IntArray
     ) -> float:
-        """Return how likely chance makes the statistic of two factors exceed the sum of
-        theirs by so much.
+        """Return the p-value of the interaction of two factors.
+
+        The statistic of both factors is compared with the sum of each factor's.
         """
         joint_share, n_cells = self.explained_share(joint_group)
         first_share, n_first = self.explained_share(first_group)
@@ -266,11 +254,36 @@ class ClusteredPredictions:
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
 
 
+def within_group_variance(
+    squared_residual: npt.NDArray[Any],
+    clusters_per_group: IntArray,
+    group_weight: npt.NDArray[Any],
+) -> float:
+    """Return the variance of clusters inside their groups, summed over groups (k,)."""
+    variance_of_group = (
+        squared_residual * clusters_per_group / (clusters_per_group - 1) / group_weight
+    )
+    return float(variance_of_group.sum())
+
+
+def noncentrality_interval(
+    statistic: float, degrees: int, error_degrees: float
+) -> tuple[float, float]:
+    """Return the 95 % interval of the noncentrality; see `find_noncentrality`."""
+    # A statistic below its degrees of freedom is smaller than by chance alone.
+    upper_statistic = max(statistic, float(degrees))
+    tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
+    lower = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)
+    upper = find_noncentrality(upper_statistic, degrees, error_degrees, tail)
+    return lower, upper
+
+
 def find_noncentrality(
     statistic: float, degrees: int, error_degrees: float, probability: float
 ) -> float:
-    """Find the noncentrality at which a statistic is not exceeded with a probability; 0
-    where none is that small.
+    """Find the noncentrality at which a statistic is exceeded with a given probability.
+
+    0 if even the central distribution exceeds it more often.
 
     Args:
         statistic: of a noncentral chi-squared distribution, or `degrees` times one of
@@ -281,18 +294,19 @@ def find_noncentrality(
     """
 
     def excess_probability(noncentrality: float) -> float:
+        """Return by how much the probability of the statistic exceeds `probability`."""
         is_central = noncentrality <= 0.0
         if math.isinf(error_degrees):
             distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
-            reached = distribution.cdf(statistic)
+            cumulative = distribution.cdf(statistic)
         else:
             central = f_distribution(degrees, error_degrees)
             distribution = (
                 central if is_central else ncf(degrees, error_degrees, noncentrality)
             )
-            reached = distribution.cdf(statistic / degrees)
-        # NaN: the distribution is too far away to be computed
-        return float(np.nan_to_num(reached)) - probability
+            cumulative = distribution.cdf(statistic / degrees)
+        # NaN: the noncentrality is too large for the distribution to be computed.
+        return float(np.nan_to_num(cumulative)) - probability
 
     if excess_probability(0.0) <= 0.0:
         return 0.0

@@ -1,5 +1,7 @@
-"""Renders that test what rows have shown: inside rules, along one factor from failures,
-and of failures again.
+"""Render images that test what rows suggest.
+
+Fresh configurations inside rules, configurations along one factor from a failure, and
+failures once more.
 """
 
 from __future__ import annotations
@@ -42,16 +44,18 @@ from advsearch.questions.explain.sweeps import (
     sweep_inside,
 )
 
-MAX_ARCS = 2  # of a circle that a condition has
+MAX_ARCS = 2
+"""Arcs of a circle that a condition on an angle has, at most."""
 MIN_REST = 0.2
-"""Share of a rule that no rule before it covers, below which no more is rendered so
-that enough of it is left.
+"""Lower limit of the fraction of a rule that no earlier rule covers.
+
+More configurations are rendered the smaller it is, so that enough are left.
 """
 
 
 @dataclass
 class Renders:
-    """Sweeps in the directory of the run; none any more after an interrupt.
+    """Runs sweeps in the directory of the run, until it is interrupted.
 
     Attributes:
         context: of the experiment.
@@ -84,8 +88,9 @@ class Renders:
         return len(self._tried_failures)
 
     def render_rows(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
-        """Return the rows of a sweep; None if it was interrupted, or its scene is no
-        longer available.
+        """Run a sweep and return its rows.
+
+        None if it was interrupted, or its scene is no longer available.
         """
         if self.interrupted:
             return None
@@ -107,13 +112,14 @@ class Renders:
         return None if self.interrupted else read_predictions([sweep])
 
     # ---- rules
-    # ------------------------------------------------------------------------------------------------------
+    # ------------------------------------------------------------------------------
 
     def confirm_rule(
         self, counted_rules: Sequence[rules.CountedRule], index: int
     ) -> Confirmation | None:
-        """Render fresh configurations inside a rule and outside those before it, in the
-        scene of each sweep.
+        """Confirm a rule by fresh configurations that no earlier rule covers.
+
+        They are rendered in the scene of each sweep.
 
         They confirm it if they alone, with the rows elsewhere, tell it. None where
         nothing was rendered.
@@ -127,12 +133,7 @@ class Renders:
 
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
-            drawn = [
-                condition
-                for condition in rule.conditions
-                if is_drawn(sweep.config, condition.factor)
-            ]
-            n_arcs = max((len(condition.arcs) for condition in drawn), default=1) or 1
+            n_arcs = count_arcs(sweep.config, rule.conditions)
             samples = math.ceil(self.config.confirm / len(self.sweeps) / n_arcs / rest)
             for arc in range(n_arcs):
                 part = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
@@ -150,13 +151,9 @@ class Renders:
                 )
                 if rows is None:
                     continue
-                is_inside = rules.find_covered(rule.conditions, rows) & is_outside(
-                    earlier_conditions, rows
-                )
-                inside = rows[is_inside & rules.is_in_view(rows)]
-                fresh_frames.append(
-                    inside.assign(unit=inside["unit"].astype(str) + f" of {part}")
-                )
+                inside = select_inside(rows, rule.conditions, earlier_conditions)
+                unit = inside["unit"].astype(str) + f" of {part}"
+                fresh_frames.append(inside.assign(unit=unit))
 
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
@@ -166,7 +163,7 @@ class Renders:
         return Confirmation(**vars(count_right(fresh_rows)), held=fresh_rule.holds)
 
     # ---- pairs
-    # ------------------------------------------------------------------------------------------------------
+    # ------------------------------------------------------------------------------
 
     def find_pairs(
         self, counted_rules: Sequence[rules.CountedRule]
@@ -193,9 +190,7 @@ class Renders:
                     break
 
     def _relative_change(self, pair: NearestRight) -> float:
-        """Return by which share of the range of the rows a value differs; 1 for
-        names.
-        """
+        """Return the difference of a pair as a fraction of the factor's range; 1 for names."""
         column = self.table[pair.parameter]
         if column.dtype == "category":
             return 1.0
@@ -238,7 +233,8 @@ class Renders:
             nearest = right_indices[0]
         else:
             nearest = min(
-                right_indices, key=lambda k: abs(float(values[k]) - float(wrong_value))
+                right_indices,
+                key=lambda index: abs(float(values[index]) - float(wrong_value)),
             )
         return NearestRight(
             values=row,
@@ -252,9 +248,7 @@ class Renders:
         )
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the files of images of a part, relative to the run directory, as far
-        as they were stored.
-        """
+        """Return the stored images of a part, as paths relative to the run directory."""
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
@@ -266,12 +260,10 @@ class Renders:
         ]
 
     # ---- clusters
-    # ---------------------------------------------------------------------------------------------------
+    # ------------------------------------------------------------------------------
 
     def find_clusters(self) -> FailureClusters | None:
-        """Render failures of one model's sweeps again, and cluster them by what the
-        model decides by.
-        """
+        """Render failures of one model again, and cluster them by the model's features."""
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
         if self.interrupted or not self.config.clusters or failing.empty:
@@ -306,30 +298,34 @@ class Renders:
         images = torch.cat([batch_images for batch_images, _ in batches])
         features = batches[0][1]
         clusters = find_clusters(features(images).double().numpy(), self.config.seed)
-        listed = []
-        for number, members in enumerate(clusters.members, start=1):
-            path = self.context.run.save_image(f"cluster-{number}", images[members[0]])
-            rows = picked.iloc[list(members)]
-            listed.append(
-                FailureCluster(
-                    failures=len(rows),
-                    answers=dict(Counter(rows["label"]).most_common()),
-                    values=read_values(rows, rows.index[0]),
-                    picture=str(path.relative_to(self.context.run.path)),
-                )
+        described_clusters = [
+            self._describe_cluster(
+                number, picked.iloc[list(members)], images[members[0]]
             )
+            for number, members in enumerate(clusters.members, start=1)
+        ]
         return FailureClusters(
             features=features.source,
             failures=len(picked),
             silhouette=clusters.silhouette,
             apart=clusters.apart,
-            listed=listed,
+            listed=described_clusters,
+        )
+
+    def _describe_cluster(
+        self, number: int, rows: pd.DataFrame, image: torch.Tensor
+    ) -> FailureCluster:
+        """Describe a cluster by its rows, and store its most typical image (H, W, 3)."""
+        path = self.context.run.save_image(f"cluster-{number}", image)
+        return FailureCluster(
+            failures=len(rows),
+            answers=dict(Counter(rows["label"]).most_common()),
+            values=read_values(rows, rows.index[0]),
+            picture=str(path.relative_to(self.context.run.path)),
         )
 
     def _select_sweeps(self) -> list[int]:
-        """Return the indices of the sweeps of the first model that was swept by
-        itself.
-        """
+        """Return the indices of the sweeps of the first model that was swept by itself."""
         models = next(
             (
                 sweep.config.models
@@ -347,8 +343,10 @@ class Renders:
     def render_again(
         self, sweep: workbench.StoredSweep, numbers: Sequence[int]
     ) -> tuple[torch.Tensor, Any]:
-        """Return images (n, H, W, 3) of a sweep of one model, as the model sees them,
-        and what reads its features.
+        """Render images of a sweep of one model again.
+
+        Returns:
+            The images (n, H, W, 3) as the model sees them, and what computes its features.
 
         Raises:
             InputError: the scene is no longer available, or the task is another than
@@ -362,10 +360,32 @@ class Renders:
         return torch.stack(images), features
 
 
+def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
+    """Return the number of sweeps that cover the arcs of conditions on angles."""
+    n_arcs = [
+        len(condition.arcs)
+        for condition in conditions
+        if is_drawn(config, condition.factor)
+    ]
+    return max(n_arcs, default=1) or 1
+
+
+def select_inside(
+    rows: pd.DataFrame,
+    conditions: rules.RuleConditions,
+    earlier_conditions: Sequence[rules.RuleConditions],
+) -> pd.DataFrame:
+    """Return the rows in view that a rule covers and that no earlier rule covers."""
+    is_inside = rules.find_covered(conditions, rows) & is_outside(
+        earlier_conditions, rows
+    )
+    return rows[is_inside & rules.is_in_view(rows)]
+
+
 def is_outside(
     rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFrame
 ) -> rules.Mask:
-    """Return which rows (n,) lie under none of some rules."""
+    """Return the mask (n,) of the rows that no rule covers."""
     mask = np.ones(len(rows), np.bool_)
     for conditions in rule_conditions:
         mask &= ~rules.find_covered(conditions, rows)
@@ -375,8 +395,7 @@ def is_outside(
 def find_typical_failures(
     table: pd.DataFrame, counted_rules: Sequence[rules.CountedRule], limit: int
 ) -> list[tuple[int, rules.RuleConditions]]:
-    """Return the indices of failures with the conditions of the rule that they are
-    under, the most typical first.
+    """Return the indices of failures, the most typical first, each with its rule.
 
     Rules take turns, a row belongs to the first that covers it, and what fails under
     none of them is the last to take a turn. The most typical failure of a rule is the

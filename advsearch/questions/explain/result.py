@@ -1,4 +1,4 @@
-"""The result of `explain`, and what is shown of it."""
+"""The result of `explain`, its view and its claims."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from advsearch.extend import ResultPart, RunResult, ShownResult, results, views,
 
 
 class RightOf(results.Fields):
-    """In how many of some configurations the model is right."""
+    """Counts of right predictions with an interval."""
 
     right: int = Field(description="right predictions")
     total: int = Field(alias="of", description="how many")
@@ -27,15 +27,17 @@ class RightOf(results.Fields):
 
     @property
     def text(self) -> str:
-        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a
-        detector, what the others are: ``... of 340 (250 missed, 49 loose)``.
+        """The fraction with its interval and total: ``12 % (9 to 16) of 340``.
+
+        Of a detector also the outcomes of the others: ``... of 340 (250 missed, 49
+        loose)``.
         """
         share = wording.share_of_text(self.right, self.total, self.interval, self.share)
         outcomes = wording.outcomes_text(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
 
     def extent(self, what: str) -> results.Extent:
-        """Return the count for a claim; `what` says what is counted."""
+        """Return the counts for a claim; `what` says what is counted."""
         return results.Extent.from_count(
             what, self.right, self.total, self.interval, self.share
         )
@@ -52,8 +54,9 @@ class Confirmation(RightOf):
 
 
 class RuleRow(RightOf):
-    """A rule under which the model is wrong more often than elsewhere, counted on rows
-    that did not choose it.
+    """A rule under which the model is wrong more often than elsewhere.
+
+    It is counted on rows that did not choose it.
     """
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
@@ -66,9 +69,7 @@ class RuleRow(RightOf):
 
 
 class RuleNotTold(RightOf):
-    """The best rule that is not told from chance, counted on rows that did not choose
-    it.
-    """
+    """The best rule that is not significant, counted on rows that did not choose it."""
 
     conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
@@ -83,7 +84,7 @@ class RuleNotTold(RightOf):
 
 
 class ParameterWeight(results.Fields):
-    """What one parameter, or two together, decide of the prediction."""
+    """How much one parameter, or two together, decides the prediction."""
 
     parameters: list[str]
     share: results.JsonFloat = Field(
@@ -98,7 +99,7 @@ class ParameterWeight(results.Fields):
 
 
 class EnvelopeRow(RightOf):
-    """A box inside which the model is right at least so often."""
+    """A box of values inside which the model has at least an accuracy."""
 
     conditions: list[results.ConditionRow] = Field(
         description="all of which hold; empty for everything that was looked at"
@@ -110,9 +111,7 @@ class EnvelopeRow(RightOf):
 
 
 class NearestRight(results.Fields):
-    """A failure and the nearest configuration that is right and differs in one
-    value.
-    """
+    """A failure and the nearest right configuration that differs in one value."""
 
     values: dict[str, str | float] = Field(description="of the failure")
     parameter: str = Field(description="the one that differs")
@@ -138,7 +137,7 @@ class FailureCluster(results.Fields):
 
 
 class FailureClusters(results.Fields):
-    """Failures, grouped by the numbers that the model decides by."""
+    """Failures, clustered by the features that the model decides by."""
 
     features: str = Field(description="what these are")
     failures: int = Field(description="failures that were rendered again")
@@ -152,8 +151,9 @@ class FailureClusters(results.Fields):
 
 
 class ExplainResult(RunResult, RightOf):
-    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and
-    `of` are those of all rows.
+    """Rules, importance and clusters of a model's failures, from the rows of sweeps.
+
+    `right` and `of` are those of all rows.
     """
 
     command: ClassVar[str] = "explain"
@@ -193,90 +193,97 @@ class ExplainResult(RunResult, RightOf):
         return f"{len(self.rules)} rules over {self.total} rows"
 
 
-CHOSEN = (
+RULES_NOTE = (
     "Chosen on one half of the rows and counted on the other, each beyond the rules "
-    "before it; 95 % intervals. "
-    "Chance alone would tell any rule in one of a hundred cases at most. The search of "
-    "the sweep's page takes the "
-    "words of a rule and shows the pictures under it."
+    "before it; 95 % intervals. Chance alone would tell any rule in one of a hundred "
+    "cases at most. The search of the sweep's page takes the words of a rule and shows "
+    "the pictures under it."
 )
-DECIDES = (
+IMPORTANCE_NOTE = (
     "The share of the variance of the predictions, right or wrong, that is between "
-    "parts of a parameter's values with "
-    "equally many rows: its first-order Sobol index, by parts. Two parameters stand "
-    "together where they decide "
-    "more than each by itself. What differs inside a part is not counted."
+    "parts of a parameter's values with equally many rows: its first-order Sobol "
+    "index, by parts. Two parameters stand together where they decide more than each "
+    "by itself. What differs inside a part is not counted."
 )
-MOST_WEIGHTS = 12  # Rows of it that are shown
-MOST_PREDICTIONS = 3  # Predictions of a cluster that are named
+WEIGHT_COLUMNS: Mapping[str, views.Column] = {
+    "parameters": lambda weight: " with ".join(weight.parameters),
+    "decides": lambda weight: wording.percent(weight.share),
+    "95 % interval": lambda weight: wording.interval_text(weight.interval),
+    "by parts": lambda weight: str(weight.parts or ""),
+}
+MAX_WEIGHTS = 12
+"""Rows of the table of weights that a view has."""
+MAX_LABELS = 3
+"""Predictions of a cluster that a caption names."""
 
 
 def shown(result: ExplainResult) -> ShownResult:
-    said = (
-        f"{wording.count(len(result.rules), 'rule')} under which the model is "
-        "wrong "
-        "more often than elsewhere."
-    )
-    if not result.rules:
-        said = (
-            f"No rule is told from chance in {result.total:,} rows, of which one half "
-            "chooses and the other counts: "
-            f"the model is right in {result.text}."
-        )
-    rules = [
+    """Return the view of an explanation."""
+    rule_sentences = [
         f"{number}. {rule_text(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)
     ]
-    weights: Mapping[str, views.Column] = {
-        "parameters": lambda one: " with ".join(one.parameters),
-        "decides": lambda one: wording.percent(one.share),
-        "95 % interval": lambda one: wording.interval_text(one.interval),
-        "by parts": lambda one: str(one.parts or ""),
-    }
+    note = ""
+    headline = (
+        f"No rule is told from chance in {result.total:,} rows, of which one half "
+        f"chooses and the other counts: the model is right in {result.text}."
+    )
+    if result.rules:
+        note = RULES_NOTE
+        headline = (
+            f"{wording.count(len(result.rules), 'rule')} under which the model is "
+            "wrong more often than elsewhere."
+        )
     sections = [
-        ResultPart(
-            "Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""
-        ),
+        ResultPart("Rules", [*rule_sentences, not_told_text(result)], note=note),
         ResultPart.table(
-            result.importance[:MOST_WEIGHTS],
-            weights,
+            result.importance[:MAX_WEIGHTS],
+            WEIGHT_COLUMNS,
             title="What decides",
-            note=DECIDES,
+            note=IMPORTANCE_NOTE,
         ),
         ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
     if result.pairs_sought:
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
-    for pair in result.pairs:
-        unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
-        wrong, right = (
-            at if isinstance(at, str) else f"{at:.4g}"
-            for at in (pair.wrong_at, pair.right_at)
-        )
-        text = (
-            f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: "
-            f"{pair.answered_there}."
-        )
-        captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
-        pictures = [
-            views.Picture(*captioned)
-            for captioned in zip(pair.pictures, captions, strict=False)
-        ]
-        sections.append(ResultPart(text=[text], pictures=[pictures]))
+    sections += [_pair_section(pair) for pair in result.pairs]
     if result.clusters:
-        sections.append(_kinds(result.clusters))
+        sections.append(_cluster_section(result.clusters))
     draws = f", of {result.units:,} independent draws" if result.units else ""
     facts = {
         "rows": f"right in {result.text}{draws}",
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
     }
-    return ShownResult(said, sections, facts, about=[result.object, result.model])
+    return ShownResult(headline, sections, facts, about=[result.object, result.model])
+
+
+def _pair_section(pair: NearestRight) -> ResultPart:
+    """Return the sentence and the images of a failure and the nearest right image."""
+    unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+    wrong_value = _format_value(pair.wrong_at)
+    right_value = _format_value(pair.right_at)
+    text = (
+        f"{pair.parameter} {wrong_value}{unit}: {pair.answered}; "
+        f"at {right_value}{unit}: {pair.answered_there}."
+    )
+    captions = (f"wrong: {pair.answered}", f"right: {pair.answered_there}")
+    # There are no images if they could not be stored.
+    pictures = [
+        views.Picture(file, caption)
+        for file, caption in zip(pair.pictures, captions, strict=False)
+    ]
+    return ResultPart(text=[text], pictures=[pictures])
+
+
+def _format_value(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def rule_text(number: int, rule: RuleRow) -> str:
-    """Return the rule with this number, from 1, in a sentence, with its counts and its
-    confirmation.
+    """Describe a rule with its counts and its confirmation in a sentence.
+
+    `number` counts from 1.
     """
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
     text = (
@@ -299,8 +306,9 @@ def triggering(result: ExplainResult) -> Iterator[str]:
 
 
 def not_told_text(result: ExplainResult) -> str:
-    """Return the best rule that is not told, why not, and how many rows it would take;
-    empty where there is none.
+    """Describe the best rule that is not significant, and how many rows it would take.
+
+    Empty if there is none.
     """
     rule = result.not_told
     if rule is None:
@@ -343,9 +351,7 @@ def envelope_text(result: ExplainResult) -> str:
 
 
 def pairs_text(result: ExplainResult) -> str:
-    """Return for how many failures a right configuration near was sought, and for how
-    many it was found.
-    """
+    """Describe for how many failures a nearby right configuration was found."""
     failures = result.total - result.right
     left = failures - result.pairs_sought
     others = (
@@ -358,26 +364,25 @@ def pairs_text(result: ExplainResult) -> str:
     )
 
 
-def _kinds(found: FailureClusters) -> ResultPart:
-    again = f"the {found.failures} failures that were rendered again"
-    text = f"One kind: {again} are alike by {found.features}."
-    if found.silhouette is not None:
-        shading = (
-            ""
-            if found.apart
-            else (
+def _cluster_section(clusters: FailureClusters) -> ResultPart:
+    """Return the kinds of failures, each with its most typical image."""
+    failures = f"the {clusters.failures} failures that were rendered again"
+    text = f"One kind: {failures} are alike by {clusters.features}."
+    if clusters.silhouette is not None:
+        reservation = ""
+        if not clusters.apart:
+            reservation = (
                 "; they shade into one another: groups of any cloud may be as far apart"
             )
+        text = (
+            f"{len(clusters.listed)} kinds among {failures}, by {clusters.features} "
+            f"(silhouette {clusters.silhouette:.2f}{reservation})."
         )
-        kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
-        text = f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
     pictures = []
-    for one in found.listed:
-        labels = ", ".join(
-            f"{name} {number}"
-            for name, number in [*one.answers.items()][:MOST_PREDICTIONS]
-        )
-        pictures.append(views.Picture(one.picture, f"{one.failures}: {labels}"))
+    for cluster in clusters.listed:
+        common_labels = list(cluster.answers.items())[:MAX_LABELS]
+        labels = ", ".join(f"{label} {count}" for label, count in common_labels)
+        pictures.append(views.Picture(cluster.picture, f"{cluster.failures}: {labels}"))
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
 
 
@@ -385,9 +390,9 @@ def claims(result: ExplainResult) -> Iterator[views.Claim]:
     """Yield the claims that the rules and the envelope support."""
     for number, rule in enumerate(result.rules, 1):
         counts: RightOf = rule.confirmed or rule
-        source = (
-            "fresh renders" if rule.confirmed else ("rows that did not choose the rule")
-        )
+        source = "rows that did not choose the rule"
+        if rule.confirmed:
+            source = "fresh renders"
         extent = counts.extent(f"right, of {source}")
         where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
         inside = f"{wording.share_text(extent)} {source}"

@@ -1,4 +1,4 @@
-"""Rows of several sweeps as one table."""
+"""Read the rows of several sweeps as one table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ prediction.
 
 
 def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
-    """Read the rows of some sweeps as one frame, with the index of their `sweep`.
+    """Read the rows of several sweeps as one frame, with the index of their `sweep`.
 
     The same draw is one unit (`name_draws`), and the same image, come again in a longer
     sweep of the same seed, is left out (`name_images`). Object, environment and model
@@ -31,10 +31,10 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         rows = sweep.read_rows()
         for name in OUTER:
             if name in rows:
-                given_names = rows[name].astype(object)
+                full_names = rows[name].astype(object)
             else:
-                given_names = pd.Series(getattr(sweep.summary, name), rows.index)
-            rows[name] = given_names.map(wording.figure_value)
+                full_names = pd.Series(getattr(sweep.summary, name), rows.index)
+            rows[name] = full_names.map(wording.figure_value)
         rows["draw"] = name_draws(sweep, rows)
         rows["image"] = name_images(sweep, rows)
         frames.append(rows.assign(sweep=index))
@@ -56,8 +56,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 
 
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
-    """Return a name of the draw of each row (n,) of a sweep, the same in another sweep
-    of the same draw.
+    """Return a name of the draw of each row (n,), equal in all sweeps of the same draw.
 
     What is drawn follows from the seed and the number of the draw, however many there
     are and whatever they are placed in: sweeps of one seed share their draws. Where
@@ -81,8 +80,7 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 
 
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
-    """Return a name of each row (n,) of a sweep: equal ones are the same prediction of
-    the same image.
+    """Return a name of each row (n,), equal for the same prediction of the same image.
 
     It consists of settings, number, values and model.
     """

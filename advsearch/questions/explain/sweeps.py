@@ -1,6 +1,4 @@
-"""Settings of sweeps that render what rows have shown: inside a rule, and along one
-factor from a failure.
-"""
+"""Derive settings of sweeps inside a rule, or along one factor from a failure."""
 
 from __future__ import annotations
 
@@ -14,7 +12,8 @@ import pandas as pd
 from advsearch.extend import Parameter, SweepConfig, rules, settings, wording
 from advsearch.questions.explain.rows import OUTER
 
-N_ALONG = 9  # values of a factor that are tried on the way to a right prediction
+N_ALONG = 9
+"""Values of a factor that are tried to find the nearest right prediction."""
 
 
 def sweep_inside(
@@ -25,7 +24,7 @@ def sweep_inside(
     seed: int,
     arc: int = 0,
 ) -> SweepConfig:
-    """Return the settings of a sweep most of whose configurations lie under conditions.
+    """Return the settings of a sweep whose configurations mostly lie under conditions.
 
     Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of
     a grid to the values that the rows have there; names to those that are left. The
@@ -44,15 +43,7 @@ def sweep_inside(
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
 
-    outer = {name: getattr(config, name) for name in OUTER}
-    for name in OUTER:
-        if name in values_inside and outer[name] is not None:
-            names = [
-                given
-                for value in values_inside[name]
-                for given in find_names(config, name, value)
-            ]
-            outer[name] = ",".join(names) or outer[name]
+    outer = cut_outer(config, values_inside)
     n_scenes = math.prod(
         len(settings.split_names(names)) if names else 1 for names in outer.values()
     )
@@ -80,13 +71,34 @@ def sweep_inside(
     )
 
 
+def cut_outer(
+    config: SweepConfig, values_inside: Mapping[str, Sequence[Any]]
+) -> dict[str, str | None]:
+    """Return the objects, environments and models that have rows under conditions.
+
+    Args:
+        config: settings of the sweep.
+        values_inside: values that each factor has under the conditions.
+    """
+    outer = {name: getattr(config, name) for name in OUTER}
+    for name, setting in outer.items():
+        if name not in values_inside or setting is None:
+            continue
+        names: list[str] = []
+        for value in values_inside[name]:
+            names += find_names(config, name, value)
+        outer[name] = ",".join(names) or setting
+    return outer
+
+
 def cut_controls(
     config: SweepConfig, table: pd.DataFrame, conditions: rules.RuleConditions, arc: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls of a sweep with the ranges of what is drawn cut to
-    conditions; see `sweep_inside`.
+    """Return the controls of a sweep with their sampled ranges cut to conditions.
+
+    See `sweep_inside`.
     """
-    controls = {name: dict(given) for name, given in config.controls.items()}
+    controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
         if condition.options is not None or not is_drawn(config, condition.factor):
             continue
@@ -102,9 +114,8 @@ def cut_controls(
         has_ranges = bool(declared.keys() & config.controls[instance].keys())
         if not has_ranges:
             # With a range for one parameter, the others would stay as they are.
-            for name, values in observed_ranges(
-                config, table, instance, declared
-            ).items():
+            ranges = observed_ranges(config, table, instance, declared)
+            for name, values in ranges.items():
                 controls[instance].setdefault(name, values)
         controls[instance][parameter] = [low, high]
     return controls
@@ -116,9 +127,7 @@ def observed_ranges(
     instance: str,
     declared: Mapping[str, Parameter],
 ) -> dict[str, Any]:
-    """Return the ranges that rows have of the parameters of a control that are
-    drawn.
-    """
+    """Return the ranges that the rows have of the sampled parameters of a control."""
     ranges: dict[str, Any] = {}
     for name, parameter in declared.items():
         column = table.get(f"{instance}.{name}")
@@ -138,8 +147,9 @@ def sweep_along(
     table: pd.DataFrame,
     seed: int,
 ) -> SweepConfig:
-    """Return the settings of a sweep along one factor, everything else as in a row; the
-    row's own value comes first.
+    """Return the settings of a sweep along one factor, everything else as in a row.
+
+    The row's own value comes first.
     """
     column = table[factor]
     if column.dtype == "category":
@@ -186,31 +196,28 @@ def sweep_along(
 def keep_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls of a sweep whose choices matter though a grid sets all of
-    their parameters.
-    """
+    """Return the controls whose choices matter though a grid sets all of their parameters."""
     controls = {}
-    for instance, given in config.controls.items():
+    for instance, options in config.controls.items():
         control_type = config.find_control_type(instance)
         if control_type is None:
             continue
-        choices = {choice.name for choice in control_type.choices} & given.keys()
+        choices = {choice.name for choice in control_type.choices} & options.keys()
         parameters = [
-            f"{instance}.{parameter.name}" for parameter in control_type.declared(given)
+            f"{instance}.{parameter.name}"
+            for parameter in control_type.declared(options)
         ]
         if choices and all(name in grid for name in parameters):
             controls[instance] = {
                 name: value
-                for name, value in given.items()
+                for name, value in options.items()
                 if name in {*choices, "kind"}
             }
     return controls
 
 
 def is_drawn(config: SweepConfig, factor: str) -> bool:
-    """Return whether a sweep draws a parameter by chance, from a range that it can be
-    given.
-    """
+    """Return whether a sweep samples a parameter from a range that can be set."""
     instance, dot, parameter = factor.partition(".")
     is_frame = bool(config.path) and parameter == "time"
     if not dot or is_frame or factor in config.grid or instance not in config.controls:
@@ -219,31 +226,22 @@ def is_drawn(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a sweep takes a value of its rows; others follow from those, as
-    `path.distance` from the time.
-    """
+    """Return whether a value of a row can be set; others follow, as `path.distance` does."""
     instance, dot, parameter = name.partition(".")
     declared = config.declared_parameters(instance)
     return not dot or declared is None or parameter in declared
 
 
 def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
-    """Return the names that a sweep was given and that its rows write as a value; else
-    the first one.
-    """
-    given = (
-        settings.split_names(getattr(config, setting))
-        if getattr(config, setting)
-        else ()
-    )
-    matching = [name for name in given if value in (name, wording.figure_value(name))]
-    return matching or list(given[:1])
+    """Return the names in a setting that rows write as `value`; else the first name."""
+    setting_value = getattr(config, setting)
+    names = settings.split_names(setting_value) if setting_value else ()
+    matching = [name for name in names if value in (name, wording.figure_value(name))]
+    return matching or list(names[:1])
 
 
 def make_quiet(config: SweepConfig, **changes: object) -> SweepConfig:
-    """Return the settings of a sweep with changes that renders its images and nothing
-    else.
-    """
+    """Return changed settings of a sweep that only renders and predicts."""
     quiet = {
         "trials": 0,
         "verify_spp": None,

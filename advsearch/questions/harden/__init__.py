@@ -1,6 +1,4 @@
-"""Train a copy of a model on its worst cases, and measure it before and after on scenes
-that training never saw.
-"""
+"""Train a copy of a model on its worst cases, and measure both on held-out scenes."""
 
 from __future__ import annotations
 
@@ -15,14 +13,13 @@ from advsearch.questions.harden.result import HardenConfig, HardenResult, claims
     "harden --model mypackage:network@weights.safetensors --labels labels.json "
     "--control texture,pose,light",
     positional_args=("model",),
-    python_arguments="advsearch.questions.harden.carry_out:hardened",
+    python_arguments="advsearch.questions.harden.carry_out:run_hardening",
     resumes_in_python=True,
     view=shown,
     claims=claims,
 )
-def harden(asked: RunContext[HardenConfig], **given: Any) -> HardenResult:
-    """Train a copy of a model on its worst cases, and prove what it is better at
-    (docs/harden.md).
+def harden(context: RunContext[HardenConfig], **arguments: Any) -> HardenResult:
+    """Train a copy of a model on its worst cases (docs/harden.md).
 
     All other arguments are the settings of `advsearch harden`. The run is kept, in
     `run` or under runs/. The model that is given stays as it is.
@@ -46,6 +43,6 @@ def harden(asked: RunContext[HardenConfig], **given: Any) -> HardenResult:
         resume: go on with the run of that name, if there is one, where it was stopped;
             everything else has to be as it was.
     """
-    from advsearch.questions.harden.carry_out import hardened  # imports torch
+    from advsearch.questions.harden.carry_out import run_hardening  # imports torch
 
-    return hardened(asked, **given)
+    return run_hardening(context, **arguments)

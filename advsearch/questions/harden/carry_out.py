@@ -1,20 +1,19 @@
-"""`harden`: trains a copy of a model on its worst cases, and measures both on what
-training never saw.
-"""
+"""Train a copy of a model on its worst cases, and measure both on held-out scenes."""
 
 from __future__ import annotations
 
 import gc
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from itertools import chain, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from advsearch.extend import (
     InputError,
+    Model,
     RunContext,
     RunDirectory,
     errors,
@@ -50,16 +49,18 @@ from advsearch.questions.harden.scenes import (
 )
 from advsearch.questions.harden.training import ClassifierCourse, Examples
 
-MEANS = "means"  # the note of what a training has from Python
+ARGUMENTS_NOTE = "means"
+"""Note of a run: which arguments that only Python can pass it has."""
 MEASUREMENTS = {
     "before": ("attacking the model as it is", None),
     "stronger_before": ("attacking it with a stronger search", "before"),
     "after": ("attacking the hardened model", None),
     "stronger": ("attacking it with a stronger search", "after"),
 }
-"""What is measured over each control, by its name in the table: what the progress says,
-and of the stronger search that of the usual one. What that has found is not sought any
-harder.
+"""Measurements by their name in the table, each with its title in the progress.
+
+A stronger search also names the usual one: where that has found a wrong prediction,
+the stronger one is not run.
 """
 
 COURSES: Mapping[str, Callable[..., Course]] = {
@@ -69,8 +70,8 @@ COURSES: Mapping[str, Callable[..., Course]] = {
 }
 
 
-def hardened(
-    asked: RunContext[HardenConfig],
+def run_hardening(
+    context: RunContext[HardenConfig],
     *,
     model: Any = None,
     optimiser: MakeOptimiser | None = None,
@@ -80,73 +81,121 @@ def hardened(
     """Harden a model as the settings say, or continue a run that was stopped.
 
     Args:
-        asked: the settings and the run.
+        context: the settings and the run.
         model: a loaded one in place of the one that the settings name.
         optimiser, beside, loss: as for `advsearch.harden`.
     """
-    config = asked.config
-    asked.progress.stage(workbench.LOADING)
+    config = context.config
+    context.progress.stage(workbench.LOADING)
     workbench.check_run_settings(config)
-    kind = config.task_name
-    classifies = config.task_name == "classification"
-    refused = {
-        "task: harden trains for classification, detection and segmentation; `data` is "
-        "of detection, and `loss` of "
-        "both of the others": kind not in COURSES
-        or (classifies and (config.data or loss)),
-        "data: is of detection; leave it out": kind == "segmentation" and config.data,
-        "beside: is of classifiers; give a detector a COCO folder as `data`": not classifies
-        and beside is not None,
-        "layers: expected all of a detector or a segmenter; leave it out": not classifies
-        and config.layers != "all",
-    }
-    for text, wrong in refused.items():
-        if wrong:
-            raise InputError(text)
+    check_settings(config, beside, loss)
+    loaded, warnings = load_task_model(config, model)
+    splits = scenes.splits_of(config, loaded)
+    work = SceneWork(config, loaded, splits, context.progress)
+
+    is_classifier = config.task_name == "classification"
+    student = trainable(loaded, config.layers, logits=is_classifier)
+    python_arguments: dict[str, Any] = {"loss": loss}
+    if is_classifier:
+        python_arguments = {"beside": beside}
+    course_arguments = dict(python_arguments)
+    if config.data:
+        course_arguments["custom_items"] = read_coco(Path(config.data), loaded)
+    course = COURSES[config.task_name](work, student, optimiser, **course_arguments)
+    check_same_arguments(context.run, {"optimiser": optimiser, **python_arguments})
+    workbench.check_made_of(context.run, [loaded])
+
+    hardening = Hardening(context.run, course)
+    worker = "advsearch.questions.harden.scenes:load_scene_work"
+    with context.until_interrupted():
+        with workbench.executor_for(config, worker, context.progress) as work.executor:
+            hardening.carry_out(context)
+    return hardening.result(context, warnings)
+
+
+def check_settings(
+    config: HardenConfig, beside: Examples | None, loss: Loss | None
+) -> None:
+    """Check that settings and Python arguments belong to the task.
+
+    Raises:
+        InputError: one of them does not.
+    """
+    task_name = config.task_name
+    is_classifier = task_name == "classification"
+    uses_data_or_loss = bool(config.data or loss)
+    if task_name not in COURSES or (is_classifier and uses_data_or_loss):
+        raise InputError(
+            "task: harden trains for classification, detection and segmentation; "
+            "`data` is of detection, and `loss` of both of the others"
+        )
+    if task_name == "segmentation" and config.data:
+        raise InputError("data: is of detection; leave it out")
+    if not is_classifier and beside is not None:
+        raise InputError(
+            "beside: is of classifiers; give a detector a COCO folder as `data`"
+        )
+    if not is_classifier and config.layers != "all":
+        raise InputError(
+            "layers: expected all of a detector or a segmenter; leave it out"
+        )
+
+
+def load_task_model(config: HardenConfig, model: Any = None) -> tuple[Model, list[str]]:
+    """Load the model that is hardened, and return it with warnings.
+
+    Raises:
+        ModelError: it cannot be loaded, or is no model for the task.
+    """
     try:
         task = workbench.make_task(config.task)
         (loaded, *_), warnings = workbench.load_models(
             [model or config.model], task, config
         )
     except errors.ModelError as error:
-        if not classifies:
+        if config.task_name != "classification":
             raise
         text = str(error).partition(": use `task=")[0]
         raise errors.ModelError(
             f"{text}; harden trains classifiers, and with `task` detectors and "
             "segmenters"
         ) from error
-    work = SceneWork(config, loaded, scenes.splits_of(config, loaded), asked.progress)
-    student = trainable(loaded, config.layers, logits=classifies)
-    given: dict[str, Any] = {"beside": beside} if classifies else {"loss": loss}
-    more = {"own": read_coco(Path(config.data), loaded)} if config.data else {}
-    course = COURSES[kind](work, student, optimiser, **given, **more)
-    means = {
-        name: value is not None
-        for name, value in {"optimiser": optimiser, **given}.items()
-    }
-    before = json.loads(asked.run.store.note(MEANS) or "{}")
-    asked.run.store.set_note(MEANS, json.dumps({**means, **before}))
-    for name, was in before.items():
-        if was != means[name]:
+    return loaded, warnings
+
+
+def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> None:
+    """Check that a resumed run gets the same Python arguments, and note them.
+
+    Args:
+        run: the run.
+        arguments: by name; None for those that were not passed.
+
+    Raises:
+        InputError: the run began with others.
+    """
+    is_passed = {name: value is not None for name, value in arguments.items()}
+    was_passed = json.loads(run.store.note(ARGUMENTS_NOTE) or "{}")
+    run.store.set_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
+    for name, passed_before in was_passed.items():
+        if passed_before != is_passed[name]:
+            preposition = "with" if passed_before else "without"
             raise InputError(
-                f"{asked.run.path}: cannot resume: it began "
-                f"{'with' if was else 'without'} `{name}`, which only Python "
-                "gives; resume it with advsearch.harden(..., run=..., resume=True) and "
-                "the same arguments"
+                f"{run.path}: cannot resume: it began {preposition} `{name}`, which "
+                "only Python gives; resume it with advsearch.harden(..., run=..., "
+                "resume=True) and the same arguments"
             )
-    workbench.check_made_of(asked.run, [loaded])
-    run = Hardening(asked.run, course)
-    worker = "advsearch.questions.harden.scenes:scenes_of"
-    with asked.until_interrupted():
-        with workbench.executor_for(config, worker, asked.progress) as work.executor:
-            run.carry_out(asked)
-    return run.result(asked, warnings)
 
 
 class Hardening:
-    """One run: `wrong` by measurement and number of a scene, `clean` for each plain
-    picture whether it is right.
+    """A run that measures a model, trains it, and measures it again.
+
+    Attributes:
+        wrong: whether a search found a wrong prediction, by the kind of the row, which
+            is a measurement and a control, and the number of the scene.
+        clean: whether each plain image of a held-out scene is right, "before" and
+            "after".
+        outcomes: counts of what becomes of the object in the others, likewise.
+        counts: number of scenes by split.
     """
 
     def __init__(self, run: RunDirectory, course: Course) -> None:
@@ -160,179 +209,231 @@ class Hardening:
         }
         self.clean: Mapping[str, list[bool]] = {}
         self.outcomes: Mapping[str, dict[str, int]] = {}
-        searched = self.config.scenes * self.config.rounds
-        held_out = scenes.CLEAN_SCENES * self.config.measured
+        n_training = self.config.scenes * self.config.rounds
         self.counts = {
-            TRAINING: searched, FURTHER: course.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held_out
-        }  # fmt: skip
+            TRAINING: n_training,
+            FURTHER: course.further * n_training,
+            VALIDATION: self.rounds.judged,
+            HELD_OUT: scenes.CLEAN_SCENES * self.config.measured,
+        }
 
-    def carry_out(self, asked: RunContext[HardenConfig]) -> None:
-        """Measure the model, train it, and measure it again; what is done is not done
-        again.
+    def carry_out(self, context: RunContext[HardenConfig]) -> None:
+        """Measure the model, train it, and measure it again.
+
+        Whatever an earlier session of the run has done is not done again.
         """
-        stages = asked.stages
-        sides = self.scenes.splits
+        stages = context.stages
+        splits = self.scenes.splits
         weights = b""
         scenes.check_disjoint(
-            sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)]
+            splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
         )
-        gc.freeze()  # as of `scenes_of`
+        gc.freeze()  # for the same reason as in `load_scene_work`
         try:
-            for which in MEASUREMENTS:
-                if which == "after":
+            for measurement in MEASUREMENTS:
+                if measurement == "after":
                     stages.begin("training", "training")
                     self.rounds.carry_out()
                     weights = (self.run.path / WEIGHTS).read_bytes()
-                if "stronger" not in which:
-                    stages.begin("measurement", MEASUREMENTS[which][0])
-                self._measure(which, weights or None)
-            looks = [
-                partial(SceneWork.looked_at, number=number, weights=weights)
-                for number in range(self.counts[HELD_OUT])
-            ]
-            right = [
-                both
-                for _, both in self.scenes.each(
-                    "looking at plain pictures of held-out scenes", looks
-                )
-            ]
-            self.clean = {
-                when: [flag for both in right for flag in both[when]]
-                for when in ("before", "after")
-            }
-            self.outcomes = {
-                when: dict(
-                    Counter(
-                        outcome
-                        for both in right
-                        for outcome in both.get(f"outcomes {when}", ())
-                    )
-                )
-                for when in ("before", "after")
-            }
+                if "stronger" not in measurement:
+                    stages.begin("measurement", MEASUREMENTS[measurement][0])
+                self._measure(measurement, weights or None)
+            self._evaluate_plain_images(weights)
         finally:
             stages.end()
             gc.unfreeze()
 
-    def _measure(self, which: str, weights: bytes | None) -> None:
-        """Attack the model, as given or with other weights, on the held-out scenes
-        where that is not measured yet.
+    def _evaluate_plain_images(self, weights: bytes) -> None:
+        """Evaluate both models on plain images of the held-out scenes."""
+        jobs = [
+            partial(SceneWork.looked_at, number=number, weights=weights)
+            for number in range(self.counts[HELD_OUT])
+        ]
+        title = "looking at plain pictures of held-out scenes"
+        evaluations = [value for _, value in self.scenes.each(title, jobs)]
+        clean = {}
+        outcomes = {}
+        for when in ("before", "after"):
+            clean[when] = [
+                is_right for evaluation in evaluations for is_right in evaluation[when]
+            ]
+            outcome_counts = Counter[str]()
+            for evaluation in evaluations:
+                outcome_counts.update(evaluation.get(f"outcomes {when}", ()))
+            outcomes[when] = dict(outcome_counts)
+        self.clean = clean
+        self.outcomes = outcomes
+
+    def _measure(self, measurement: str, weights: bytes | None) -> None:
+        """Attack the model on the held-out scenes that are not measured yet.
+
+        Args:
+            measurement: a key of `MEASUREMENTS`.
+            weights: safetensors; None for those that the model was loaded with.
         """
-        title, usual = MEASUREMENTS[which]
+        title, usual = MEASUREMENTS[measurement]
         keys = [
             (control, number)
             for number, control in product(
                 range(self.config.measured), self.config.controls
             )
-            if (f"{which} {control}", number) not in self.wrong
+            if (f"{measurement} {control}", number) not in self.wrong
         ]
-        known = [
-            key for key in keys if usual and self.wrong[f"{usual} {key[0]}", key[1]]
+        # What the usual search has found is not searched again by the stronger one.
+        found = [
+            (control, number)
+            for control, number in keys
+            if usual and self.wrong[f"{usual} {control}", number]
         ]
-        sought = [key for key in keys if key not in known]
-        times = scenes.TIMES if usual else 1
-        attack = partial(SceneWork.attacked, times=times, weights=weights)
-        attacks = [
-            partial(attack, control=control, number=number)
-            for control, number in sought
-        ]
-        endings = self.scenes.each(
-            title, attacks, hint="`measured` and `steps` shorten it"
-        )
-        done = ((sought[place], ending != ROBUST) for place, ending in endings)
-        for (control, number), wrong in chain(((key, True) for key in known), done):
-            self.wrong[f"{which} {control}", number] = wrong
-            seed = seeds.stream(self.config.seed, f"measured {control}", number)
-            self.run.record_row(
-                f"{which} {control}",
-                number,
-                seed=seed,
-                spp=self.config.verify_spp,
-                success=wrong,
-            )
+        to_attack = [key for key in keys if key not in found]
+        for control, number in found:
+            self._record(measurement, control, number, True)
 
-    def _robust(self, which: str, controls: Iterable[str]) -> list[bool] | None:
-        """Whether each scene is robust to the searches over all of some controls; None
-        where some are not known.
-        """
-        numbers = range(self.config.measured)
-        wrong = [
-            [self.wrong.get((f"{which} {control}", number)) for control in controls]
-            for number in numbers
+        times = scenes.TIMES if usual else 1
+        jobs = [
+            partial(
+                SceneWork.attacked,
+                times=times,
+                weights=weights,
+                control=control,
+                number=number,
+            )
+            for control, number in to_attack
         ]
-        return (
-            None
-            if any(None in each for each in wrong)
-            else [not any(each) for each in wrong]
+        hint = "`measured` and `steps` shorten it"
+        for index, status in self.scenes.each(title, jobs, hint=hint):
+            control, number = to_attack[index]
+            self._record(measurement, control, number, status != ROBUST)
+
+    def _record(
+        self, measurement: str, control: str, number: int, is_wrong: bool
+    ) -> None:
+        """Store whether an attack found a wrong prediction in a scene."""
+        kind = f"{measurement} {control}"
+        self.wrong[kind, number] = is_wrong
+        self.run.record_row(
+            kind,
+            number,
+            seed=seeds.stream(self.config.seed, f"measured {control}", number),
+            spp=self.config.verify_spp,
+            success=is_wrong,
         )
+
+    def _robust(self, measurement: str, controls: Collection[str]) -> list[bool] | None:
+        """Return whether each scene withstood the searches over all of some controls.
+
+        None if some are not measured yet.
+        """
+        is_robust = []
+        for number in range(self.config.measured):
+            is_wrong = [
+                self.wrong.get((f"{measurement} {control}", number))
+                for control in controls
+            ]
+            if None in is_wrong:
+                return None
+            is_robust.append(not any(is_wrong))
+        return is_robust
 
     def result(
-        self, asked: RunContext[HardenConfig], warnings: list[str]
+        self, context: RunContext[HardenConfig], warnings: list[str]
     ) -> HardenResult:
+        """Return the result of the run, as far as it is measured."""
         config = self.config
-        done = asked.ending == "done"
-        table = list[HardenedControl]()
-        for control in config.controls:
-            shares = {
-                which: _share(self._robust(which, [control])) for which in MEASUREMENTS
-            }
-            if None not in shares.values():
-                table.append(HardenedControl.of({"control": control, **shares}))
-        before, after = (
-            self._robust(which, config.controls) for which in ("before", "after")
-        )
-        paired: dict[str, Any] = {}
-        if before is not None and after is not None:
-            pairs = list(zip(before, after, strict=True))
-            gained = pairs.count((False, True))
-            lost = pairs.count((True, False))
-            paired = {
-                "gained": gained,
-                "lost": lost,
-                "p": statistics.paired.mcnemar(gained, lost),
-            }
-        if done and self.rounds.best == 0:
-            warnings = [
-                *warnings,
-                "No round kept the clean accuracy, so the weights are the model's own.",
-            ]
-        path = self.run.path
-        taught = self.scenes.splits[TRAINING]
-        views = dict(
-            zip(
-                self.counts,
-                (self.course.views[0], 1, self.course.views[1], scenes.CLEAN_VIEWS),
-                strict=True,
+        is_done = context.ending == "done"
+        if is_done and self.rounds.best == 0:
+            text = (
+                "No round kept the clean accuracy, so the weights are the model's own."
             )
-        )
-        name = config.model.partition("@")[0].strip()
-        facts = self.scenes.executor and self.scenes.executor.facts
-        split = {
-            side: SplitSide.of(
-                {**vars(each), "scenes": self.counts[side], "views": views[side]}
-            )
-            for side, each in self.scenes.splits.items()
-        }
+            warnings = [*warnings, text]
+        before = self._robust("before", config.controls)
+        after = self._robust("after", config.controls)
         rounds = [
-            each.model_copy(update={"kept": done and number == self.rounds.best})
-            for number, each in enumerate(self.rounds.done)
+            training_round.model_copy(
+                update={"kept": is_done and number == self.rounds.best}
+            )
+            for number, training_round in enumerate(self.rounds.done)
         ]
-        return asked.result(
-            HardenResult, **paired, environment=",".join(taught.environments), objects=list(taught.objects),
-            before=_share(before), after=_share(after),
-            clean_before=_share(self.clean.get("before"), scenes.CLEAN_VIEWS, self.outcomes.get("before")),
-            clean_after=_share(self.clean.get("after"), scenes.CLEAN_VIEWS, self.outcomes.get("after")),
-            table=table, split=split, rounds=rounds,
+        training_split = self.scenes.splits[TRAINING]
+        facts = self.scenes.executor and self.scenes.executor.facts
+        weights_path = self.run.path / WEIGHTS
+        return context.result(
+            HardenResult,
+            **_compare_robustness(before, after),
+            environment=",".join(training_split.environments),
+            objects=list(training_split.objects),
+            before=_share(before),
+            after=_share(after),
+            clean_before=self._clean_share("before"),
+            clean_after=self._clean_share("after"),
+            table=self._control_rows(),
+            split=self._split_rows(),
+            rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search="portfolio of pgd with restarts, cmaes and random, "
-                            f"{scenes.TIMES * config.steps} steps",
-            # a name with a colon is of code that makes it
-            hardened=f"{name}@{path / WEIGHTS}" if done and (name == "reference" or ":" in name) else None,
-            weights=str(path / WEIGHTS) if done else None,
-            pictures=str(path / PICTURES) if done else None,
-            shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}), warnings=warnings,
-            seconds=asked.stages.seconds,
-        )  # fmt: skip
+            f"{scenes.TIMES * config.steps} steps",
+            hardened=self._hardened_name() if is_done else None,
+            weights=str(weights_path) if is_done else None,
+            pictures=str(self.run.path / PICTURES) if is_done else None,
+            shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}),
+            warnings=warnings,
+            seconds=context.stages.seconds,
+        )
+
+    def _clean_share(self, when: str) -> Share | None:
+        return _share(self.clean.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when))
+
+    def _control_rows(self) -> list[HardenedControl]:
+        """Return the robustness to each control that is measured."""
+        rows = []
+        for control in self.config.controls:
+            shares = {
+                measurement: _share(self._robust(measurement, [control]))
+                for measurement in MEASUREMENTS
+            }
+            if None not in shares.values():
+                rows.append(HardenedControl.of({"control": control, **shares}))
+        return rows
+
+    def _split_rows(self) -> dict[str, SplitSide]:
+        """Describe the parts of the split."""
+        training_views, validation_views = self.course.views
+        n_views = {
+            TRAINING: training_views,
+            FURTHER: 1,
+            VALIDATION: validation_views,
+            HELD_OUT: scenes.CLEAN_VIEWS,
+        }
+        return {
+            name: SplitSide.of(
+                {**vars(split), "scenes": self.counts[name], "views": n_views[name]}
+            )
+            for name, split in self.scenes.splits.items()
+        }
+
+    def _hardened_name(self) -> str | None:
+        """Return the name that loads the hardened model; None if no name can."""
+        name = self.config.model.partition("@")[0].strip()
+        # A name with a colon is of code that makes the model.
+        if name == "reference" or ":" in name:
+            return f"{name}@{self.run.path / WEIGHTS}"
+        return None
+
+
+def _compare_robustness(
+    before: Sequence[bool] | None, after: Sequence[bool] | None
+) -> dict[str, Any]:
+    """Return the fields of the paired comparison; empty if it is not measured."""
+    if before is None or after is None:
+        return {}
+    pairs = list(zip(before, after, strict=True))
+    gained = pairs.count((False, True))
+    lost = pairs.count((True, False))
+    return {
+        "gained": gained,
+        "lost": lost,
+        "p": statistics.paired.mcnemar(gained, lost),
+    }
 
 
 def _share(
@@ -340,24 +441,24 @@ def _share(
     views: int = 1,
     outcomes: Mapping[str, int] | None = None,
 ) -> Share | None:
-    """Return the share of pictures that are right, so many `views` of each scene, one
-    after the other, with its interval over scenes: views of one scene are not
-    independent.
+    """Return the fraction of right images with its interval over scenes.
+
+    Args:
+        right: whether each image is right (scenes * views), all views of a scene after
+            each other; None if they are not measured.
+        views: images of each scene, which are not independent.
+        outcomes: counts of what becomes of the object in the others.
     """
     if right is None:
         return None
     right_views = [
-        sum(right[first : first + views]) for first in range(0, len(right), views)
+        sum(right[start : start + views]) for start in range(0, len(right), views)
     ]
-    interval = statistics.clustered.share_interval(
-        right_views, [views] * len(right_views)
-    )
-    accuracy = sum(right) / len(right)
-    counts = dict(outcomes or {}) or None
+    n_views = [views] * len(right_views)
     return Share(
-        accuracy=accuracy,
-        interval=interval,
+        accuracy=sum(right) / len(right),
+        interval=statistics.clustered.share_interval(right_views, n_views),
         right=sum(right),
         count=len(right),
-        outcomes=counts,
+        outcomes=dict(outcomes or {}) or None,
     )

@@ -1,6 +1,6 @@
-"""How a detector is hardened: it is trained on pictures that searches got wrong, with
-what is true in them, beside the same scenes as they are and pictures of one's own.
-Losses are the network's, or a function of the caller's.
+"""Train detectors and segmenters on adversarial, plain and custom images.
+
+The loss is the network's own, or a function of the caller's.
 """
 
 from __future__ import annotations
@@ -46,41 +46,50 @@ Loss = Callable[[nn.Module, Tensor, Sequence[Target]], Tensor]
 training makes smaller.
 """
 
-SPP = 8  # samples a pixel of a picture
-TRIALS = 6  # of a search
-SIDES = 3  # from which a scene is seen as it is
-# how often an epoch looks at a picture that a search made, for each look at one as it
-# is
-SEEN = 5
-LARGEST = 256 << 20  # bytes of a COCO file, and pixels along a picture of it
-LARGEST_SIDE = 8192
+SPP = 8
+"""Samples per pixel."""
+TRIALS = 6
+"""Of a search."""
+N_VIEWS = 3
+"""Views of a plain scene."""
+WORST_LOOKS = 5
+"""How often an epoch uses an adversarial image, relative to a plain one."""
+MAX_BYTES = 256 << 20
+"""Size of a COCO file."""
+MAX_SIZE = 8192
+"""Width and height of an image of a COCO file, in pixels."""
 
 
 class Example(NamedTuple):
-    """A picture (H, W, 3) uint8, all that is in it, boxes (K, 4) in its pixels and
-    their classes (K,), and whether a search has found it. What is not of one's own has
-    the place of the thing in it, with the task that judges it.
+    """An image with its ground truth.
+
+    Attributes:
+        levels: the image (H, W, 3) uint8.
+        boxes: (K, 4), x0, y0, x1, y1 in pixels.
+        labels: classes of the boxes (K,).
+        task: evaluates predictions of a rendered image; None for a custom image.
+        truth: ground truth for the task: a `Place` of detection, or a `Region` of
+            segmentation.
+        found: whether a search has found it.
     """
 
     levels: Tensor
     boxes: Tensor
     labels: Tensor
     task: Task | None = None
-    truth: Any = None  # a `Place` of detection, or a `Region` of segmentation
+    truth: Any = None
     found: bool = False
 
     @classmethod
     def of(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
-        """Render a configuration, or the scene as it is, with the conditions that a
-        seed draws.
-        """
-        at = problem.domain.start if u is None else u
-        truth: Any = problem.truth(problem.whole(at, seed))
+        """Render a configuration, or the plain scene, under conditions of a seed."""
+        configuration = problem.domain.start if u is None else u
+        truth: Any = problem.truth(problem.whole(configuration, seed))
         box = getattr(truth, "box", None)
         boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
-            color.levels_of(problem.picture(at, seed, SPP)),
+            color.levels_of(problem.picture(configuration, seed, SPP)),
             boxes,
             labels,
             problem.task,
@@ -89,63 +98,63 @@ class Example(NamedTuple):
         )
 
     def right(self, model: Model) -> bool:
+        """Return whether a model is right about a rendered image."""
         assert self.task is not None
         with torch.no_grad():
-            return bool(
-                self.task.loss(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0
-            )
+            output = model(self.levels[None] / 255.0)
+            return bool(self.task.loss(output, self.truth)[0] <= 0.0)
 
 
 def read_coco(folder: Path, model: Model) -> list[Example]:
-    """Return the pictures of a folder as `export --format coco` writes it:
-    `annotations.json` and `images/`. Categories are found among the model's labels by
-    their names; what is called otherwise is left out. A FileFormatError where it is
-    something else, or names files outside of it; an InputError where no category is one
-    of the labels.
+    """Read the images of a directory that `export --format coco` has written.
+
+    It has `annotations.json` and `images/`. Categories that are no label of the model
+    are left out.
+
+    Raises:
+        FileFormatError: it is something else, or names files outside of it.
+        InputError: no category is a label of the model.
     """
     path = folder / "annotations.json"
-    inside = (folder / "images").resolve()
+    image_directory = (folder / "images").resolve()
     try:
         coco: Any = stored_files.parse_json(
-            stored_files.read_text(path, "a COCO file", LARGEST)
+            stored_files.read_text(path, "a COCO file", MAX_BYTES)
         )
-        known = [
-            kind for kind in coco["categories"] if str(kind["name"]) in model.labels
-        ]
-        indices = {kind["id"]: model.labels.index(str(kind["name"])) for kind in known}
-        things = defaultdict[Any, list[Any]](list)
-        for thing in coco["annotations"]:
-            if thing["category_id"] in indices and not thing.get("iscrowd"):
-                things[thing["image_id"]].append(thing)
-        if not indices:
+        label_of_category = {
+            category["id"]: model.labels.index(str(category["name"]))
+            for category in coco["categories"]
+            if str(category["name"]) in model.labels
+        }
+        annotations_of_image = defaultdict[Any, list[Any]](list)
+        for annotation in coco["annotations"]:
+            is_known = annotation["category_id"] in label_of_category
+            if is_known and not annotation.get("iscrowd"):
+                annotations_of_image[annotation["image_id"]].append(annotation)
+        if not label_of_category:
             raise InputError(
                 f"data: {path}: none of its categories is a label of model {model.name}"
             )
         examples = []
         for image in coco["images"]:
-            name = Path(str(image["file_name"]))
-            file = inside / name
-            if (
-                name.is_absolute()
-                or ".." in name.parts
-                or file.is_symlink()
-                or inside not in file.resolve().parents
-            ):
-                raise errors.FileFormatError(
-                    f"{path}: expected names of files in images/, got {str(name)[:100]}"
-                )
-            picture = torch.from_numpy(workbench.upright(file, LARGEST_SIDE))
-            if picture.shape[:2] != (image["height"], image["width"]):
-                raise ValueError(f"{name} of another size than it says")
-            here = things[image["id"]]
+            file = _locate_image(image_directory, str(image["file_name"]), path)
+            pixels = torch.from_numpy(workbench.upright(file, MAX_SIZE))
+            if pixels.shape[:2] != (image["height"], image["width"]):
+                raise ValueError(f"{image['file_name']} of another size than it says")
+            annotations = annotations_of_image[image["id"]]
             boxes = torch.tensor(
-                [thing["bbox"] for thing in here], dtype=torch.float32
+                [annotation["bbox"] for annotation in annotations], dtype=torch.float32
             ).reshape(-1, 4)
+            # COCO has the width and the height of a box.
             boxes[:, 2:] += boxes[:, :2]
             labels = torch.tensor(
-                [indices[thing["category_id"]] for thing in here], dtype=torch.int64
+                [
+                    label_of_category[annotation["category_id"]]
+                    for annotation in annotations
+                ],
+                dtype=torch.int64,
             )
-            examples.append(Example(color.levels_of(picture), boxes, labels))
+            examples.append(Example(color.levels_of(pixels), boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
@@ -153,25 +162,47 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
         ) from None
 
 
+def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
+    """Return the path of an image of a COCO file.
+
+    Raises:
+        FileFormatError: it is outside of the directory.
+    """
+    relative_path = Path(name)
+    file = directory / relative_path
+    if (
+        relative_path.is_absolute()
+        or ".." in relative_path.parts
+        or file.is_symlink()
+        or directory not in file.resolve().parents
+    ):
+        raise errors.FileFormatError(
+            f"{coco_file}: expected names of files in images/, got "
+            f"{str(relative_path)[:100]}"
+        )
+    return file
+
+
 def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
-    """Return the loss that a network gives in training: torchvision's of lists of
-    pictures and targets, transformers' of `labels`, and any network's whose `forward`
-    takes targets after its input; the sum of several. A ModelError where it gives none.
+    """Return the loss that a network computes itself in training.
+
+    Networks of torchvision take lists of images and targets, those of transformers take
+    `labels`; any other network's `forward` takes targets after its input. A mapping of
+    losses is summed.
+
+    Args:
+        network: in training mode.
+        x: the network's input.
+        targets: the ground truth of each image.
+
+    Raises:
+        ModelError: the network returns no loss.
     """
     inner: Any = getattr(network, "network", network)
     returned: Any = None
     if hasattr(inner, "config"):
-        sides = x.new_tensor([x.shape[-1], x.shape[-2]] * 2)
-        named = []
-        for target in targets:
-            low, high = (target["boxes"] / sides).split(2, dim=1)
-            named.append(
-                {
-                    "class_labels": target["labels"],
-                    "boxes": torch.cat([(low + high) / 2, high - low], dim=1),
-                }
-            )
-        returned = inner(pixel_values=x, labels=named).loss
+        labels = _transformers_labels(x, targets)
+        returned = inner(pixel_values=x, labels=labels).loss
     elif inner is not network:
         returned = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
@@ -188,86 +219,122 @@ def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor
     return returned.sum()
 
 
+def _transformers_labels(
+    x: Tensor, targets: Sequence[Target]
+) -> list[dict[str, Tensor]]:
+    """Return targets as transformers' detectors take them.
+
+    Boxes have a center and a size, as fractions of the input's size.
+    """
+    size = x.new_tensor([x.shape[-1], x.shape[-2]] * 2)
+    labels = []
+    for target in targets:
+        lower, upper = (target["boxes"] / size).split(2, dim=1)
+        boxes = torch.cat([(lower + upper) / 2, upper - lower], dim=1)
+        labels.append({"class_labels": target["labels"], "boxes": boxes})
+    return labels
+
+
 class DetectorCourse(Course):
-    """Trains on the worst pictures that searches find for the student as it is, on the
-    same scenes as they are, from other sides too, and on one's own examples; half of
-    the time mirrored. Statistics of batches stay as they are.
+    """Train a detector on adversarial images, plain images and custom examples.
+
+    Searches attack the student as it is at the start of the round. Images are mirrored
+    half of the time. Statistics of batch normalization are not updated.
     """
 
     batch = 8
     weight_decay = 1e-4
     warm_up = 0.3
-    views = (SIDES, SIDES)
+    views = (N_VIEWS, N_VIEWS)
 
     def __init__(
-        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None,
-        own: Sequence[Example] = (), loss: Loss | None = None,
-    ) -> None:  # fmt: skip
-        super().__init__(work, student, optimiser, own)
+        self,
+        work: SceneWork,
+        student: Trainable,
+        optimiser: MakeOptimiser | None = None,
+        custom_items: Sequence[Example] = (),
+        loss: Loss | None = None,
+    ) -> None:
+        super().__init__(work, student, optimiser, custom_items)
         self.loss = loss or self.usual_loss()
 
     def usual_loss(self) -> Loss:
+        """Return the loss that is used if the caller passes none."""
         return own_loss
 
     def draw(self, title: str, split: str, places: range) -> list[Example]:
-        """Return pictures of scenes as they are, then for each control the worst that a
-        search finds, wrong or not.
+        """Return plain images of scenes, then the worst one that each search finds.
+
+        There is a search for each control; its image is used whether the prediction is
+        wrong or not.
         """
-        side = self.work.splits[split]
+        scene_split = self.work.splits[split]
         controls = tuple(self.config.controls)
-        model = self.student.model
         plain = list[Example]()
         worst = list[Example]()
         self.work.progress.stage(title, len(places) * len(controls))
         for number in places:
-            name, scene = side.scene(number)
+            name, scene = scene_split.scene(number)
             for control in controls:
-                seed = seeds.stream(side.seed, f"search {control}", number)
-                config = self.work.attack(
-                    (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
-                )
-                u = workbench.attack_on(config, scene, model).u
-                problem = workbench.problem_of(
-                    config, scene, model, differentiated=False
-                )
-                plain.append(Example.of(problem, seeds.stream(seed, "plain", 0)))
-                worst.append(Example.of(problem, seeds.stream(seed, "worst", 0), u))
+                seed = seeds.stream(scene_split.seed, f"search {control}", number)
+                plain_image, worst_image = self._attack(scene, name, control, seed)
+                plain.append(plain_image)
+                worst.append(worst_image)
                 self.work.progress.advance(1)
-            around, _ = self.work.problem(side, number, controls[-1:])
+            # Further views vary in what the last control does not search.
+            problem, _ = self.work.problem(scene_split, number, controls[-1:])
             plain += [
-                Example.of(around, seeds.stream(seed, "plain", view))
-                for view in range(1, SIDES)
+                Example.of(problem, seeds.stream(seed, "plain", view))
+                for view in range(1, N_VIEWS)
             ]
         return plain + worst
 
+    def _attack(
+        self, scene: workbench.Scene, name: str, control: str, seed: int
+    ) -> tuple[Example, Example]:
+        """Attack the student in a scene; return a plain image and the worst one."""
+        model = self.student.model
+        config = self.work.attack(
+            (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
+        )
+        u = workbench.attack_on(config, scene, model).u
+        problem = workbench.problem_of(config, scene, model, differentiated=False)
+        plain = Example.of(problem, seeds.stream(seed, "plain", 0))
+        worst = Example.of(problem, seeds.stream(seed, "worst", 0), u)
+        return plain, worst
+
     def looks(self, item: Example) -> int:
-        return SEEN if item.found else 1
+        return WORST_LOOKS if item.found else 1
 
     @contextmanager
     def gradients(self, new: Sequence[Example]) -> Iterator[Take]:
+        """Return a context in which gradients are computed in training mode."""
         network = self.student.net.train()
-        for part in network.modules():
-            if isinstance(part, (_BatchNorm, nn.Dropout)):
-                part.eval()
+        for module in network.modules():
+            if isinstance(module, (_BatchNorm, nn.Dropout)):
+                module.eval()
 
-        def take(batch: Sequence[Example], rng: np.random.Generator) -> None:
-            inputs, targets = zip(
-                *(self.shown(item, bool(rng.random() < 0.5)) for item in batch),
-                strict=True,
-            )
+        def compute_gradient(
+            batch: Sequence[Example], rng: np.random.Generator
+        ) -> None:
+            inputs = list[Tensor]()
+            targets = list[Target]()
+            for item in batch:
+                is_mirrored = bool(rng.random() < 0.5)
+                x, target = self.shown(item, is_mirrored)
+                inputs.append(x)
+                targets.append(target)
             network.zero_grad()
             self.loss(network, torch.cat(inputs), targets).backward()
 
-        yield take
+        yield compute_gradient
         network.eval()
 
     def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
-        """Return what the network is given for a picture, with what is in it in pixels
-        of that.
-        """
+        """Return the network's input for an image, and the target in its pixels."""
         levels = item.levels
         boxes = item.boxes
-        (height, width) = item.levels.shape[:2]
+        height, width = item.levels.shape[:2]
         if mirrored:
             levels = levels.flip(1)
             boxes = torch.stack(
@@ -283,44 +350,75 @@ class DetectorCourse(Course):
         }
 
     def score(self, held_back: Sequence[Example]) -> Score:
-        right = [(item.found, item.right(self.student.model)) for item in held_back]
-        return Score(
-            *(
-                float(np.mean([known for found, known in right if found == which]))
-                for which in (False, True)
-            )
-        )
+        """Evaluate the student on plain and on adversarial images."""
+        plain = []
+        worst = []
+        for item in held_back:
+            is_right = item.right(self.student.model)
+            if item.found:
+                worst.append(is_right)
+            else:
+                plain.append(is_right)
+        return Score(float(np.mean(plain)), float(np.mean(worst)))
 
     def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
-        """Write them as COCO has it, for one's own training."""
-        folder = f"{PICTURES}/round-{number:03d}"
+        """Write the images of a round in COCO's format."""
+        directory = f"{PICTURES}/round-{number:03d}"
         images = []
-        things = list[Any]()
-        for at, (item, name) in enumerate(written(run, f"{folder}/images", new), 1):
+        annotations = list[dict[str, Any]]()
+        written_items = written(run, f"{directory}/images", new)
+        for image_id, (item, name) in enumerate(written_items, start=1):
             height, width = item.levels.shape[:2]
             images.append(
-                {"id": at, "file_name": f"{name}.png", "height": height, "width": width}
+                {
+                    "id": image_id,
+                    "file_name": f"{name}.png",
+                    "height": height,
+                    "width": width,
+                }
             )
-            for (left, top, right, bottom), label in zip(
+            for box, label in zip(
                 item.boxes.tolist(), item.labels.tolist(), strict=True
             ):
-                box = [left, top, right - left, bottom - top]
-                things.append({"id": len(things) + 1, "image_id": at, "category_id": label, "bbox": box,
-                               "area": box[2] * box[3], "iscrowd": 0})  # fmt: skip
+                annotation_id = len(annotations) + 1
+                annotations.append(_annotate(annotation_id, image_id, box, label))
         if new:
-            named = [
-                {"id": at, "name": name}
-                for at, name in enumerate(self.student.model.labels)
+            categories = [
+                {"id": index, "name": label}
+                for index, label in enumerate(self.student.model.labels)
             ]
-            coco = {"images": images, "annotations": things, "categories": named}
-            run.write_file(f"{folder}/annotations.json", json.dumps(coco).encode())
+            coco = {
+                "images": images,
+                "annotations": annotations,
+                "categories": categories,
+            }
+            run.write_file(f"{directory}/annotations.json", json.dumps(coco).encode())
+
+
+def _annotate(
+    annotation_id: int, image_id: int, box: Sequence[float], label: int
+) -> dict[str, Any]:
+    """Return COCO's annotation of a box (x0, y0, x1, y1)."""
+    left, top, right, bottom = box
+    width = right - left
+    height = bottom - top
+    return {
+        "id": annotation_id,
+        "image_id": image_id,
+        "category_id": label,
+        "bbox": [left, top, width, height],
+        "area": width * height,
+        "iscrowd": 0,
+    }
 
 
 def written(
     run: RunDirectory, folder: str, items: Sequence[Example]
 ) -> Iterator[tuple[Example, str]]:
-    """Write the picture of each item into a folder of the run, and yield it with the
-    name of that, without ".png".
+    """Write the images of items into a directory of the run.
+
+    Yields:
+        Each item with the name of its image, without ".png".
     """
     for number, item in enumerate(items, 1):
         (run.path / folder).mkdir(parents=True, exist_ok=True)
@@ -329,14 +427,15 @@ def written(
         yield item, name
 
 
-# ---- How a segmenter is hardened: as a detector is, with a class for each pixel in the
-# place of boxes ---------------
+# ---- segmenters
+# ----------------------------------------------------------------------------------
 
 
 class SegmenterCourse(DetectorCourse):
-    """A picture teaches that the object's pixels are of its class, and all others of
-    that which the model gave them before it was trained: what they are is not known,
-    and they are to stay.
+    """Train a segmenter on adversarial and plain images.
+
+    The object's pixels are of its class. All others keep the class that the original
+    model predicts, since what they show is not known.
     """
 
     def usual_loss(self) -> Loss:
@@ -344,44 +443,57 @@ class SegmenterCourse(DetectorCourse):
         return partial(pixel_loss, task)
 
     def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
-        """Return the network's input, and "classes" (h, w) int64 and "object" (h, w) at
-        the size of its output.
+        """Return the network's input for an image, and the target of its pixels.
+
+        The target has "classes" (h, w) int64 and "object" (h, w) bool at the size of
+        the network's output.
         """
         region: Any = item.truth
         levels = item.levels.flip(1) if mirrored else item.levels
         with torch.no_grad():
             classes = self.work.model(levels[None] / 255.0)[0].argmax(dim=0)
-        there = region.at(tuple(classes.shape)).to(classes.device)
-        there = there.flip(1) if mirrored else there
+        object_mask = region.at(tuple(classes.shape)).to(classes.device)
+        if mirrored:
+            object_mask = object_mask.flip(1)
         x = self.student.model.prepared(levels[None] / 255.0)[:1]
         return x, {
-            "classes": torch.where(there, region.labels[0], classes).to(x.device),
-            "object": there.to(x.device),
+            "classes": torch.where(object_mask, region.labels[0], classes).to(x.device),
+            "object": object_mask.to(x.device),
         }
 
     def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
-        folder = f"{PICTURES}/round-{number:03d}"
-        for item, name in written(run, folder, new):
+        """Write the images of a round, and the masks of their objects."""
+        directory = f"{PICTURES}/round-{number:03d}"
+        for item, name in written(run, directory, new):
             mask = item.truth.mask[..., None].float().expand(-1, -1, 3)
-            run.save_image(f"{name}-mask", mask, folder)
+            run.save_image(f"{name}-mask", mask, directory)
 
 
 def pixel_loss(
     task: Task, network: nn.Module, x: Tensor, targets: Sequence[Target]
 ) -> Tensor:
-    """Return a network's own loss (transformers' of `labels`), else the cross-entropy,
-    half of it for the object.
+    """Return the loss of a segmenter.
+
+    Networks of transformers compute it from `labels`. Of others it is the mean of the
+    cross-entropy of the object's pixels and that of all others.
+
+    Args:
+        task: reads the network's output.
+        network: in training mode.
+        x: the network's input.
+        targets: "classes" and "object" of each image.
     """
-    classes, objects = (
-        torch.stack([target[name] for target in targets])
-        for name in ("classes", "object")
-    )
+    classes = torch.stack([target["classes"] for target in targets])
+    is_object = torch.stack([target["object"] for target in targets])
     inner: Any = getattr(network, "network", network)
     if hasattr(inner, "config"):
         loss: Tensor = inner(pixel_values=x, labels=classes).loss
         return loss
-    each = F.cross_entropy(task.read(network(x), len(x)), classes, reduction="none")
-    return 0.5 * sum(
-        (each[part].mean() for part in (objects, ~objects) if bool(part.any())),
-        each.sum() * 0.0,
-    )
+    logits = task.read(network(x), len(x))
+    pixel_losses = F.cross_entropy(logits, classes, reduction="none")
+    # Zero, with a graph to all parameters.
+    total = pixel_losses.sum() * 0.0
+    for mask in (is_object, ~is_object):
+        if bool(mask.any()):
+            total = total + pixel_losses[mask].mean()
+    return 0.5 * total

@@ -1,8 +1,7 @@
-"""What a model is trained on: plain renders of scenes, and the worst configurations of
-them that short searches find.
+"""Make training examples: plain renders of scenes, and their worst configurations.
 
 Where light arrives linearly (textures, patches), a lesson holds a matrix of light
-transport of one view, which says the picture of any texture and its derivative without
+transport of one view, which gives the image of any texture and its derivative without
 rendering: its adversarial texture is searched further each time that the lesson comes
 up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views
 share is one of expectation over transformation (EOT, Athalye et al. 2018). Everything
@@ -19,6 +18,7 @@ import tarfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -35,42 +35,59 @@ from advsearch.extend import (
     writing,
 )
 
-PICTURES = "artifacts/pictures"  # what was trained on, in the run
+PICTURES = "artifacts/pictures"
+"""Directory of the training's images in the run."""
 SPP = 2
+"""Samples per pixel of an image; many lessons with noise teach more than few without."""
 MATRIX_SPP = 4
+"""Samples per pixel of a matrix of light transport."""
 DEPTH = 4
-"""Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments
-of the longest path: many lessons with some noise teach more than few without.
-"""
-STEP = 0.5  # a step of an adversarial texture, as a share of its budget
-TOGETHER = 32  # pictures that a model is asked about at once
+"""Segments of the longest light path."""
+STEP = 0.5
+"""Step of an adversarial texture, as a fraction of its budget."""
+TOGETHER = 32
+"""Batch size of the model's predictions."""
+
+
+Renderer = Callable[..., Tensor]
+"""Renders a configuration (d,) with a `seed` and `spp` to an image (H, W, 3)."""
 
 
 @dataclass(eq=False)
 class Lesson:
-    """One scene under conditions that were drawn for it: indices of its right classes, and its picture as it is, (H, W,
-    3) uint8, as there are many; of a scene that is rendered twice, that with one control moved."""
+    """One scene under sampled conditions, with its plain image.
+
+    Attributes:
+        right: indices of the right classes.
+        levels: the image (H, W, 3) uint8, to save memory. Of a scene that is rendered
+            twice it is the one with a single control changed.
+    """
 
     right: tuple[int, ...]
     levels: Tensor
 
     @property
     def plain(self) -> Tensor:
-        """(H, W, 3) the picture of `levels`, sRGB in [0, 1]."""
+        """The image of `levels` (H, W, 3), sRGB in [0, 1]."""
         return self.levels / 255.0
 
     @property
     def worst(self) -> Tensor:
-        """(H, W, 3) the worst picture that is known."""
+        """The worst image that is known (H, W, 3), sRGB in [0, 1]."""
         return self.plain
 
 
 @dataclass(eq=False)
 class TextureLesson(Lesson):
-    """A lesson whose pictures `linear` says, the scene being let go of: the space and
-    the domain of its texture, the numbers of the conditions that it was made for, and
-    the adversarial texture (d,), which other views may share and which changes in
-    place.
+    """A lesson with an adversarial texture, whose images need no rendering.
+
+    Attributes:
+        space: maps configurations to textures.
+        domain: the configurations that are allowed.
+        linear: computes the image of a texture; it no longer holds the scene.
+        numbers: the sampled conditions that it was made for.
+        texture: the adversarial configuration (d,). Other views may share it, and it is
+            changed in place.
     """
 
     space: Any
@@ -80,10 +97,10 @@ class TextureLesson(Lesson):
     texture: Tensor
 
     def picture(self, u: Tensor) -> Tensor:
-        """Return the picture (H, W, 3) of a texture, with a graph."""
+        """Return the image (H, W, 3) of a texture, with a graph."""
         inputs = self.space.inputs(u)
-        moved = {name: inputs[name] for name in self.linear.there}
-        image: Tensor = self.linear.shown(moved, torch.cat([u, self.numbers]))
+        texture_inputs = {name: inputs[name] for name in self.linear.there}
+        image: Tensor = self.linear.shown(texture_inputs, torch.cat([u, self.numbers]))
         return image
 
     @property
@@ -94,9 +111,11 @@ class TextureLesson(Lesson):
 
 @dataclass(eq=False)
 class RenderedLesson(Lesson):
-    """A lesson whose pictures (N, H, W, 3) uint8 were rendered at random
-    configurations, with the loss (N,) of each when a model last looked at it; infinite
-    of those that none has.
+    """A lesson with images of random configurations.
+
+    Attributes:
+        pictures: the images (N, H, W, 3) uint8.
+        losses: the loss of each image (N,) when it was last evaluated; infinite before.
     """
 
     pictures: Tensor
@@ -106,8 +125,12 @@ class RenderedLesson(Lesson):
     def of(
         cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor
     ) -> RenderedLesson:
-        """Return a lesson of a picture (H, W, 3) and some (N, H, W, 3) in [0, 1], the
-        first the worst so far.
+        """Create a lesson whose first image is the worst so far.
+
+        Args:
+            right: indices of the right classes.
+            plain: the plain image (H, W, 3) in [0, 1].
+            pictures: the other images (N, H, W, 3) in [0, 1].
         """
         return cls(
             right,
@@ -130,139 +153,191 @@ def lessons(
     tries: int | None = None,
     shared: bool = False,
 ) -> list[Lesson]:
-    """Draw lessons from so many views of one scene, each with conditions of its own,
-    drawn by chance, and from `plain` views of it as it is, which nothing makes harder.
-    Where no matrix says the pictures, `tries` configurations are rendered beside each
-    view as it is (see `tried`); None for two renders of a view: one of the controls
-    moved, and all of them. Views that are `shared` have one adversarial texture.
+    """Make lessons from views of one scene, each with its own sampled conditions.
+
+    Args:
+        problem: the scene with the controls that make it harder.
+        views: that have worst images.
+        seed: root of the samples.
+        plain: further views without worst images.
+        tries: random configurations of each view that are rendered where a matrix of
+            light transport does not give the images (see `tried`). None renders each
+            view twice: with a single control changed, and with all of them.
+        shared: whether the views have one adversarial texture.
     """
-    domain = problem.domain
-    start = problem.domain.start
-    linear = views and problem.is_linear
-    quickly = problem.renderer.like(quick=True)
-    drawn = list[Lesson]()
+    has_matrix = bool(views) and problem.is_linear
     right = tuple(int(index) for index in problem.truth())
-    space, whole_space = (
-        replace(space, scene=None) for space in (problem.searched_space, problem.space)
-    )
-
-    def begun(seed: int) -> Tensor:
-        return domain.sample(torch.Generator().manual_seed(seed), extreme=True)[
-            0
-        ].clone()
-
-    common = begun(seed)
+    render = problem.renderer.like(quick=True)
+    all_lessons = list[Lesson]()
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
-        for number in range(views):
-            view = seeds.stream(seed, "lesson", number)
-            whole = problem.whole(start, view)
-            numbers = whole[domain.dim :].clone()  # and not all that it is a part of
-            if linear:
-                made = problem.linearised(whole, view, MATRIX_SPP)
-                levels = color.levels_of(made(whole))
-                texture = common if shared else begun(view)
-                made.let_go(whole_space)
-                drawn.append(
-                    TextureLesson(right, levels, space, domain, made, numbers, texture)
-                )
-                continue
-            generator = torch.Generator().manual_seed(view)
-            if tries is None:
-                *alone, together = tried(
-                    domain, generator, 1 + len(problem.searched_space.controls)
-                )
-                wanted = [
-                    alone[torch.randint(len(alone), (), generator=generator)],
-                    together,
-                ]
-            else:
-                wanted = [start, *tried(domain, generator, tries)]
-            first, *pictures = (
-                quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted
-            )
-            drawn.append(RenderedLesson.of(right, first, torch.stack(pictures)))
-        for number in range(plain):
-            view = seeds.stream(seed, "plain lesson", number)
-            drawn.append(
-                Lesson(
-                    right,
-                    color.levels_of(
-                        quickly(problem.whole(start, view), seed=view, spp=SPP)
-                    ),
-                )
-            )
-    return drawn
+        if has_matrix:
+            all_lessons += _texture_lessons(problem, views, seed, right, shared)
+        else:
+            all_lessons += _rendered_lessons(problem, render, views, seed, right, tries)
+        all_lessons += _plain_lessons(problem, render, plain, seed, right)
+    return all_lessons
+
+
+def _texture_lessons(
+    problem: Problem, views: int, seed: int, right: tuple[int, ...], shared: bool
+) -> list[TextureLesson]:
+    """Make a lesson with a matrix of light transport for each view."""
+    domain = problem.domain
+    # Lessons do not hold the scene, which takes much memory.
+    space = replace(problem.searched_space, scene=None)
+    full_space = replace(problem.space, scene=None)
+    shared_texture = _sample_texture(domain, seed)
+    texture_lessons = []
+    for number in range(views):
+        view_seed = seeds.stream(seed, "lesson", number)
+        configuration = problem.whole(domain.start, view_seed)
+        # A clone does not keep the full configuration in memory.
+        conditions = configuration[domain.dim :].clone()
+        linear = problem.linearised(configuration, view_seed, MATRIX_SPP)
+        levels = color.levels_of(linear(configuration))
+        texture = shared_texture
+        if not shared:
+            texture = _sample_texture(domain, view_seed)
+        linear.let_go(full_space)
+        texture_lessons.append(
+            TextureLesson(right, levels, space, domain, linear, conditions, texture)
+        )
+    return texture_lessons
+
+
+def _sample_texture(domain: policies.Domain, seed: int) -> Tensor:
+    """Sample an extreme configuration (d,) from which a search begins."""
+    generator = torch.Generator().manual_seed(seed)
+    return domain.sample(generator, extreme=True)[0].clone()
+
+
+def _rendered_lessons(
+    problem: Problem,
+    render: Renderer,
+    views: int,
+    seed: int,
+    right: tuple[int, ...],
+    tries: int | None,
+) -> list[RenderedLesson]:
+    """Make a lesson with renders of random configurations for each view."""
+    domain = problem.domain
+    rendered_lessons = []
+    for number in range(views):
+        view_seed = seeds.stream(seed, "lesson", number)
+        conditions = problem.whole(domain.start, view_seed)[domain.dim :].clone()
+        generator = torch.Generator().manual_seed(view_seed)
+        if tries is None:
+            n_controls = len(problem.searched_space.controls)
+            *single_changes, joint_change = tried(domain, generator, 1 + n_controls)
+            index = torch.randint(len(single_changes), (), generator=generator)
+            configurations = [single_changes[index], joint_change]
+        else:
+            configurations = [domain.start, *tried(domain, generator, tries)]
+        plain_image, *images = (
+            render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
+            for u in configurations
+        )
+        rendered_lessons.append(
+            RenderedLesson.of(right, plain_image, torch.stack(images))
+        )
+    return rendered_lessons
+
+
+def _plain_lessons(
+    problem: Problem, render: Renderer, views: int, seed: int, right: tuple[int, ...]
+) -> list[Lesson]:
+    """Make a lesson with one plain render for each view."""
+    plain_lessons = []
+    for number in range(views):
+        view_seed = seeds.stream(seed, "plain lesson", number)
+        configuration = problem.whole(problem.domain.start, view_seed)
+        image = render(configuration, seed=view_seed, spp=SPP)
+        plain_lessons.append(Lesson(right, color.levels_of(image)))
+    return plain_lessons
 
 
 def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Tensor:
-    """Draw configurations (count, d) at random. In half of them each number is moved to
-    the nearer end of its range by chance, as searches end where several numbers are.
-    Choices, and numbers that are periodic, have no ends. Of several controls each moves
-    alone in turn, then all of them at once.
+    """Sample configurations (count, d) at random.
+
+    In half of them each value is moved by chance to the nearer bound of its range, as
+    searches end where several values are at bounds. Choices and periodic values have no
+    bounds. Of several controls each changes by itself in turn, then all together.
     """
-    drawn = domain.sample(generator, count)
-    at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (
+    samples = domain.sample(generator, count)
+    is_at_bound = (torch.rand(samples.shape, generator=generator) < 0.5) & (
         torch.rand(count, 1, generator=generator) < 0.5
     )
-    owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
-    controls = list(dict.fromkeys(owners))
+    control_of_block = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
+    controls = list(dict.fromkeys(control_of_block))
     turn = torch.arange(count) % (len(controls) + 1)
-    for owner, (block, part) in zip(owners, domain.parts(), strict=True):
+    for control, (block, columns) in zip(control_of_block, domain.parts(), strict=True):
         if block.options or block.periodic:
-            at_ends[:, part] = False
-        still = (turn != controls.index(owner)) & (turn != len(controls))
-        drawn[still, part] = domain.start[part]
-        at_ends[still, part] = False
-    ends = torch.where(
-        drawn - domain.lower < domain.upper - drawn, domain.lower, domain.upper
-    )
+            is_at_bound[:, columns] = False
+        is_unchanged = (turn != controls.index(control)) & (turn != len(controls))
+        samples[is_unchanged, columns] = domain.start[columns]
+        is_at_bound[is_unchanged, columns] = False
+    is_lower_nearer = samples - domain.lower < domain.upper - samples
+    nearer_bound = torch.where(is_lower_nearer, domain.lower, domain.upper)
     return torch.stack(
-        [domain.project(row) for row in torch.where(at_ends, ends, drawn)]
+        [domain.project(u) for u in torch.where(is_at_bound, nearer_bound, samples)]
     )
 
 
 def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
-    """Return (N,): the negative logarithm of the probability that logits (N, C) give to
-    the right classes of each.
+    """Return the negative log-likelihood (N,) of any right class.
+
+    Args:
+        logits: (N, C).
+        right: indices of the right classes of each row.
     """
-    known = F.log_softmax(logits, dim=1)
+    log_probabilities = F.log_softmax(logits, dim=1)
     return torch.stack(
-        [-row[list(of)].logsumexp(dim=0) for row, of in zip(known, right, strict=True)]
+        [
+            -row[list(classes)].logsumexp(dim=0)
+            for row, classes in zip(log_probabilities, right, strict=True)
+        ]
     )
 
 
 def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
-    """Those lessons that something makes harder."""
+    """Return the lessons that have worst images."""
     return [
         lesson for lesson in some if isinstance(lesson, (TextureLesson, RenderedLesson))
     ]
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
-    """Make lessons harder for a model: further steps of textures, and a look at what
-    was rendered more than once.
+    """Search for worse images of lessons.
+
+    Textures take steps of the search; where several images were rendered, their losses
+    are computed again.
     """
-    for begin in range(0, len(chosen), TOGETHER):
-        part = chosen[begin : begin + TOGETHER]
-        ascend(part, partial(slopes, model=model), steps)
-        several = [
-            lesson
-            for lesson in part
-            if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1
-        ]
-        if several:
-            with torch.no_grad():
-                pictures = torch.cat([lesson.pictures for lesson in several]) / 255.0
-                loss = surprise(
-                    model(pictures),
-                    [lesson.right for lesson in several for _ in lesson.pictures],
-                )
-            for lesson, losses in zip(
-                several,
-                loss.split([len(each.pictures) for each in several]),
-                strict=True,
-            ):
-                lesson.losses = losses.clone()
+    for start in range(0, len(chosen), TOGETHER):
+        batch = chosen[start : start + TOGETHER]
+        ascend(batch, partial(slopes, model=model), steps)
+        _update_losses(batch, model)
+
+
+def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
+    """Compute the losses of lessons with several rendered images."""
+    rendered_lessons = [
+        lesson
+        for lesson in batch
+        if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1
+    ]
+    if not rendered_lessons:
+        return
+    n_images = [len(lesson.pictures) for lesson in rendered_lessons]
+    right = []
+    for lesson in rendered_lessons:
+        right += [lesson.right] * len(lesson.pictures)
+    with torch.no_grad():
+        images = torch.cat([lesson.pictures for lesson in rendered_lessons]) / 255.0
+        losses = surprise(model(images), right)
+    for lesson, lesson_losses in zip(
+        rendered_lessons, losses.split(n_images), strict=True
+    ):
+        lesson.losses = lesson_losses.clone()
 
 
 def ascend(
@@ -270,18 +345,33 @@ def ascend(
     slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
     steps: int = 1,
 ) -> None:
-    """Steps uphill of textures, by what `slopes` says; views that share one add up.
-    Other lessons stay as they are.
+    """Take steps of steepest ascent of the textures of lessons.
+
+    The gradients of views that share a texture are summed. Other lessons are unchanged.
+
+    Args:
+        some: the lessons.
+        slopes_of: returns the gradient of each lesson, as `slopes` does.
+        steps: number of steps.
     """
-    chosen = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
-    for _ in range(steps if chosen else 0):
-        total = dict[int, Tensor]()
-        for lesson, slope in zip(chosen, slopes_of(chosen), strict=True):
-            total[id(lesson.texture)] = slope + total.get(id(lesson.texture), 0.0)
-        for lesson in {id(lesson.texture): lesson for lesson in chosen}.values():
-            steepest = lesson.domain.steepest(lesson.texture, total[id(lesson.texture)])
+    texture_lessons = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
+    if not texture_lessons:
+        return
+    lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
+    for _ in range(steps):
+        gradient_of_texture = dict[int, Tensor]()
+        gradients = slopes_of(texture_lessons)
+        for lesson, gradient in zip(texture_lessons, gradients, strict=True):
+            texture_id = id(lesson.texture)
+            gradient_of_texture[texture_id] = gradient + gradient_of_texture.get(
+                texture_id, 0.0
+            )
+        for texture_id, lesson in lesson_of_texture.items():
+            direction = lesson.domain.steepest(
+                lesson.texture, gradient_of_texture[texture_id]
+            )
             lesson.texture.copy_(
-                lesson.domain.project(lesson.texture + STEP * steepest)
+                lesson.domain.project(lesson.texture + STEP * direction)
             )
 
 
@@ -290,52 +380,60 @@ def slopes(
     model: Callable[[Tensor], Tensor],
     change: Callable[[Tensor], Tensor] = lambda images: images,
 ) -> Sequence[Tensor]:
-    """Return the derivative (d,) of each lesson's loss by its texture; `change` is of
-    the pictures (N, H, W, 3).
+    """Return the gradient (d,) of each lesson's loss with respect to its texture.
+
+    Args:
+        chosen: the lessons.
+        model: returns logits (N, C).
+        change: is applied to the images (N, H, W, 3) before.
     """
-    leaves = [lesson.texture.clone().requires_grad_() for lesson in chosen]
-    pictures = torch.stack(
-        [lesson.picture(u) for lesson, u in zip(chosen, leaves, strict=True)]
+    textures = [lesson.texture.clone().requires_grad_() for lesson in chosen]
+    images = torch.stack(
+        [lesson.picture(u) for lesson, u in zip(chosen, textures, strict=True)]
     )
-    return torch.autograd.grad(
-        surprise(model(change(pictures)), [lesson.right for lesson in chosen]).sum(),
-        leaves,
-    )
+    right = [lesson.right for lesson in chosen]
+    loss = surprise(model(change(images)), right).sum()
+    return torch.autograd.grad(loss, textures)
 
 
 def save_pictures(
     run: RunDirectory, number: int, chosen: Sequence[Lesson], labels: Sequence[str]
 ) -> None:
-    """Write the pictures of a round's lessons into `PICTURES` of the run, and those of
-    all rounds as a WebDataset.
+    """Write the images of a round's lessons, and those of all rounds as a WebDataset.
 
-    The pictures are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``. The
-    WebDataset stands beside their folder. It has of each picture a ``.png``, a ``.cls``
-    with the index of its class and a ``.json`` with that and the kind of picture.
-    Members have no time and no owner, so that equal pictures make equal files.
+    The images are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png`` in `PICTURES`
+    of the run. The WebDataset is next to that directory. It has a ``.png`` of each
+    image, a ``.cls`` with the index of its class, and a ``.json`` with that and the
+    kind of image. Members have no time and no owner, so that equal images make equal
+    files.
     """
-    folder = run.path / PICTURES
-    for place, lesson in enumerate(chosen):
-        name = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
-        class_folder = f"{PICTURES}/{lesson.right[0]:04d}-{name}"
-        (run.path / class_folder).mkdir(parents=True, exist_ok=True)
-        for kind in ("plain", "worst") if with_worst([lesson]) else ("plain",):
-            run.save_image(
-                f"{number:03d}-{place:05d}-{kind}", getattr(lesson, kind), class_folder
-            )
+    for index, lesson in enumerate(chosen):
+        label = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
+        class_directory = f"{PICTURES}/{lesson.right[0]:04d}-{label}"
+        (run.path / class_directory).mkdir(parents=True, exist_ok=True)
+        name = f"{number:03d}-{index:05d}"
+        run.save_image(f"{name}-plain", lesson.plain, class_directory)
+        if with_worst([lesson]):
+            run.save_image(f"{name}-worst", lesson.worst, class_directory)
+    _write_webdataset(run.path / PICTURES)
+
+
+def _write_webdataset(directory: Path) -> None:
+    """Write the images of a directory into a tar beside it; see `save_pictures`."""
     with (
-        writing.replacing(folder.with_suffix(".tar")) as part,
-        tarfile.open(part, "w") as tar,
+        writing.replacing(directory.with_suffix(".tar")) as temporary_path,
+        tarfile.open(temporary_path, "w") as tar,
     ):
-        for path in sorted(folder.glob("*/*.png")):
-            index = int(path.parent.name[:4])
+        for path in sorted(directory.glob("*/*.png")):
+            class_index = int(path.parent.name[:4])
             kind = path.stem.rpartition("-")[2]
-            facts = json.dumps({"class": index, "kind": kind})
-            for suffix, data in {
+            metadata = json.dumps({"class": class_index, "kind": kind})
+            data_by_suffix = {
                 "png": path.read_bytes(),
-                "cls": str(index).encode(),
-                "json": facts.encode(),
-            }.items():
+                "cls": str(class_index).encode(),
+                "json": metadata.encode(),
+            }
+            for suffix, data in data_by_suffix.items():
                 member = tarfile.TarInfo(f"{path.parent.name}-{path.stem}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))

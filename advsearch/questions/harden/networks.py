@@ -1,6 +1,4 @@
-"""Networks that are trained further: copies that collect gradients, and what happens to
-their images by chance.
-"""
+"""Trainable copies of networks, and random augmentation of their images."""
 
 from __future__ import annotations
 
@@ -19,31 +17,33 @@ from advsearch.extend import Model, errors
 
 @dataclass(frozen=True, eq=False)
 class Trainable:
-    """A copy of a network whose trained parameters collect gradients, and a model that
-    asks the same weights.
+    """A copy of a network whose trained parameters collect gradients.
 
-    The model is in evaluation mode, and collects no gradients for the weights.
+    Attributes:
+        net: the network.
+        model: predicts with the same weights, in evaluation mode and without gradients
+            for them.
     """
 
     net: nn.Module
     model: Model
 
     def logits(self, images: Tensor) -> Tensor:
-        """Return logits (N, C) of images (N, H, W, 3) sRGB in [0, 1], with a graph to
-        the parameters.
+        """Return logits (N, C) with a graph to the parameters.
+
+        Args:
+            images: (N, H, W, 3) sRGB in [0, 1].
         """
-        asked = replace(self.model, module=self.net, attached=False)
+        trained_model = replace(self.model, module=self.net, attached=False)
         with self._mixed_precision():
             x = self.model.preprocessing(images.to(self.model.device)).to(
                 self.model.dtype
             )
-            logits: Tensor = asked.ask(x)
+            logits: Tensor = trained_model.ask(x)
         return logits
 
     def quickly(self, images: Tensor) -> Tensor:
-        """Return what `model` says of images (N, H, W, 3), in the precision of
-        `logits`.
-        """
+        """Return the logits of `model` for images (N, H, W, 3) in mixed precision."""
         with self._mixed_precision():
             logits: Tensor = self.model(images)
         return logits
@@ -51,8 +51,10 @@ class Trainable:
     def twin(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
         net: nn.Module = self.model.with_network(self.net).module  # type: ignore[assignment]
-        for parameter, own in zip(net.parameters(), self.net.parameters(), strict=True):
-            parameter.requires_grad_(own.requires_grad)
+        for parameter, original in zip(
+            net.parameters(), self.net.parameters(), strict=True
+        ):
+            parameter.requires_grad_(original.requires_grad)
         return Trainable(net, self.model.with_network(net))
 
     def parameters(self) -> list[nn.Parameter]:
@@ -60,13 +62,12 @@ class Trainable:
         return [weights for weights in self.net.parameters() if weights.requires_grad]
 
     def _mixed_precision(self) -> torch.autocast:
-        """Compute convolutions and products of matrices in bfloat16, on a processor
-        that has instructions for it.
+        """Return a context that uses bfloat16 if the processor has instructions for it.
 
-        Several threads at one of them wait for each other busily: where others want the
-        cores too it takes five times as long as in float32.
+        Several threads that work on one product wait for each other busily. If others
+        use the cores too, it takes five times as long as in float32.
         """
-        # torch 2.8 says nothing
+        # torch 2.8 has no such function.
         processor: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
         bfloat16 = self.model.device.type == "cpu" and bool(
             processor.get("avx512_bf16")
@@ -103,16 +104,17 @@ def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trai
         ]
         net.requires_grad_(False)
         owners[-1].requires_grad_(True)
-    made = Trainable(net, model.with_network(net))
-    if not made.parameters():
+    copied = Trainable(net, model.with_network(net))
+    if not copied.parameters():
         raise errors.ModelError(f"model {model.name}: has no parameters to train")
-    return made
+    return copied
 
 
 @contextmanager
 def one_thread_each() -> Iterator[ThreadPoolExecutor]:
-    """Open as many threads as torch has, each of which has one of torch's: side by side
-    they wait at no barriers.
+    """Open as many threads as torch has, each of which uses a single one of torch's.
+
+    So they do not wait for each other at barriers.
     """
     count = torch.get_num_threads()
     with ThreadPoolExecutor(
@@ -126,98 +128,132 @@ def one_thread_each() -> Iterator[ThreadPoolExecutor]:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What may happen to a training image, in this order; every amount is drawn anew
-    for every image.
+    """Random changes of training images, in the order of the attributes.
 
-    The side of the square crop is uniform between two parts of the image's side (1 and
-    1 switch it off); its place is uniform inside the image or, where it is larger,
-    around it; there the border goes on.
+    Every amount is sampled for every image. A square crop lies at a uniform position
+    inside the image; if it is larger than the image, the border is repeated around it.
+
+    Attributes:
+        flip: probability of a horizontal mirror image.
+        smallest_crop, largest_crop: bounds of the crop's side, as a fraction of the
+            image's side; 1 and 1 switch it off.
+        turn: bound of the angle that the crop is rotated by, in degrees.
+        brightness: bound of the shift, display-referred.
+        contrast: bound of the relative change of deviations from the image's mean.
+        colour: bound of the relative change of each channel.
+        blur: probability of a 3 x 3 binomial blur.
+        noise: bound of the standard deviation of gaussian noise, display-referred.
+        noisy: probability of noise.
+        cutout: probability that a gray square hides a part.
+        largest_cutout: bound of the square's side, as a fraction of the image's side.
     """
 
-    flip: float = 0.5  # probability of a horizontal mirror image
+    flip: float = 0.5
     smallest_crop: float = 0.8
     largest_crop: float = 1.0
-    # half width of the uniform angle that the crop is turned by, in degrees
     turn: float = 0.0
-    brightness: float = 0.1  # half width of the uniform shift, display-referred
-    # half width of the uniform factor around 1 that scales deviations from the image's
-    # mean
+    brightness: float = 0.1
     contrast: float = 0.25
-    colour: float = 0.08  # half width of the uniform factor around 1, per channel
-    blur: float = 0.15  # probability of a 3 x 3 binomial blur
-    # upper end of the uniform standard deviation of gaussian noise, display-referred
+    colour: float = 0.08
+    blur: float = 0.15
     noise: float = 0.04
-    noisy: float = 0.3  # probability that noise is added at all
-    cutout: float = 0.2  # probability that a grey square hides a part
-    # upper end of the square's side, as a part of the image's
+    noisy: float = 0.3
+    cutout: float = 0.2
     largest_cutout: float = 0.3
 
     def __call__(self, images: Tensor, generator: Generator) -> Tensor:
-        """Return changed images (N, 3, H, W), float32 in [0, 1], from images of the
-        same kind.
-        """
+        """Return augmented images (N, 3, H, W), float32 in [0, 1]."""
+        x = self._crop(images, generator)
+        x = self._change_colors(x, generator)
+        self._blur_some(x, generator)
+        self._add_noise(x, generator)
+        x.clamp_(0.0, 1.0)
+        self._cut_out(x, generator)
+        return x
+
+    def _crop(self, images: Tensor, generator: Generator) -> Tensor:
+        """Resample mirrored, rotated and scaled crops of images (N, 3, H, W)."""
         count = len(images)
-
-        def uniform(low: float, high: float, *each: int) -> Tensor:
-            return low + (high - low) * torch.rand(
-                math.prod([count, *each]), generator=generator
-            )
-
-        def chosen(probability: float) -> Tensor:
-            return torch.rand(count, generator=generator) < probability
-
-        scale = uniform(self.smallest_crop, self.largest_crop)
-        shift = uniform(-1.0, 1.0, 2).view(2, count) * (1.0 - scale).abs()
-        mirror = 1.0 - 2.0 * chosen(self.flip).float()
-        angle = uniform(-self.turn, self.turn) * (math.pi / 180.0)
-        along = scale * angle.cos()
-        across = scale * angle.sin()
+        scale = _uniform(
+            self.smallest_crop, self.largest_crop, count, generator=generator
+        )
+        shift = _uniform(-1.0, 1.0, count, 2, generator=generator).view(2, count)
+        shift = shift * (1.0 - scale).abs()
+        mirror = 1.0 - 2.0 * _choose(self.flip, count, generator).float()
+        degrees = _uniform(-self.turn, self.turn, count, generator=generator)
+        angle = degrees * (math.pi / 180.0)
+        cosine = scale * angle.cos()
+        sine = scale * angle.sin()
         rows = (
-            torch.stack([along * mirror, -across, shift[0]], 1),
-            torch.stack([across * mirror, along, shift[1]], 1),
+            torch.stack([cosine * mirror, -sine, shift[0]], 1),
+            torch.stack([sine * mirror, cosine, shift[1]], 1),
         )
         grid = F.affine_grid(
             torch.stack(rows, 1), list(images.shape), align_corners=False
         )
-        x = F.grid_sample(
+        return F.grid_sample(
             images, grid, mode="bilinear", padding_mode="border", align_corners=False
         )
-        # ((x - mean) gain + mean + shift) colour, as one affine map
-        gain = 1.0 + uniform(-self.contrast, self.contrast).view(count, 1, 1, 1)
-        colour = 1.0 + uniform(-self.colour, self.colour, 3).view(count, 3, 1, 1)
-        lighter = uniform(-self.brightness, self.brightness).view(count, 1, 1, 1)
-        x = torch.addcmul(
-            (x.mean(dim=(1, 2, 3), keepdim=True) * (1.0 - gain) + lighter) * colour,
+
+    def _change_colors(self, x: Tensor, generator: Generator) -> Tensor:
+        """Change contrast, brightness and color of images (N, 3, H, W)."""
+        count = len(x)
+        gain = 1.0 + _uniform(
+            -self.contrast, self.contrast, count, generator=generator
+        ).view(count, 1, 1, 1)
+        color = 1.0 + _uniform(
+            -self.colour, self.colour, count, 3, generator=generator
+        ).view(count, 3, 1, 1)
+        brightness = _uniform(
+            -self.brightness, self.brightness, count, generator=generator
+        ).view(count, 1, 1, 1)
+        # ((x - mean) gain + mean + brightness) color, as one affine map
+        mean = x.mean(dim=(1, 2, 3), keepdim=True)
+        return torch.addcmul(
+            (mean * (1.0 - gain) + brightness) * color,
             x,
-            gain * colour,
+            gain * color,
         )
-        blurred = chosen(self.blur)
-        if bool(blurred.any()):
-            taps = x.new_tensor([0.25, 0.5, 0.25])
-            kernel = (taps[:, None] * taps[None, :]).expand(3, 1, 3, 3)
-            x[blurred] = F.conv2d(
-                F.pad(x[blurred], (1, 1, 1, 1), mode="replicate"), kernel, groups=3
-            )
-        noisy = chosen(self.noisy)
-        if some := int(noisy.sum()):
-            deviation = (self.noise * torch.rand(some, generator=generator)).view(
-                some, 1, 1, 1
-            )
-            x[noisy] += deviation * torch.randn(
-                (some, *x.shape[1:]), generator=generator
-            )
-        x.clamp_(0.0, 1.0)
-        hidden = chosen(self.cutout).tolist()
-        (height, width) = x.shape[2:]
-        for index, (size, top, left, grey) in enumerate(
-            torch.rand((count, 4), generator=generator).tolist()
-        ):
-            if hidden[index]:
-                side = max(
-                    1,
-                    int((0.3 + 0.7 * size) * self.largest_cutout * min(height, width)),
-                )
+
+    def _blur_some(self, x: Tensor, generator: Generator) -> None:
+        """Blur some of the images (N, 3, H, W) in place."""
+        is_blurred = _choose(self.blur, len(x), generator)
+        if not bool(is_blurred.any()):
+            return
+        taps = x.new_tensor([0.25, 0.5, 0.25])
+        kernel = (taps[:, None] * taps[None, :]).expand(3, 1, 3, 3)
+        padded = F.pad(x[is_blurred], (1, 1, 1, 1), mode="replicate")
+        x[is_blurred] = F.conv2d(padded, kernel, groups=3)
+
+    def _add_noise(self, x: Tensor, generator: Generator) -> None:
+        """Add gaussian noise to some of the images (N, 3, H, W) in place."""
+        is_noisy = _choose(self.noisy, len(x), generator)
+        n_noisy = int(is_noisy.sum())
+        if n_noisy == 0:
+            return
+        deviation = self.noise * torch.rand(n_noisy, generator=generator)
+        noise = torch.randn((n_noisy, *x.shape[1:]), generator=generator)
+        x[is_noisy] += deviation.view(n_noisy, 1, 1, 1) * noise
+
+    def _cut_out(self, x: Tensor, generator: Generator) -> None:
+        """Hide a part of some of the images (N, 3, H, W) by a gray square in place."""
+        is_hidden = _choose(self.cutout, len(x), generator).tolist()
+        height, width = x.shape[2:]
+        samples = torch.rand((len(x), 4), generator=generator).tolist()
+        for index, (size, top, left, gray) in enumerate(samples):
+            if is_hidden[index]:
+                fraction = (0.3 + 0.7 * size) * self.largest_cutout
+                side = max(1, int(fraction * min(height, width)))
                 row = int(top * (height - side))
                 column = int(left * (width - side))
-                x[index, :, row : row + side, column : column + side] = grey
-        return x
+                x[index, :, row : row + side, column : column + side] = gray
+
+
+def _uniform(lower: float, upper: float, *shape: int, generator: Generator) -> Tensor:
+    """Return as many uniform samples as a shape has elements, in one dimension."""
+    return lower + (upper - lower) * torch.rand(math.prod(shape), generator=generator)
+
+
+def _choose(probability: float, count: int, generator: Generator) -> Tensor:
+    """Return a random mask (count,)."""
+    return torch.rand(count, generator=generator) < probability

@@ -1,4 +1,4 @@
-"""The settings of `harden`, and its result."""
+"""The settings of `harden`, its result, and the views of it."""
 
 from __future__ import annotations
 
@@ -20,18 +20,23 @@ from advsearch.extend import (
     wording,
 )
 
-STEPS = 40  # of a search, as of an attack
-ALL = "all"  # the objects of a command that takes all bundled ones
+STEPS = 40
+"""Of a search, as of an attack."""
+ALL = "all"
+"""Value of `object` that stands for all bundled objects."""
 PLAIN_SCENES = 6
-RENDERED_SCENES = 15
-"""Scenes that come with each one of the training, of which nothing is drawn but one
-view: plain ones, where nothing is rendered, or such as are rendered. What is learned is
-lost on other scenes where there are few, and so is clean accuracy.
+"""Further scenes for each one of the training, with one plain view each.
+
+With few of them the training generalizes worse to other scenes, and loses clean
+accuracy.
 """
+RENDERED_SCENES = 15
+"""The same where controls are rendered: the view is rendered at random configurations."""
 
 TEXTURE_LOOKS = 6
-"""How often an epoch looks at a scene with a texture, over its views: it is another one
-each time, while what was rendered stays.
+"""How often an epoch uses a scene with a texture, over its views.
+
+The texture is another one each time, while what was rendered stays.
 """
 
 QUICK: dict[str, int] = {
@@ -42,22 +47,20 @@ QUICK: dict[str, int] = {
     "measured": 14,
     "steps": 20,
 }
-"""What `quick` takes where nothing else was said: minutes instead of an hour."""
+"""Defaults of settings with `quick`: minutes instead of an hour."""
 
 
 class HardenConfig(AttackConfig):
-    """Everything that decides what `harden` does: training on worst cases, and the
-    measurement before and after.
-    """
+    """Settings of `harden`: training on worst cases, and measurement before and after."""
 
     # fmt: off
     command: ClassVar[str] = "harden"
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
-        "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
-        "shutter", "rolling",
-        "average", "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label", "measure", "estimators",
-        "things", "judge",
+        "smallest", "ensemble", "printable", "aov", "metrics", "log", "target",
+        "minimise", "over", "draws", "path", "shutter", "rolling", "average",
+        "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label",
+        "measure", "estimators", "things", "judge",
     )
 
     object: str = setting_as_in(
@@ -74,12 +77,14 @@ class HardenConfig(AttackConfig):
     held_out: str | None = setting(
         None, "scene", "objects that training never sees, which are measured, "
                        "separated by commas",
-        "names of objects or files", otherwise="other instances of the bundled objects", min_length=1,
+        "names of objects or files", otherwise="other instances of the bundled objects",
+        min_length=1,
     )
     held_out_environment: str | None = setting(
         None, "scene", "what lights the measurement, and never the training",
         "names of environments or files, separated by commas",
-        otherwise="the bundled environments that the reference model was not trained in", min_length=1,
+        otherwise="the bundled environments that the reference model was not trained in",
+        min_length=1,
     )
     task: str | dict[str, JsonValue] = setting_as_in(
         AttackConfig, "task", description="what the model does: classification, "
@@ -126,11 +131,12 @@ class HardenConfig(AttackConfig):
 
     @model_validator(mode="before")
     @classmethod
-    def _quickly(cls, data: Any) -> Any:
+    def _apply_quick(cls, data: Any) -> Any:
         return {**QUICK, **data} if data.get("quick") is True else data
 
     @property
     def texture_looks(self) -> int:
+        """How often an epoch uses each view of a scene with a texture."""
         return max(1, TEXTURE_LOOKS // self.views)
 
     @property
@@ -139,7 +145,7 @@ class HardenConfig(AttackConfig):
 
 
 class Share(results.Fields):
-    """A share of right predictions."""
+    """The fraction of right predictions with its interval."""
 
     accuracy: float = Field(description="`right` of `count`")
     interval: results.Interval = Field(
@@ -166,8 +172,9 @@ class HardenedControl(results.Fields):
 
 
 class TrainingRound(results.Fields):
-    """One round of search and training, judged on scenes of the training's environments
-    that it was not trained on.
+    """One round of search and training.
+
+    It is evaluated on other scenes in the training's environments.
     """
 
     lessons: int = Field(description="views that it was trained on")
@@ -183,8 +190,9 @@ class TrainingRound(results.Fields):
 
 
 class SplitSide(results.Fields):
-    """What one side of the split consists of; no object and, held out, no environment
-    is on two sides.
+    """One part of the split.
+
+    No object is in two parts, and no environment is in the held-out part and another.
     """
 
     objects: list[str]
@@ -264,20 +272,19 @@ class HardenResult(views.InNotebook, RunResult):
         )
 
 
-ROBUST = (
+ROBUST_NOTE = (
     "Robust: the plain picture of a held-out scene is right, and the search finds no "
-    "wrong one. 95 % intervals over "
-    "scenes: Clopper-Pearson; of plain pictures, two of each scene, by bets. Scenes "
-    "are of the objects that are named: "
-    "intervals and p say nothing of other objects."
+    "wrong one. 95 % intervals over scenes: Clopper-Pearson; of plain pictures, two of "
+    "each scene, by bets. Scenes are of the objects that are named: intervals and p say "
+    "nothing of other objects."
 )
-TRAINED = (
+TRAINING_NOTE = (
     "Round 0 is the model as it was. Weights are part of the way from those to the "
-    "trained ones. Judged on scenes in "
-    "the training's environments on which it was not trained."
+    "trained ones. Judged on scenes in the training's environments on which it was not "
+    "trained."
 )
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
-ROUNDS: Mapping[str, views.Column] = {
+ROUND_COLUMNS: Mapping[str, views.Column] = {
     "round": "{0[0]}",
     "views trained on": "{0[1].lessons}",
     "part of the way": lambda row: wording.percent(row[1].part),
@@ -285,7 +292,7 @@ ROUNDS: Mapping[str, views.Column] = {
     "worst pictures right": lambda row: wording.percent(row[1].robust),
     "kept": lambda row: "yes" if row[1].kept else "",
 }
-SPLIT: Mapping[str, views.Column] = {
+SPLIT_COLUMNS: Mapping[str, views.Column] = {
     "side": "{0[0]}",
     "objects": lambda row: ", ".join(row[1].objects),
     "environments": lambda row: ", ".join(row[1].environments),
@@ -293,47 +300,20 @@ SPLIT: Mapping[str, views.Column] = {
     "views": "{0[1].views}",
 }
 
+ShareChanges = Mapping[str, tuple[Share | None, Share | None]]
+"""Fractions before and after, by what they are of."""
+
 
 def shown(result: HardenResult) -> ShownResult:
-    """Return how robust the model was and is, what it was trained on, and what never
-    was.
-    """
-    shares: dict[str, tuple[Share | None, Share | None]] = {}
-    for row in result.table:
-        shares[f"robust to {row.control}"] = row.before, row.after
-        shares[f"robust to {row.control}, stronger search"] = (
-            row.stronger_before,
-            row.stronger,
-        )
-    if len(result.table) > 1:
-        shares["robust to each"] = result.before, result.after
-    if result.clean_after is not None:
-        shares["plain pictures right"] = result.clean_before, result.clean_after
+    """Return the view of a hardening."""
+    shares = _share_changes(result)
+    chart: dict[str, Any] = {}
+    if shares:
 
-    def draw(axes: Any) -> None:
-        bars = {
-            name: [
-                None if share is None else (share.accuracy, share.interval)
-                for share in both
-            ]
-            for name, both in shares.items()
-        }
-        figures.draw_shares(
-            axes, bars, ("before", "after"), (figures.RED, figures.BLUE)
-        )
-        axes.set(xlabel="share that is right, with 95 % interval")
-        axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
-        axes.figure.legend(loc="outside lower center", ncols=2)
+        def draw(axes: Any) -> None:
+            _draw_shares(axes, shares, result.model)
 
-    measured = []
-    for name, both in shares.items():
-        cells = [
-            (wording.percent(share.accuracy), wording.interval_text(share.interval))
-            if share
-            else ("", "")
-            for share in both
-        ]
-        measured.append([name, *cells[0], *cells[1]])
+        chart = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))}
     facts = {
         "model": result.model,
         "searched with": result.search,
@@ -342,65 +322,107 @@ def shown(result: HardenResult) -> ShownResult:
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
-    before = result.before
-    after = result.after
-    clean = result.clean_before
-    left = result.clean_after
-    said = "Stopped before the hardened model was measured."
-    if (
-        before is not None
-        and after is not None
-        and clean is not None
-        and left is not None
-    ):
-        said = (
-            f"Of {after.count} held-out scenes the searches leave {after.right} right, "
-            f"before {before.right}; "
-            f"of {left.count} plain pictures {left.right} are right, before "
-            f"{clean.right}."
-        )
-        for when, share in (("Now", left), ("Before", clean)):
-            others = wording.outcomes_text(share.outcomes, result.task)
-            said += f" {when}, the other plain pictures are {others}." if others else ""
-        if result.lost is not None:
-            said += (
-                f" Scene by scene: {result.gained} got better, {result.lost} "
-                "worse "
-                f"(p = {result.p:.2g}, "
-            )
-            said += "for scenes of these objects; of other objects it says nothing)."
-    chart: dict[str, Any] = (
-        {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
-    )
     sections = [
         ResultPart(
             "Before and after",
             heads=HEADS,
-            rows=measured,
-            note=ROBUST,
+            rows=[_share_cells(name, both) for name, both in shares.items()],
+            note=ROBUST_NOTE,
             height=110 + 44 * len(shares),
             **chart,
         ),
         ResultPart.table(
             enumerate(result.rounds),
-            ROUNDS,
+            ROUND_COLUMNS,
             title="The training",
-            note=TRAINED,
+            note=TRAINING_NOTE,
             only="page",
         ),
         ResultPart.table(
             result.split.items(),
-            SPLIT,
+            SPLIT_COLUMNS,
             title="What it was trained and measured on",
             only="page",
         ),
     ]
     return ShownResult(
-        said,
+        _summarize(result),
         sections,
         facts,
         about=[",".join(result.objects), ", ".join(result.controls)],
     )
+
+
+def _share_changes(
+    result: HardenResult,
+) -> dict[str, tuple[Share | None, Share | None]]:
+    """Return the fractions of right images before and after, by what they are of."""
+    shares: dict[str, tuple[Share | None, Share | None]] = {}
+    for row in result.table:
+        shares[f"robust to {row.control}"] = (row.before, row.after)
+        shares[f"robust to {row.control}, stronger search"] = (
+            row.stronger_before,
+            row.stronger,
+        )
+    if len(result.table) > 1:
+        shares["robust to each"] = (result.before, result.after)
+    if result.clean_after is not None:
+        shares["plain pictures right"] = (result.clean_before, result.clean_after)
+    return shares
+
+
+def _share_cells(name: str, both: tuple[Share | None, Share | None]) -> list[str]:
+    """Return the cells of a row under `HEADS`."""
+    cells = [name]
+    for share in both:
+        if share is None:
+            cells += ["", ""]
+        else:
+            interval = wording.interval_text(share.interval)
+            cells += [wording.percent(share.accuracy), interval]
+    return cells
+
+
+def _draw_shares(axes: Any, shares: ShareChanges, model: str) -> None:
+    """Draw fractions before and after as bars with intervals."""
+    bars = {
+        name: [
+            None if share is None else (share.accuracy, share.interval)
+            for share in both
+        ]
+        for name, both in shares.items()
+    }
+    figures.draw_shares(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
+    axes.set(xlabel="share that is right, with 95 % interval")
+    axes.set_title(f"Held-out scenes: {wording.short_name(model)}")
+    axes.figure.legend(loc="outside lower center", ncols=2)
+
+
+def _summarize(result: HardenResult) -> str:
+    """Describe in words how robust and how accurate the model was and is."""
+    before = result.before
+    after = result.after
+    clean_before = result.clean_before
+    clean_after = result.clean_after
+    if before is None or after is None or clean_before is None or clean_after is None:
+        return "Stopped before the hardened model was measured."
+    text = (
+        f"Of {after.count} held-out scenes the searches leave {after.right} right, "
+        f"before {before.right}; "
+        f"of {clean_after.count} plain pictures {clean_after.right} are right, before "
+        f"{clean_before.right}."
+    )
+    for when, share in (("Now", clean_after), ("Before", clean_before)):
+        outcomes = wording.outcomes_text(share.outcomes, result.task)
+        if outcomes:
+            text += f" {when}, the other plain pictures are {outcomes}."
+    if result.lost is not None:
+        text += (
+            f" Scene by scene: {result.gained} got better, {result.lost} worse "
+            f"(p = {result.p:.2g}, for scenes of these objects; of other objects it "
+            "says nothing)."
+        )
+    return text
 
 
 def claims(result: HardenResult) -> Iterator[views.Claim]:

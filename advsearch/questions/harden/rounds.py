@@ -1,6 +1,8 @@
-"""The rounds of a hardening: scenes are drawn, a copy of the model is trained on all of
-them, and that part of the way to its weights is kept which is best on scenes that it
-was not trained on.
+"""The rounds of a hardening.
+
+Each round samples scenes, trains a copy of the model on all scenes so far, and
+interpolates between the original and the trained weights: the result is the
+interpolation that is best on validation scenes.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 
-# by optimisers, too: before there are scenes, whose changes make Python collect what is
-# new
+# Optimizers import it too; it is imported before there are scenes, since importing with
+# many objects alive makes Python's garbage collection slow.
 import torch._dynamo
 from safetensors import torch as safetensors
 from torch import Tensor, nn
@@ -27,45 +29,45 @@ from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.result import TrainingRound
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneWork
 
-WEIGHTS = "artifacts/hardened.safetensors"  # the weights that are kept, in the run
-ROUND = "artifacts/round-{:03d}.safetensors"  # those after each round
-ROUNDS = "rounds"  # the note of what each round came to
+WEIGHTS = "artifacts/hardened.safetensors"
+"""File of the best weights in the run."""
+ROUND = "artifacts/round-{:03d}.safetensors"
+"""File of the weights after each round."""
+ROUNDS = "rounds"
+"""Note of a run: the result of each round."""
 LARGEST_GRADIENT_NORM = 2.0
-JUDGED = 168  # scenes by which weights are chosen, at most
+JUDGED = 168
+"""Limit of the number of validation scenes."""
 PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
-"""Of the way from the weights that were given to the trained ones, which are judged."""
+"""Interpolations that are evaluated: 0 is the original weights, 1 the trained ones."""
 
 MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
-# leaves the gradient of a batch with the parameters
 Take = Callable[[Sequence[Any], np.random.Generator], None]
+"""Computes the gradient of a batch of items, and leaves it with the parameters."""
 
 
 class Score(NamedTuple):
-    """How a model does on scenes that it was not trained on: its share of plain
-    pictures, and of the worst ones.
-    """
+    """Accuracy on validation scenes: of plain images, and of the worst ones."""
 
     clean: float
     robust: float
 
 
 class Course(ABC):
-    """How models of one kind are trained, on items of which each has one picture of a
-    scene or more.
+    """Trains models of one task on items, each of which has images of a scene.
 
     Attributes:
-        work, student: what draws from scenes, with the model as it was given; the copy
-            that is trained.
-        optimiser: makes one of the parameters, whose own learning rate counts; None for
-            AdamW.
-        own: items that are trained on beside those that are drawn.
-        further: scenes that are drawn on top of each one of the training.
-        views: that are drawn of a scene of the training, and of one by which weights
-            are chosen.
-        batch, warm_up: items of a step; share of the steps in which the learning rate
-            rises.
-        average: weight of the past in the average of the weights, per step, which a
-            round ends with.
+        work: samples items from scenes; it has the original model.
+        student: the copy that is trained.
+        optimiser: creates the optimizer of the parameters, with a learning rate of its
+            own; None for AdamW.
+        custom_items: items that are trained on along with the sampled ones.
+        further: scenes that are sampled in addition to each one of the training.
+        views: number of views of a training scene, and of a validation scene.
+        batch: items of a step.
+        warm_up: fraction of the steps in which the learning rate rises.
+        average: decay per step of the running average of the weights, which a round
+            ends with.
     """
 
     batch: ClassVar[int]
@@ -79,46 +81,53 @@ class Course(ABC):
         work: SceneWork,
         student: Trainable,
         optimiser: MakeOptimiser | None = None,
-        own: Sequence[Any] = (),
+        custom_items: Sequence[Any] = (),
     ) -> None:
         self.work = work
         self.config = work.config
         self.student = student
         self.optimiser = optimiser
-        self.own = own
+        self.custom_items = custom_items
 
     @property
     def further(self) -> int:
+        """Scenes that are sampled in addition to each one of the training."""
         return 0
 
     @abstractmethod
     def draw(self, title: str, split: str, places: range) -> list[Any]:
-        """Return items of the scenes with these numbers of a split; `title` is what the
-        progress says.
+        """Sample the items of scenes.
+
+        Args:
+            title: of the stage that the progress reports.
+            split: that the scenes belong to.
+            places: numbers of the scenes.
         """
 
     @abstractmethod
     def looks(self, item: Any) -> int:
-        """Return how often an epoch looks at an item."""
+        """Return how often an epoch uses an item."""
 
     @abstractmethod
     def gradients(self, new: Sequence[Any]) -> AbstractContextManager[Take]:
-        """Begin a round in which these are new; inside there is what takes
-        gradients.
+        """Return a context in which gradients are computed.
+
+        Args:
+            new: items that no earlier round has used.
         """
 
     @abstractmethod
     def score(self, held_back: Sequence[Any]) -> Score:
-        """Judge the student on items that it was not trained on, which stay as they
-        are.
-        """
+        """Evaluate the student on items of the validation, which are not changed."""
 
     @abstractmethod
     def save(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
-        """Write the pictures of a round's new items into `PICTURES` of the run."""
+        """Write the images of a round's new items into `PICTURES` of the run."""
 
     def steps(self, pool: Sequence[Any]) -> int:
-        return self.config.epochs * -(-sum(map(self.looks, pool)) // self.batch)
+        """Return the number of optimizer steps of a round."""
+        n_items = sum(self.looks(item) for item in pool)
+        return self.config.epochs * math.ceil(n_items / self.batch)
 
     def round(
         self,
@@ -127,57 +136,74 @@ class Course(ABC):
         new: Sequence[Any] = (),
         tick: Callable[[], None] = lambda: None,
     ) -> None:
-        """Train on items in an order that the number of the round decides."""
+        """Train the student on items.
+
+        Args:
+            number: of the round, which decides the order of the items.
+            pool: all items.
+            new: those that no earlier round has used.
+            tick: is called after each step.
+        """
         parameters = self.student.parameters()
-        rate = self.config.rate
-        make = self.optimiser or partial(
-            torch.optim.AdamW, lr=rate, weight_decay=self.weight_decay
-        )
-        optimiser = make(parameters)
-        n_rates = self.steps(pool) + 1
-        rates = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, [float(group["lr"]) for group in optimiser.param_groups], total_steps=n_rates,
-            pct_start=warm_up_fraction(self.warm_up, n_rates), cycle_momentum=False,
-        )  # fmt: skip
+        optimizer, schedule = self._make_optimizer(parameters, self.steps(pool))
         average = [parameter.detach().clone() for parameter in parameters]
-        done = 0
+        n_steps = 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
-        places = [
-            place for place, item in enumerate(pool) for _ in range(self.looks(item))
+        indices = [
+            index for index, item in enumerate(pool) for _ in range(self.looks(item))
         ]
-        with self.gradients(new) as take:
+        with self.gradients(new) as compute_gradient:
             for _ in range(self.config.epochs):
-                order = rng.permutation(places)
-                for begin in range(0, len(order), self.batch):
-                    take(
-                        [pool[place] for place in order[begin : begin + self.batch]],
-                        rng,
-                    )
+                order = rng.permutation(indices)
+                for start in range(0, len(order), self.batch):
+                    batch = [pool[index] for index in order[start : start + self.batch]]
+                    compute_gradient(batch, rng)
                     nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
-                    optimiser.step()
-                    rates.step()
-                    done += 1
-                    decay = min(self.average, done / (done + 5))
-                    for kept, parameter in zip(average, parameters, strict=True):
-                        kept.lerp_(parameter.detach(), 1.0 - decay)
+                    optimizer.step()
+                    schedule.step()
+                    n_steps += 1
+                    decay = min(self.average, n_steps / (n_steps + 5))
+                    for mean, parameter in zip(average, parameters, strict=True):
+                        mean.lerp_(parameter.detach(), 1.0 - decay)
                     tick()
         with torch.no_grad():
-            for kept, parameter in zip(average, parameters, strict=True):
-                parameter.copy_(kept)
+            for mean, parameter in zip(average, parameters, strict=True):
+                parameter.copy_(mean)
+
+    def _make_optimizer(
+        self, parameters: Sequence[nn.Parameter], n_steps: int
+    ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
+        """Create the optimizer of a round, and its schedule of learning rates."""
+        make_optimizer = self.optimiser or partial(
+            torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
+        )
+        optimizer = make_optimizer(parameters)
+        # The schedule makes a step after the last step of the optimizer.
+        n_rates = n_steps + 1
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer,
+            [float(group["lr"]) for group in optimizer.param_groups],
+            total_steps=n_rates,
+            pct_start=warm_up_fraction(self.warm_up, n_rates),
+            cycle_momentum=False,
+        )
+        return optimizer, schedule
 
 
 def warm_up_fraction(fraction: float, n_rates: int) -> float:
-    """Return the fraction of the steps in which the rate rises, or a little more where
-    that is a single step.
+    """Return the fraction of the steps in which the learning rate rises.
 
-    OneCycleLR divides by the steps of its rise but one.
+    It is a little larger where that is a single step, since OneCycleLR divides by the
+    steps of its rise less one.
     """
     return fraction * 1.001 if math.isclose(fraction * n_rates, 1.0) else fraction
 
 
 class Rounds:
-    """The rounds of a run; `done` is what each came to, of which the first is the model
-    as it was.
+    """The rounds of a run.
+
+    Attributes:
+        done: the result of each round that has ended; the first is the original model.
     """
 
     def __init__(self, run: RunDirectory, course: Course) -> None:
@@ -186,132 +212,153 @@ class Rounds:
         self.config = course.config
         self.progress = course.work.progress
         self.done = [
-            TrainingRound.of(noted)
-            for noted in json.loads(run.store.note(ROUNDS) or "[]")
+            TrainingRound.of(fields)
+            for fields in json.loads(run.store.note(ROUNDS) or "[]")
         ]
 
     @property
     def judged(self) -> int:
-        """Scenes by which weights are chosen, for each control: a third as many as a
-        round adds, up to `JUDGED`.
+        """Number of validation scenes for each control.
+
+        A third as many as a round adds, up to `JUDGED`.
         """
-        return min(-(-self.config.scenes // 3), JUDGED)
+        return min(math.ceil(self.config.scenes / 3), JUDGED)
 
     @property
     def best(self) -> int:
-        """The round whose weights are kept: the most robust one whose clean accuracy is
-        within what may be lost.
-        """
+        """The most robust round whose clean accuracy has fallen by no more than allowed."""
         allowed = [
-            number for number, done in enumerate(self.done) if self._allowed(done.clean)
+            number
+            for number, training_round in enumerate(self.done)
+            if self._allowed(training_round.clean)
         ]
         return max(
             allowed, key=lambda number: (self.done[number].robust, number), default=0
         )
 
     def _allowed(self, clean: float) -> bool:
+        """Return whether a clean accuracy has fallen by no more than allowed."""
         return clean >= self.done[0].clean - self.config.clean_loss - 1e-9
 
     def carry_out(self) -> None:
-        """Do what is left of the rounds; the student has the best weights afterwards,
-        which the run keeps.
+        """Run the rounds that are left, and write the best weights.
+
+        Afterwards the student has the best weights.
         """
         course = self.course
         config = self.config
-        net = self.course.student.net
+        network = course.student.net
         if len(self.done) <= config.rounds:
-            pool = list(course.own)
-            begun = 0
-            held_back = course.draw(
-                "drawing scenes to choose weights by", VALIDATION, range(self.judged)
-            )
+            pool = list(course.custom_items)
+            n_trained = 0
+            title = "drawing scenes to choose weights by"
+            held_back = course.draw(title, VALIDATION, range(self.judged))
             if not self.done:
                 self.progress.stage("judging the model as it is")
                 self.keep(0, [], course.score(held_back), 0, 0.0)
             for number in range(1, config.rounds + 1):
-                net.load_state_dict(self._weights(number - 1))
-                places = range((number - 1) * config.scenes, number * config.scenes)
-                new = course.draw(f"round {number}: drawing scenes", TRAINING, places)
-                pool += new
+                network.load_state_dict(self._weights(number - 1))
+                scene_numbers = range(
+                    (number - 1) * config.scenes, number * config.scenes
+                )
+                title = f"round {number}: drawing scenes"
+                new_items = course.draw(title, TRAINING, scene_numbers)
+                pool += new_items
                 if number < len(self.done):
-                    continue  # done before this run was stopped
+                    continue  # it ended before this run was stopped
                 self.progress.stage(f"round {number}: training", course.steps(pool))
                 with workbench.all_for_torch():
-                    # others are as hard as their training left them
+                    # Earlier items are as hard as their training left them.
                     course.round(
-                        number, pool, pool[begun:], lambda: self.progress.advance(1)
+                        number, pool, pool[n_trained:], lambda: self.progress.advance(1)
                     )
                     self.progress.stage(
                         f"round {number}: choosing weights", len(PARTS), at_most=True
                     )
-                    judged, part = self.mixed(held_back)
-                begun = len(pool)
-                self.keep(number, new, judged, len(pool), part)
-        net.load_state_dict(self._weights(self.best))
+                    score, part = self.mixed(held_back)
+                n_trained = len(pool)
+                self.keep(number, new_items, score, len(pool), part)
+        network.load_state_dict(self._weights(self.best))
         self._save(WEIGHTS)
 
     def mixed(self, held_back: Sequence[Any]) -> tuple[Score, float]:
-        """Leave the student with the best part of the way from the weights that were
-        given; return its score and it.
+        """Set the student to the best interpolation between original and trained weights.
 
-        The best one is right most often on the worst pictures among those that lose no
-        more on plain ones than they may; where all lose more, it is the one that loses
-        least. Less of the way learned less: once that shows, the smaller parts are not
-        looked at, as each costs a search of its own.
+        The best one is right most often on the worst images among those whose clean
+        accuracy has fallen by no more than allowed; if all have fallen more, it is the
+        one with the best clean accuracy. Interpolations nearer to the original have
+        learned less. Once that shows, the others are not evaluated, as each costs a
+        search of its own.
+
+        Returns:
+            Its score, and the interpolation: a member of `PARTS`.
         """
-        net = self.course.student.net
-        given = self._weights(0)
-        scores = dict[float, Score]()
-        learned = {name: weight.clone() for name, weight in net.state_dict().items()}
+        network = self.course.student.net
+        original = self._weights(0)
+        trained = {
+            name: weight.clone() for name, weight in network.state_dict().items()
+        }
 
-        def take(part: float) -> None:
-            mixed = {name: torch.lerp(given[name], weight, part) for name, weight in learned.items()
-                     if weight.is_floating_point()}  # fmt: skip
-            net.load_state_dict({**learned, **mixed})
-
-        for part in PARTS:
-            take(part)
-            scores[part] = self.course.score(held_back)
-            self.progress.advance(1, worst=scores[part].robust)
-            allowed = {
-                part: score.robust
-                for part, score in scores.items()
-                if self._allowed(score.clean)
+        def interpolate(part: float) -> None:
+            interpolated = {
+                name: torch.lerp(original[name], weight, part)
+                for name, weight in trained.items()
+                if weight.is_floating_point()
             }
-            if allowed and [*allowed.values()][-1] < max(allowed.values()):
+            network.load_state_dict({**trained, **interpolated})
+
+        scores = dict[float, Score]()
+        allowed = dict[float, float]()
+        for part in PARTS:
+            interpolate(part)
+            score = self.course.score(held_back)
+            scores[part] = score
+            self.progress.advance(1, worst=score.robust)
+            if self._allowed(score.clean):
+                allowed[part] = score.robust
+            if allowed and list(allowed.values())[-1] < max(allowed.values()):
                 break
-        best = max(
-            allowed or scores,
-            key=lambda part: allowed[part] if allowed else scores[part].clean,
-        )
-        take(best)
-        return scores[best], best
+        if allowed:
+            best_part = max(allowed, key=allowed.__getitem__)
+        else:
+            best_part = max(scores, key=lambda part: scores[part].clean)
+        interpolate(best_part)
+        return scores[best_part], best_part
 
     def keep(
         self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float
     ) -> None:
-        """Keep the weights of a round, with its new pictures and what it came to."""
+        """Store the weights of a round, its new images and its result.
+
+        Args:
+            number: of the round.
+            new: its new items.
+            judged: the score of the weights.
+            trained: number of items that it was trained on.
+            part: the interpolation of the weights; see `mixed`.
+        """
         self._save(ROUND.format(number))
         self.course.save(self.run, number, new)
         self.done.append(
             TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False)
         )
-        self.run.store.set_note(
-            ROUNDS, json.dumps([done.model_dump() for done in self.done])
-        )
+        fields = [training_round.model_dump() for training_round in self.done]
+        self.run.store.set_note(ROUNDS, json.dumps(fields))
         clean, worst = map(wording.percent, judged)
         self.progress.message(
             f"round {number}: {clean} of plain pictures right, {worst} of the worst"
         )
 
     def _save(self, name: str) -> None:
-        # two names may be of one tensor, which safetensors refuses
+        """Write the student's weights into a file of the run."""
         state = self.course.student.net.state_dict()
-        kept = {
+        # Two names may belong to one tensor, which safetensors rejects.
+        cloned = {
             key: weight.clone(memory_format=torch.contiguous_format)
             for key, weight in state.items()
         }
-        self.run.write_file(name, safetensors.save(kept))
+        self.run.write_file(name, safetensors.save(cloned))
 
     def _weights(self, number: int) -> dict[str, Tensor]:
+        """Read the weights of a round."""
         return safetensors.load((self.run.path / ROUND.format(number)).read_bytes())

@@ -1,5 +1,6 @@
-"""What `harden` does with single scenes, here or on workers: draws lessons from one,
-attacks one, or looks at one.
+"""Work of `harden` on single scenes, in this process or on workers.
+
+A scene is sampled into lessons, attacked, or evaluated as it is.
 """
 
 from __future__ import annotations
@@ -34,46 +35,56 @@ from advsearch.questions.harden.objects import OBJECTS
 from advsearch.questions.harden.result import ALL, HardenConfig
 
 TRAINING = "training"
+"""Split that the weights are fitted to."""
 FURTHER = "further training"
+"""Split of further training scenes, mostly plain ones."""
 VALIDATION = "validation"
+"""Split that chooses among weights."""
 HELD_OUT = "held out"
-"""The splits: what the weights are fitted to (the second mostly as it is), what chooses
-among them, and what is measured in the end.
-"""
+"""Split that is measured in the end."""
 
-ROBUST = "robust"  # of a scene in which nothing was found; otherwise there is an ending
+ROBUST = "robust"
+"""Status of a scene in which no attack found a wrong prediction."""
 
 OVER: dict[str, dict[str, object]] = {
     "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
     "environment": {"rotation": [0.0, 360.0], "exposure": [-0.8, 0.5]},
 }
-"""What varies by chance from view to view, unless it is searched."""
+"""Ranges that vary at random from view to view, unless they are searched."""
 
-# random configurations of a view that is rendered to choose weights by, of which the
-# worst counts
 TRIES_TO_CHOOSE = 6
+"""Random configurations of a validation view that is rendered; the worst one counts."""
 CLEAN_SCENES = 4
+"""Held-out scenes whose plain images are evaluated, for each one that is attacked."""
 CLEAN_VIEWS = 2
+"""Views of each of these scenes."""
 CLEAN_SPP = 16
-"""Held-out scenes whose plain pictures are looked at, for each one that is attacked,
-the views of each, and their samples a pixel.
-"""
+"""Samples per pixel of these views."""
 
 STRONGER = {
     "name": "portfolio",
     "policies": [{"name": "restarts", "policy": "pgd"}, "cmaes", "random"],
 }
-"""The policy of the stronger search, with three times the steps."""
+"""The policy of the stronger search."""
 TIMES = 3
+"""Steps of the stronger search as a multiple of the usual steps."""
 
-# a method of `SceneWork` and its arguments: what is wanted of the scene `number`
 Wanted = partial[Any]
+"""A job: a method of `SceneWork` with its arguments, among which is a `number`."""
 
 
 @dataclass
 class SceneWork:
-    """What is done with single scenes and the given model: pure functions, carried out
-    here or by an executor.
+    """Runs jobs on single scenes with the original model, here or on workers.
+
+    The jobs are pure functions.
+
+    Attributes:
+        config: the settings.
+        model: the original model.
+        splits: by name.
+        progress: reports the jobs.
+        executor: runs the jobs on workers; None runs them here.
     """
 
     config: HardenConfig
@@ -83,108 +94,129 @@ class SceneWork:
     executor: Any = None
 
     def __call__(self, wanted: Iterable[Wanted]) -> list[Any]:
-        return [each(self) for each in wanted]
+        return [job(self) for job in wanted]
 
     def each(
         self, title: str, wanted: Sequence[Wanted], hint: str = ""
     ) -> Iterator[tuple[int, Any]]:
-        """Have done what is wanted of scenes; yield the place of each and what came of
-        it, in any order.
+        """Run jobs, and yield the index and the result of each in any order.
+
+        Args:
+            title: of the stage that the progress reports.
+            wanted: the jobs.
+            hint: how to shorten the stage.
         """
         self.progress.stage(title, len(wanted), hint=hint)
-        places = {id(each): place for place, each in enumerate(wanted)}
+        index_of_job = {id(job): index for index, job in enumerate(wanted)}
         executor = self.executor or workbench.InProcess(self)
-        for done in executor.results([each] for each in wanted):
-            (each,) = done.items
-            (value,) = done.require_value(f"harden, scene {each.keywords['number']}")
-            self.progress.advance(
-                1, **({} if executor.facts is None else executor.facts.told)
-            )
-            yield places[id(each)], value
+        for batch in executor.results([job] for job in wanted):
+            (job,) = batch.items
+            (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
+            progress_facts = {} if executor.facts is None else executor.facts.told
+            self.progress.advance(1, **progress_facts)
+            yield index_of_job[id(job)], value
 
     def drawn(
-        self, *, side: str, number: int, controls: Sequence[str], views: int, plain: int, shared: bool = False,
-        beside: Sequence[str] = (),
-    ) -> list[Lesson]:  # fmt: skip
-        """Draw lessons of a scene of a side: views that its controls make harder
-        together, in which those `beside` vary by chance and which may share one
-        adversarial texture, and `plain` views of it as it is.
+        self,
+        *,
+        split: str,
+        number: int,
+        controls: Sequence[str],
+        views: int,
+        plain: int,
+        shared: bool = False,
+        varying_controls: Sequence[str] = (),
+    ) -> list[Lesson]:
+        """Make lessons of a scene.
+
+        Args:
+            split: name of the split.
+            number: of the scene.
+            controls: that make the views harder together.
+            views: number of views that are made harder.
+            plain: number of further views of the plain scene.
+            shared: whether the views share one adversarial texture.
+            varying_controls: further controls that vary at random.
         """
-        problem, seed = self.problem(self.splits[side], number, controls, beside)
-        tries = TRIES_TO_CHOOSE if side == VALIDATION else None
+        problem, seed = self.problem(
+            self.splits[split], number, controls, varying_controls
+        )
+        tries = TRIES_TO_CHOOSE if split == VALIDATION else None
         return lessons(problem, views, seed, plain=plain, tries=tries, shared=shared)
 
     def attacked(
         self, *, control: str, number: int, times: int, weights: bytes | None = None
     ) -> str:
-        """Attack a held-out scene, `times` as long as usual: more than once is the
-        stronger search. Weights of the model are safetensors; None for those that it
-        was given with. Return how it ended: `ROBUST` where it found nothing and the
-        clean scene is right in as many trials as a verified answer would have to be
-        wrong in.
+        """Attack a held-out scene, and return the status of the attack.
+
+        `ROBUST` if it found nothing, and the clean scene is right in as many trials as
+        an adversarial scene would have to be wrong in.
+
+        Args:
+            control: that is searched.
+            number: of the scene.
+            times: multiple of the usual steps; more than one is the stronger search.
+            weights: of the model, safetensors; None for the original ones.
         """
         name, scene = self.splits[HELD_OUT].scene(
             number, workbench.scene_settings(self.config)
         )
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
-        harder = (
-            {}
-            if times == 1
-            else {"policy": STRONGER, "steps": times * self.config.steps}
-        )
-        config = self.attack((control,), name, seed=seed, **harder)
-        return attacked(
-            config, scene, self.model if weights is None else self.with_weights(weights)
-        )
+        search: dict[str, Any] = {}
+        if times > 1:
+            search = {"policy": STRONGER, "steps": times * self.config.steps}
+        config = self.attack((control,), name, seed=seed, **search)
+        model = self.model if weights is None else self.with_weights(weights)
+        return attack_scene(config, scene, model)
 
     def looked_at(self, *, number: int, weights: bytes) -> dict[str, list[Any]]:
-        """Return whether plain pictures of a held-out scene are right "before", with
-        the given weights, and "after"; and under "outcomes before" and "outcomes after"
-        what becomes of the object in those that are not.
+        """Evaluate the model on plain images of a held-out scene.
+
+        Returns:
+            Under "before" and "after" whether each image is right, with the original
+            and with the given weights; under "outcomes before" and "outcomes after"
+            what becomes of the object in those that are not.
         """
-        side = self.splits[HELD_OUT]
-        right = dict[str, list[Any]]()
-        problem, _ = self.problem(side, number, tuple(self.config.controls)[:1])
+        split = self.splits[HELD_OUT]
+        results_by_name = dict[str, list[Any]]()
+        problem, _ = self.problem(split, number, tuple(self.config.controls)[:1])
         for view in range(CLEAN_VIEWS):
-            seed = seeds.stream(side.seed, "plain", number * CLEAN_VIEWS + view)
-            picture = problem.picture(problem.domain.start, seed, CLEAN_SPP)[None]
+            seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
+            image = problem.picture(problem.domain.start, seed, CLEAN_SPP)[None]
             truth = problem.truth(problem.whole(problem.domain.start, seed))
-            for when, model in (
-                ("before", self.model),
-                ("after", self.with_weights(weights)),
-            ):
+            models = {"before": self.model, "after": self.with_weights(weights)}
+            for when, model in models.items():
                 with torch.no_grad():
-                    judgement = problem.task.judge(model(picture), truth)[0]
-                right.setdefault(when, []).append(judgement.right)
-                if not judgement.right and judgement.outcome is not None:
-                    right.setdefault(f"outcomes {when}", []).append(
-                        judgement.outcome.value
-                    )
-        return right
+                    evaluation = problem.task.judge(model(image), truth)[0]
+                results_by_name.setdefault(when, []).append(evaluation.right)
+                if not evaluation.right and evaluation.outcome is not None:
+                    outcomes = results_by_name.setdefault(f"outcomes {when}", [])
+                    outcomes.append(evaluation.outcome.value)
+        return results_by_name
 
     def with_weights(self, weights: bytes) -> Model:
+        """Return the model with other weights, safetensors."""
         network = self.model.copy_network()
         network.load_state_dict(safetensors.load(weights))
         return self.model.with_network(network)
 
     @cached_property
     def linear(self) -> tuple[str, ...]:
-        """The controls whose pictures a matrix of light transport says."""
+        """The controls whose images a matrix of light transport gives."""
         return tuple(
             control for control in self.config.controls if self._has_matrix(control)
         )
 
     @property
     def rendered(self) -> tuple[str, ...]:
+        """The controls whose images have to be rendered."""
         return tuple(
             control for control in self.config.controls if control not in self.linear
         )
 
     @cached_property
     def beside(self) -> tuple[str, ...]:
-        """The controls that are rendered which can vary by chance beside every
-        matrix.
-        """
+        """The rendered controls that can vary at random while a matrix is used."""
         return tuple(
             name
             for name in self.rendered
@@ -192,68 +224,81 @@ class SceneWork:
         )
 
     def _has_matrix(self, *controls: str) -> bool:
-        """Whether a matrix says the pictures of the first control, the others varying
-        by chance.
+        """Return whether a matrix gives the images of the first control.
+
+        The others vary at random.
         """
         try:
-            return self.problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[
-                0
-            ].is_linear
+            problem, _ = self.problem(
+                self.splits[TRAINING], 0, controls[:1], controls[1:]
+            )
+            return problem.is_linear
         except InputError:
             if len(controls) > 1:
                 return False
             raise
 
     @cached_property
-    def _measured(self) -> frozenset[str]:
-        return frozenset(
-            map(
-                fingerprint,
-                self.splits[HELD_OUT].assets(CLEAN_SCENES * self.config.measured),
-            )
-        )
+    def _held_out_fingerprints(self) -> frozenset[str]:
+        """The fingerprints of the objects that are measured."""
+        n_scenes = CLEAN_SCENES * self.config.measured
+        held_out_objects = self.splits[HELD_OUT].assets(n_scenes)
+        return frozenset(fingerprint(asset) for asset in held_out_objects)
 
     def problem(
         self,
-        side: SceneSide,
+        split: SceneSide,
         number: int,
         controls: Sequence[str],
-        beside: Sequence[str] = (),
+        varying_controls: Sequence[str] = (),
     ) -> tuple[Problem, int]:
-        """Return what a scene is searched as, with controls that vary by chance
-        `beside`, and the root of its draws.
+        """Return the problem of a scene, and the root seed of its samples.
+
+        Args:
+            split: the split.
+            number: of the scene.
+            controls: that are searched.
+            varying_controls: that vary at random.
         """
-        name, scene = side.scene(number, workbench.scene_settings(self.config))
-        if side.name != HELD_OUT:
-            check_unmeasured(scene.description.object, self._measured)
-        kinds = {
+        name, scene = split.scene(number, workbench.scene_settings(self.config))
+        if split.name != HELD_OUT:
+            check_unmeasured(scene.description.object, self._held_out_fingerprints)
+        control_types = {
             control.partition(":")[0].partition(".")[0]
-            for control in (*controls, *beside)
+            for control in (*controls, *varying_controls)
         }
-        over = {other: ranges for other, ranges in OVER.items() if other not in kinds}
-        over |= {control: self.config.controls[control] for control in beside}
-        problem = workbench.problem_of(
-            self.attack(controls, name, over=over),
-            scene,
-            self.model,
-            differentiated=False,
-        )
-        return problem, seeds.stream(side.seed, "views", number)
+        over = {
+            control_type: ranges
+            for control_type, ranges in OVER.items()
+            if control_type not in control_types
+        }
+        over |= {control: self.config.controls[control] for control in varying_controls}
+        config = self.attack(controls, name, over=over)
+        problem = workbench.problem_of(config, scene, self.model, differentiated=False)
+        return problem, seeds.stream(split.seed, "views", number)
 
     def attack(
         self, controls: Sequence[str], name: str, **changes: object
     ) -> AttackConfig:
-        """Return what some of the controls are searched with, on an object of a
-        name.
+        """Return the settings of an attack.
+
+        Args:
+            controls: that are searched.
+            name: of the object.
+            changes: to the settings.
         """
         searched = {control: self.config.controls[control] for control in controls}
-        changed: dict[str, Any] = {}  # None is what none of the controls takes
+        # A setting that none of the controls takes is None.
+        changed: dict[str, Any] = {}
         for control, ranges in searched.items():
-            alone = workbench.settings_alone(self.config, control, ranges)
-            taken = {
-                setting: value for setting, value in alone.items() if value is not None
+            control_settings = workbench.settings_alone(self.config, control, ranges)
+            set_values = {
+                setting: value
+                for setting, value in control_settings.items()
+                if value is not None
             }
-            changed = settings.merged({**dict.fromkeys(alone), **changed}, taken)
+            unset = dict.fromkeys(control_settings)
+            changed = settings.merged({**unset, **changed}, set_values)
         changed |= {
             "object": name,
             "environment": None,
@@ -272,38 +317,34 @@ class SceneWork:
         )
 
 
-def scenes_of(described: Mapping[str, Any]) -> SceneWork:
-    """Return what does what is wanted of scenes of the hardening that settings
-    describe: what a worker does.
-    """
+def load_scene_work(described: Mapping[str, Any]) -> SceneWork:
+    """Load what a worker needs to run jobs on scenes, by the fields of the settings."""
     config = HardenConfig(**described)
     (model, *_), _ = workbench.load_models(
         [config.model], workbench.make_task(config.task), config
     )
-    # what a scene leaves is collected after each; a sixth of the time goes into looking
-    # at all the rest
+    # Garbage is collected after each scene. A sixth of the time would go into visiting
+    # the objects that exist by now.
     gc.freeze()
     return SceneWork(config, model, splits_of(config, model))
 
 
-def attacked(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack, and return how it ended; `ROBUST` where nothing was found and the clean
-    scene is steadily right.
-    """
+def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
+    """Attack a scene, and return the status; see `SceneWork.attacked`."""
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
         raise KeyboardInterrupt
     if summary.ending in ("found", "already wrong"):
         return summary.ending
     control = summary.clean.control
-    steady = control is not None and control.correct >= workbench.WORST_CASE.needed(
-        control.trials
-    )
-    return ROBUST if steady else "unsteady"
+    if control is None:
+        return "unsteady"
+    n_needed = workbench.WORST_CASE.needed(control.trials)
+    return ROBUST if control.correct >= n_needed else "unsteady"
 
 
 # ---- the split
-# ------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------
 
 RANGES = {
     "camera.azimuth": (0.0, 360.0),
@@ -311,16 +352,21 @@ RANGES = {
     "camera.fov": (25.0, 45.0),
     "environment.rotation": (0.0, 360.0),
 }
-"""Ranges from which scenes draw parameters, in degrees."""
-# the range of the ground's level, sRGB, around which the channels differ
+"""Ranges from which scenes sample parameters, in degrees."""
 GROUND = (0.1, 0.9)
+"""Range of the ground's brightness, sRGB, around which the channels differ."""
 
 
 @dataclass(frozen=True)
 class SceneSide:
-    """One side of the split: objects (bundled ones, or files) and environments, and the
-    root of its draws. With `varied` each scene has an environment of its own, made from
-    one of these.
+    """One part of the split, which has scenes by number.
+
+    Attributes:
+        name: of the part.
+        objects: names of bundled objects, or files.
+        environments: names or files.
+        seed: root of the samples.
+        varied: whether each scene has a random variation of an environment.
     """
 
     name: str
@@ -332,48 +378,41 @@ class SceneSide:
     def scene(
         self, number: int, given: Mapping[str, Any] | None = None
     ) -> tuple[str, workbench.Scene]:
-        """Return the scene with this number, from 0, and the name of its object; the
-        objects take turns. Parameters that are given are fixed. An object in a file
-        without a label is called as it: ``coffee-mug.glb``, "coffee mug".
+        """Return a scene, and the name of its object.
+
+        The objects take turns. An object in a file without a label is named after the
+        file: ``coffee-mug.glb`` is a "coffee mug".
+
+        Args:
+            number: of the scene, from 0.
+            given: parameters with fixed values.
         """
         name = self.objects[number % len(self.objects)]
         rng = self._draws(number)
-        made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
+        asset = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
-        ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
-        drawn = {parameter: rng.uniform(*ends) for parameter, ends in RANGES.items()}
-        drawn |= dict(
-            zip(
-                ("ground.red", "ground.green", "ground.blue"),
-                ground.tolist(),
-                strict=True,
-            )
-        )
-        scene = workbench.load_scene(
-            made, environment, settings={**drawn, **(given or {})}
-        )
-        described = scene.description
-        if self.varied and described.environment is not None:
-            light = white_light_changed(varied(described.environment, rng), rng)
-            described = replace(described, environment=light)
-        if described.object.label is None:
+        scene_settings = {**_sample_scene_settings(rng), **(given or {})}
+        scene = workbench.load_scene(asset, environment, settings=scene_settings)
+        description = scene.description
+        if self.varied and description.environment is not None:
+            light = white_light_changed(varied(description.environment, rng), rng)
+            description = replace(description, environment=light)
+        if description.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
-            described = replace(
-                described, object=replace(described.object, label=label)
-            )
-        return name, scene if described is scene.description else workbench.Scene(
-            described
-        )
+            labelled_object = replace(description.object, label=label)
+            description = replace(description, object=labelled_object)
+        if description is not scene.description:
+            scene = workbench.Scene(description)
+        return name, scene
 
     def _draws(self, number: int) -> np.random.Generator:
+        """Return the random generator of a scene."""
         return np.random.default_rng(
             [seeds.stream(self.seed, f"{self.name} scene", number)]
         )
 
     def assets(self, count: int) -> Iterator[assets.ObjectAsset]:
-        """Yield the objects of the first `count` scenes; what a file holds comes
-        once.
-        """
+        """Yield the objects of the first `count` scenes, those in files only once."""
         for number in range(count):
             name = self.objects[number % len(self.objects)]
             if name in OBJECTS:
@@ -382,22 +421,29 @@ class SceneSide:
                 yield self.scene(number)[1].description.object
 
 
+def _sample_scene_settings(rng: np.random.Generator) -> dict[str, float]:
+    """Sample the color of the ground, and the parameters in `RANGES`."""
+    ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
+    scene_settings = {
+        parameter: rng.uniform(*bounds) for parameter, bounds in RANGES.items()
+    }
+    for channel, value in zip(("red", "green", "blue"), ground.tolist(), strict=True):
+        scene_settings[f"ground.{channel}"] = value
+    return scene_settings
+
+
 def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
-    """Return the sides of the split by name; an InputError where there is nothing on a
-    side.
+    """Return the parts of the split by name.
+
+    Raises:
+        InputError: the model has a class for no object, or an object in a file has no
+            held-out instance.
     """
-
-    def has_class(label: str) -> bool:
-        try:
-            return bool(model.label_set(label).indices)
-        except InputError:
-            return False
-
     objects = tuple(OBJECTS) if config.object == ALL else config.objects
     known = tuple(
         name
         for name in objects
-        if name not in OBJECTS or has_class(OBJECTS[name].label)
+        if name not in OBJECTS or _has_class(model, OBJECTS[name].label)
     )
     if not known:
         raise InputError(
@@ -410,46 +456,68 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
             f"held_out: {', '.join(files)} has no other instances; name objects of its "
             "class that training never sees"
         )
-    lit = [
-        settings.split_names(names)
-        if names
-        else workbench.library.list_environments(bundled)
-        for names, bundled in (
-            (config.environment, "train"),
-            (config.held_out_environment, "heldout"),
+    training_environments = _environments(config.environment, "train")
+    splits = {
+        name: SceneSide(
+            name,
+            known,
+            training_environments,
+            seeds.stream(config.seed, name),
+            varied=True,
         )
-    ]
-    sides = {name: (known, lit[0], True) for name in (TRAINING, FURTHER, VALIDATION)}
-    sides[HELD_OUT] = (
-        known if config.held_out is None else settings.split_names(config.held_out),
-        lit[1],
-        False,
-    )
-    return {
-        name: SceneSide(name, a, b, seeds.stream(config.seed, name), c)
-        for name, (a, b, c) in sides.items()
+        for name in (TRAINING, FURTHER, VALIDATION)
     }
+    held_out_objects = known
+    if config.held_out is not None:
+        held_out_objects = settings.split_names(config.held_out)
+    splits[HELD_OUT] = SceneSide(
+        HELD_OUT,
+        held_out_objects,
+        _environments(config.held_out_environment, "heldout"),
+        seeds.stream(config.seed, HELD_OUT),
+    )
+    return splits
+
+
+def _has_class(model: Model, label: str) -> bool:
+    try:
+        return bool(model.label_set(label).indices)
+    except InputError:
+        return False
+
+
+def _environments(names: str | None, bundled_split: str) -> tuple[str, ...]:
+    """Return the environments of a setting; without it, those of a bundled split."""
+    if names:
+        return settings.split_names(names)
+    return workbench.library.list_environments(bundled_split)
 
 
 def fingerprint(asset: assets.ObjectAsset) -> str:
-    parts = asset.mesh.vertices, asset.mesh.faces, asset.base_color
-    return hashlib.sha256(
-        b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-    ).hexdigest()
+    """Return a hash of an object's mesh and texture."""
+    arrays = (asset.mesh.vertices, asset.mesh.faces, asset.base_color)
+    data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+    return hashlib.sha256(data).hexdigest()
 
 
 def check_disjoint(held: SceneSide, taught: Sequence[SceneSide]) -> None:
-    """Refuse, by an InputError, to measure what is trained on: one of the training's
-    environments, or of its files. Of each bundled object the first instance is looked
-    at; all others, which take minutes, when they are drawn.
+    """Check that nothing is measured that is trained on.
+
+    Of each bundled object only the first instance is compared here; all others, which
+    take minutes, when they are sampled.
+
+    Args:
+        held: the held-out part of the split.
+        taught: the other parts.
+
+    Raises:
+        InputError: an environment or a file is in both.
     """
-    both = sorted(
-        {name for split in taught for name in split.environments}
-        & set(held.environments)
-    )
-    if both:
+    training_environments = {name for split in taught for name in split.environments}
+    common = sorted(training_environments & set(held.environments))
+    if common:
         raise InputError(
-            f"held_out_environment: {', '.join(both)} is an environment "
+            f"held_out_environment: {', '.join(common)} is an environment "
             "of the training too; name others"
         )
     measured = set(map(fingerprint, held.assets(len(held.objects))))
@@ -459,8 +527,14 @@ def check_disjoint(held: SceneSide, taught: Sequence[SceneSide]) -> None:
 
 
 def check_unmeasured(asset: assets.ObjectAsset, measured: Set[str]) -> None:
-    """Refuse, by an InputError, to train on an object whose fingerprint is among those
-    of what is measured.
+    """Check that an object of the training is not measured.
+
+    Args:
+        asset: the object.
+        measured: fingerprints of what is measured.
+
+    Raises:
+        InputError: it is.
     """
     if fingerprint(asset) in measured:
         raise InputError(

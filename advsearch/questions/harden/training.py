@@ -1,6 +1,4 @@
-"""How a classifier is hardened: it learns lessons, plain pictures and worst ones, and
-what it said of plain ones.
-"""
+"""Train a classifier on plain and worst images, and keep its plain predictions."""
 
 from __future__ import annotations
 
@@ -31,30 +29,26 @@ from advsearch.questions.harden.result import PLAIN_SCENES, RENDERED_SCENES
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, SceneWork, Wanted
 
-PART = 6  # lessons of a step that one thread works at
+PART = 6
+"""Lessons of a step that one thread works at."""
 FIRST_STEPS = 4
+"""Steps of the search of each texture before a training."""
 HELD_BACK_STEPS = 8
-"""Steps of each texture before a training, and of those that weights are judged on,
-from where a search begins.
-"""
+"""Steps of the search of the textures by which weights are chosen, from its start."""
 AUGMENTATION = Augmentation(
     smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0
 )
-"""What happens to pictures while they are trained on; the search for worse ones sees
-the same.
-"""
-# weight of the given model's answers to plain pictures, beside that of the right ones
+"""Of training images; the search for worse ones sees the same."""
 KEEP = 1.0
+"""Weight of the original model's predictions of plain images, relative to the loss."""
 MIXED = 0.5
+"""Fraction of the parts of a batch that mix their images."""
 MIXING = 0.4
-"""Share of the parts that mix pictures, and both parameters of the beta distribution
-that their weights come from.
-"""
+"""Both parameters of the beta distribution of the mixing weights."""
 SHARED = 0.25
+"""Fraction of the scenes with a texture in which all views have the same texture."""
 MOVED = 0.5
-"""Shares of the scenes with a texture in which all views have the same, and in which
-rendered controls vary too.
-"""
+"""Fraction of the scenes with a texture in which rendered controls vary too."""
 
 Examples = Iterable[tuple[Tensor, Tensor]]
 """Batches of images (N, H, W, 3) sRGB in [0, 1] and class indices (N,), such as a
@@ -63,8 +57,16 @@ Examples = Iterable[tuple[Tensor, Tensor]]
 
 
 class ClassifierCourse(Course):
-    """Keeps the answers to plain pictures of the model as it was given. Of the examples
-    `beside` a batch is taken with each step, from the start again when they end.
+    """Train a classifier on lessons.
+
+    It keeps the original model's predictions of plain images.
+
+    Args:
+        work: samples lessons from scenes.
+        student: the copy that is trained.
+        optimiser: creates the optimizer; None for AdamW.
+        beside: further batches, of which one is taken with each step. They are
+            repeated from the start when they end.
     """
 
     batch = 24
@@ -73,75 +75,99 @@ class ClassifierCourse(Course):
     average = 0.98
 
     def __init__(
-        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None,
+        self,
+        work: SceneWork,
+        student: Trainable,
+        optimiser: MakeOptimiser | None = None,
         beside: Examples | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(work, student, optimiser)
         self.views = (self.config.views, 2)
         self.beside = beside
-        self._further: Iterator[tuple[Tensor, Tensor]] = iter(())
+        self._example_batches: Iterator[tuple[Tensor, Tensor]] = iter(())
 
     @property
     def further(self) -> int:
         return RENDERED_SCENES if self.work.rendered else PLAIN_SCENES
 
     def draw(self, title: str, split: str, places: range) -> list[Lesson]:
-        """Return lessons of scenes: for each control whose pictures a matrix says, and
-        for all others together.
+        """Make lessons of the scenes of a split with these numbers.
 
-        In the training a fourth of the scenes have one texture for all views, in half
-        of them the controls that are rendered vary by chance, and further scenes come
-        on top: of what is rendered new scenes teach more than further views. Of what is
-        rendered one in so many scenes is drawn as it is, too: there the given model's
-        predictions count.
+        There are lessons for each control with a matrix of light transport, and for all
+        others together. In the training a fourth of the scenes have one texture for all
+        views, in half of them the rendered controls vary by chance, and further scenes
+        come on top: of what is rendered, new scenes teach more than further views. Each
+        rendered scene of the training has a plain lesson too, where the original
+        model's predictions count.
         """
-        linear = self.work.linear
+        jobs = self._matrix_jobs(split, places)
         rendered = self.work.rendered
-        training = split == TRAINING
-        views = self.views[not training]
-        further = range(self.further * places[0], self.further * (places[-1] + 1))
-
-        def drawing(
-            number: int, controls: Sequence[str], views: int, plain: int, **how: Any
-        ) -> Wanted:
-            how = {
-                "side": split,
-                "number": number,
-                "controls": controls,
-                "views": views,
-                "plain": plain,
-                **how,
-            }
-            return partial(SceneWork.drawn, **how)
-
-        wanted = list[Wanted]()
-        for control in linear:
-            for number in places:
-                shared, moved = (
-                    self.chance(control, number) if training else (False, False)
-                )
-                beside = self.work.beside if moved else ()
-                wanted.append(
-                    drawing(number, (control,), views, 1, shared=shared, beside=beside)
-                )
         if rendered:
-            wanted += [
-                drawing(number, rendered, *((1, 1) if training else (views, 0)))
+            n_views = 1
+            n_plain = 1
+            if split != TRAINING:
+                n_views = self.views[1]
+                n_plain = 0
+            jobs += [
+                _lesson_job(split, number, rendered, n_views, n_plain)
                 for number in places
             ]
-        if training:
-            more = (rendered, 1, 0) if rendered else (linear[:1], 0, 1)
-            wanted += [drawing(number, *more, side=FURTHER) for number in further]
-        drawn = dict(self.work.each(title, wanted))
-        return [lesson for place in range(len(wanted)) for lesson in drawn[place]]
+        if split == TRAINING:
+            jobs += self._further_jobs(places)
+        lessons_of_job = dict(self.work.each(title, jobs))
+        sampled_lessons: list[Lesson] = []
+        for index in range(len(jobs)):
+            sampled_lessons += lessons_of_job[index]
+        return sampled_lessons
+
+    def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Wanted]:
+        """Return the jobs of the controls that have a matrix of light transport."""
+        is_training = split == TRAINING
+        n_views = self.views[0] if is_training else self.views[1]
+        jobs = list[Wanted]()
+        for control in self.work.linear:
+            for number in scene_numbers:
+                shares_texture = False
+                varies = False
+                if is_training:
+                    shares_texture, varies = self.chance(control, number)
+                varying_controls = self.work.beside if varies else ()
+                jobs.append(
+                    _lesson_job(
+                        split,
+                        number,
+                        (control,),
+                        n_views,
+                        1,
+                        shared=shares_texture,
+                        varying_controls=varying_controls,
+                    )
+                )
+        return jobs
+
+    def _further_jobs(self, scene_numbers: range) -> list[Wanted]:
+        """Return the jobs of the further scenes of the training, of one view each."""
+        first = self.further * scene_numbers[0]
+        end = self.further * (scene_numbers[-1] + 1)
+        controls = self.work.linear[:1]
+        n_views = 0
+        n_plain = 1
+        if self.work.rendered:
+            controls = self.work.rendered
+            n_views = 1
+            n_plain = 0
+        return [
+            _lesson_job(FURTHER, number, controls, n_views, n_plain)
+            for number in range(first, end)
+        ]
 
     def chance(self, control: str, number: int) -> tuple[bool, bool]:
-        """Return whether all views of a scene share a texture, and others vary beside
-        it; not by turns, as objects.
+        """Return whether the views of a scene share a texture, and others vary too.
+
+        It is random, since objects take turns.
         """
-        shared, moved = np.random.default_rng(
-            seeds.stream(self.config.seed, f"views of {control}", number)
-        ).random(2)
+        seed = seeds.stream(self.config.seed, f"views of {control}", number)
+        shared, moved = np.random.default_rng(seed).random(2)
         return bool(shared < SHARED), bool(moved < MOVED)
 
     def looks(self, item: Lesson) -> int:
@@ -157,187 +183,266 @@ class ClassifierCourse(Course):
             )
 
     def _next(self) -> tuple[Tensor, Tensor] | None:
+        """Return the next batch of further examples; None if there are none."""
         if self.beside is None:
             return None
-        if (batch := next(self._further, None)) is None:
-            self._further = iter(self.beside)
-            batch = next(self._further)
+        batch = next(self._example_batches, None)
+        if batch is None:
+            self._example_batches = iter(self.beside)
+            batch = next(self._example_batches)
         return batch
 
     def score(self, held_back: Sequence[Lesson]) -> Score:
-        """Judge the student, by textures that are searched against it; plain lessons
-        count for `clean` alone.
+        """Evaluate the student on held-back lessons, which are not changed.
+
+        Textures are searched against the student. Plain lessons count only for the
+        clean accuracy.
         """
-        own = [copy.copy(lesson) for lesson in held_back]
+        searched = [copy.copy(lesson) for lesson in held_back]
         model = self.student.model
-        for lesson in own:
+        for lesson in searched:
             if isinstance(lesson, TextureLesson):
                 lesson.texture = lesson.texture.clone()
-        lessons.harder(own, model, HELD_BACK_STEPS)
-
-        def right(chosen: Sequence[Lesson], which: str) -> float:
-            right = 0
-            with torch.no_grad():
-                for begin in range(0, len(chosen), lessons.TOGETHER):
-                    part = chosen[begin : begin + lessons.TOGETHER]
-                    said = (
-                        model(torch.stack([getattr(lesson, which) for lesson in part]))
-                        .argmax(dim=1)
-                        .tolist()
-                    )
-                    right += sum(
-                        index in lesson.right
-                        for index, lesson in zip(said, part, strict=True)
-                    )
-            return right / len(chosen)
-
-        return Score(right(own, "plain"), right(with_worst(own), "worst"))
+        lessons.harder(searched, model, HELD_BACK_STEPS)
+        hard_lessons = with_worst(searched)
+        clean = _accuracy(model, searched, lambda lesson: lesson.plain)
+        robust = _accuracy(model, hard_lessons, lambda lesson: lesson.worst)
+        return Score(clean, robust)
 
     def save(self, run: RunDirectory, number: int, new: Sequence[Lesson]) -> None:
         lessons.save_pictures(run, number, new, self.student.model.labels)
 
 
+def _lesson_job(
+    split: str,
+    number: int,
+    controls: Sequence[str],
+    views: int,
+    plain: int,
+    **options: Any,
+) -> Wanted:
+    """Return the job that makes lessons of a scene; see `SceneWork.drawn`."""
+    return partial(
+        SceneWork.drawn,
+        split=split,
+        number=number,
+        controls=controls,
+        views=views,
+        plain=plain,
+        **options,
+    )
+
+
+def _accuracy(
+    model: Model, chosen: Sequence[Lesson], image_of: Callable[[Lesson], Tensor]
+) -> float:
+    """Return the fraction of lessons whose images (H, W, 3) a model gets right."""
+    n_right = 0
+    with torch.no_grad():
+        for start in range(0, len(chosen), lessons.TOGETHER):
+            batch = chosen[start : start + lessons.TOGETHER]
+            logits = model(torch.stack([image_of(lesson) for lesson in batch]))
+            predicted = logits.argmax(dim=1).tolist()
+            n_right += sum(
+                index in lesson.right
+                for index, lesson in zip(predicted, batch, strict=True)
+            )
+    return n_right / len(chosen)
+
+
 class Gradients:
-    """Takes gradients for a network that is trained, whose parameters collect them, on
-    threads that have one of torch's each (side by side they wait at no barriers), each
-    with a copy of the network that shares its weights.
+    """Compute gradients of a network on several threads.
+
+    Each of the threads uses one of torch's threads, so that they do not wait for each
+    other at barriers, and has a copy of the network that shares its weights.
+
+    Args:
+        student: the network, whose parameters collect the gradients.
+        given: the model before it was trained.
+        pool: the threads.
     """
 
     def __init__(self, student: Trainable, given: Model, pool: Executor) -> None:
         self._student = student
-        self._given = given
+        self._original_model = given
         self._pool = pool
         self._twins: list[Trainable] = []
 
     def take(
         self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int
     ) -> None:
-        """Make the worst pictures of lessons worse, and leave the gradient of their
-        loss with the parameters. Further images (N, H, W, 3) and class indices (N,)
-        count too.
+        """Make the worst images of lessons worse, and compute the gradient of the loss.
+
+        The gradient is left with the parameters.
+
+        Args:
+            batch: the lessons.
+            beside: further images (N, H, W, 3) and class indices (N,).
+            seed: of the augmentation.
         """
-        # textures first, so that both have the same parts
+        # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
+        plain_weight = 1.0 / len(batch)
+        worst_weight = 1.0 / max(1, len(with_worst(batch)))
 
-        def each(
-            do: Callable[..., Sequence[Any]], chosen: Sequence[Lesson]
-        ) -> list[Sequence[Any]]:
-            parts = [
-                chosen[begin : begin + PART] for begin in range(0, len(chosen), PART)
-            ]
-            self._twins += [self._student.twin() for _ in parts[len(self._twins) :]]
-            return list(self._pool.map(do, parts, self._twins, itertools.count(seed)))
-
-        def climb(
+        def texture_gradients(
             part: Sequence[TextureLesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor]:
             return lessons.slopes(
-                part, twin.quickly, lambda images: _changed(images, seed)
+                part, twin.quickly, lambda images: _augment(images, seed)
             )
 
-        def descend(
+        def weight_gradients(
             part: Sequence[Lesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor | None]:
-            return torch.autograd.grad(
-                self._loss(twin, part, *means, seed),
-                twin.parameters(),
-                allow_unused=True,
-            )
+            loss = self._loss(twin, part, plain_weight, worst_weight, seed)
+            return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
 
-        lessons.ascend(
-            batch,
-            lambda chosen: [slope for some in each(climb, chosen) for slope in some],
-        )
-        means = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))
-        found = each(descend, batch)
+        def all_texture_gradients(
+            texture_lessons: Sequence[TextureLesson],
+        ) -> list[Tensor]:
+            parts = self._map_parts(texture_gradients, texture_lessons, seed)
+            return list(itertools.chain.from_iterable(parts))
+
+        lessons.ascend(batch, all_texture_gradients)
+        gradients = self._map_parts(weight_gradients, batch, seed)
         if beside is not None:
-            loss = surprise(
-                self._student.logits(beside[0]), [(int(label),) for label in beside[1]]
-            ).mean()
-            found.append(
+            images, labels = beside
+            logits = self._student.logits(images)
+            loss = surprise(logits, [(int(label),) for label in labels]).mean()
+            gradients.append(
                 torch.autograd.grad(loss, self._student.parameters(), allow_unused=True)
             )
-        for parameter, *own in zip(self._student.parameters(), *found, strict=True):
-            some = [slope for slope in own if slope is not None]
-            parameter.grad = torch.stack(some).sum(dim=0) if some else None
+        for parameter, *part_gradients in zip(
+            self._student.parameters(), *gradients, strict=True
+        ):
+            used = [gradient for gradient in part_gradients if gradient is not None]
+            parameter.grad = torch.stack(used).sum(dim=0) if used else None
+
+    def _map_parts(
+        self,
+        function: Callable[..., Sequence[Any]],
+        chosen: Sequence[Lesson],
+        seed: int,
+    ) -> list[Sequence[Any]]:
+        """Apply a function to parts of lessons on the threads.
+
+        It is called with the part, a copy of the network, and a seed.
+        """
+        parts = [chosen[start : start + PART] for start in range(0, len(chosen), PART)]
+        n_missing = len(parts) - len(self._twins)
+        self._twins += [self._student.twin() for _ in range(n_missing)]
+        return list(self._pool.map(function, parts, self._twins, itertools.count(seed)))
 
     def _loss(
         self,
         student: Trainable,
         part: Sequence[Lesson],
-        plain: float,
-        worst: float,
+        plain_weight: float,
+        worst_weight: float,
         seed: int,
     ) -> Tensor:
-        """What is descended, of a part of a batch, textures first: so much of each
-        plain picture and each worst one.
+        """Return the loss of a part of a batch.
 
-        Worst textures are changed as the search for them saw them: seen otherwise, they
-        are no longer the worst. At times all that was rendered is mixed with each other
-        (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more pictures of it will
-        come; a texture is another one each time. The given model's predictions count of
-        scenes as they are alone: where something moved, it is right without being sure.
+        Worst textures are augmented as the search for them saw them: otherwise they are
+        no longer the worst. At times all rendered images are mixed with each other
+        (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more of them will come; a
+        texture is another one each time. The original model's predictions count only
+        for plain scenes: where a control changed, it is right without being sure.
+
+        Args:
+            student: the network.
+            part: the lessons, textures first.
+            plain_weight: of each plain image.
+            worst_weight: of each worst image.
+            seed: of the augmentation and the mixing.
         """
-        searched = with_worst(part)
+        hard_lessons = with_worst(part)
+        taught: list[Lesson] = [*part, *hard_lessons]
+        right = [lesson.right for lesson in taught]
+        images = _augmented_images(part, hard_lessons, seed)
+
         rng = np.random.default_rng(seed)
         mixed = list[int]()
-        textured = [
-            lesson.worst for lesson in searched if isinstance(lesson, TextureLesson)
-        ]
-        shown = [
-            [lesson.plain for lesson in part],
-            textured,
-            [lesson.worst for lesson in searched[len(textured) :]],
-        ]
-        images = torch.cat(
-            [_changed(torch.stack(some), seed) for some in shown if some]
-        )
-        taught = [*part, *searched]
-        right = [lesson.right for lesson in taught]
         if rng.random() < MIXED:
             mixed = [
-                place
-                for place, lesson in enumerate(taught)
+                index
+                for index, lesson in enumerate(taught)
                 if isinstance(lesson, RenderedLesson)
             ]
-        others = rng.permutation(mixed).astype(int).tolist()
-        drawn = float(rng.beta(MIXING, MIXING))
-        share = min(drawn, 1.0 - drawn)
+        partners = rng.permutation(mixed).astype(int).tolist()
+        sampled_weight = float(rng.beta(MIXING, MIXING))
+        partner_weight = min(sampled_weight, 1.0 - sampled_weight)
         if mixed:
-            images[mixed] = torch.lerp(images[mixed], images[others], share)
+            images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
+
         logits = student.logits(images)
         losses = surprise(logits, right)
         if mixed:
-            of_others = surprise(logits[mixed], [right[place] for place in others])
-            losses[mixed] = torch.lerp(losses[mixed], of_others, share)
-        loss = plain * losses[: len(part)].sum() + worst * losses[len(part) :].sum()
-        if as_given := [
-            place
-            for place, lesson in enumerate(part)
+            partner_losses = surprise(
+                logits[mixed], [right[index] for index in partners]
+            )
+            losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
+        loss = (
+            plain_weight * losses[: len(part)].sum()
+            + worst_weight * losses[len(part) :].sum()
+        )
+        unrendered = [
+            index
+            for index, lesson in enumerate(part)
             if not isinstance(lesson, RenderedLesson)
-        ]:
-            with torch.no_grad():
-                wanted = self._given(images[as_given])
-            # only where the given model is right: the Kullback-Leibler divergence of
-            # what it says
-            known = [
-                said in right[at]
-                for said, at in zip(
-                    wanted.argmax(dim=1).tolist(), as_given, strict=True
-                )
-            ]
-            own, target = (
-                F.log_softmax(some[known], dim=1) for some in (logits[as_given], wanted)
+        ]
+        if unrendered:
+            divergence = self._divergence_from_original(
+                images[unrendered],
+                logits[unrendered],
+                [right[index] for index in unrendered],
             )
-            loss = loss + plain * KEEP * F.kl_div(
-                own, target, reduction="sum", log_target=True
-            )
+            loss = loss + plain_weight * KEEP * divergence
         return loss
 
+    def _divergence_from_original(
+        self, images: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]
+    ) -> Tensor:
+        """Return the Kullback-Leibler divergence from the original model's predictions.
 
-def _changed(images: Tensor, seed: int) -> Tensor:
-    """Change pictures (N, H, W, 3) by chance; the same way whenever there are as many
-    of them.
+        It is summed over the images (N, H, W, 3) that the original model gets right.
+        """
+        with torch.no_grad():
+            original_logits = self._original_model(images)
+        predicted = original_logits.argmax(dim=1).tolist()
+        is_right = [
+            index in classes for index, classes in zip(predicted, right, strict=True)
+        ]
+        return F.kl_div(
+            F.log_softmax(logits[is_right], dim=1),
+            F.log_softmax(original_logits[is_right], dim=1),
+            reduction="sum",
+            log_target=True,
+        )
+
+
+def _augmented_images(
+    part: Sequence[Lesson], hard_lessons: Sequence[Lesson], seed: int
+) -> Tensor:
+    """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
+
+    Plain images, worst textures and worst renders are augmented separately, so that
+    worst textures are changed as in the search for them.
     """
+    groups = [
+        [lesson.plain for lesson in part],
+        [lesson.worst for lesson in hard_lessons if isinstance(lesson, TextureLesson)],
+        [
+            lesson.worst
+            for lesson in hard_lessons
+            if not isinstance(lesson, TextureLesson)
+        ],
+    ]
+    return torch.cat([_augment(torch.stack(group), seed) for group in groups if group])
+
+
+def _augment(images: Tensor, seed: int) -> Tensor:
+    """Augment images (N, H, W, 3), equally for equal N and seed."""
     generator = torch.Generator().manual_seed(seed)
     return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)

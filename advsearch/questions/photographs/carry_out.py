@@ -1,12 +1,14 @@
-"""Photographs of the real thing, aligned with a run's renderings: judged by its models
-and task, kept, and counted.
+"""Compare photographs of the real object with the renderings of a run.
+
+Each photograph is predicted by the run's models, evaluated by its task, stored in the
+run, and counted in a table of agreement.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -46,16 +48,17 @@ from advsearch.questions.photographs.result import (
     PhotographedRendering,
 )
 
-# of the files in a folder that are photographs
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-_ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
-"""The name of a file with a photograph that was aligned with a rendering."""
+"""Of files that are photographs."""
+ALIGNED_NAME = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
+"""Name of the file of a photograph that was aligned with a rendering."""
+STORED_FIELDS = ("rendering", "right", "label", "file")
+"""What a stored photograph says of its rendering, and its own file."""
 
 
 @workbench.helped
 def photo_agreement(run: str | Path) -> PhotoAgreement:
-    """Return how the photographs that were taken for a run agree with its renderings
-    (docs/viewer.md).
+    """Return how the photographs of a run agree with its renderings (docs/viewer.md).
 
     Args:
         run: a run's name or folder.
@@ -64,91 +67,139 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         UnknownNameError: there is no such run.
         FileFormatError: what was kept of a photograph is something else.
     """
-    kept = ["rendering", "right", "label", "file"]
+    table = _read_photos(directory.find_run(run))
+    n_photos = len(table)
+    n_agreeing = int(table["agrees"].sum())
+    agreement = None
+    interval = None
+    if n_photos:
+        agreement = n_agreeing / n_photos
+        interval = statistics.intervals.clopper_pearson(n_agreeing, n_photos)
+    return PhotoAgreement(
+        photos=n_photos,
+        agreement=agreement,
+        interval=interval,
+        renderings=[
+            _summarize_rendering(str(name), str(model), photos)
+            for (name, model), photos in table.groupby(
+                ["rendering", "model"], sort=False
+            )
+        ],
+        **_count_outcomes(table),
+    )
+
+
+def _read_photos(run: Path) -> pd.DataFrame:
+    """Read the aligned photographs of a run, one row for each prediction.
+
+    Columns: those of `STORED_FIELDS`; "model", "correct" and "predicted" of the
+    photograph; and "agrees", whether it is right where the rendering is.
+    """
     rows = list[dict[str, object]]()
-    with workbench.in_turn(), Store.open_to_read(directory.find_run(run)) as store:
+    with workbench.in_turn(), Store.open_to_read(run) as store:
         for row in store.rows(PHOTO):
-            if not {*kept} <= (photo := _photo_of(row)).keys():
+            photo = _stored_photo(row)
+            if not photo.keys() >= set(STORED_FIELDS):
                 raise errors.FileFormatError(
                     f"row {row.id}: expected what was kept of a photograph, got "
                     "something else"
                 )
             model = str(row.values["model"]["value"]) if "model" in row.values else ""
-            said = {
-                "model": model,
-                "correct": bool(row.correct),
-                "said": row.label or "",
-            }
-            rows.append({**photo, "right": bool(photo["right"]), **said})
-    table = pd.DataFrame(rows, columns=[*kept, "model", "correct", "said"])
-    table["agrees"] = table["right"] == table["correct"]
-    four = table.groupby(["right", "correct"]).size()
-    agreeing = int(table["agrees"].sum())
-    words = {True: "right", False: "wrong"}
-    counts = {
-        f"{words[a]}_{words[b]}": int(four.get((a, b), 0)) for a in words for b in words
-    }
-    renderings = []
-    for (name, model), group in table.groupby(["rendering", "model"], sort=False):
-        photos = len(group)
-        last = group.iloc[-1]
-        alike = int(group["agrees"].sum())
-        renderings.append(
-            PhotographedRendering(
-                rendering=str(name), model=str(model), label=str(last["label"]), rendering_right=bool(last["right"]),
-                photos=photos, photos_right=int(group["correct"].sum()), agreeing=alike,
-                interval=statistics.intervals.clopper_pearson(alike, photos), labels=list(group["said"]),
-                files=list(map(str, group["file"])),
+            rows.append(
+                {
+                    **photo,
+                    "right": bool(photo["right"]),
+                    "model": model,
+                    "correct": bool(row.correct),
+                    "predicted": row.label or "",
+                }
             )
-        )  # fmt: skip
-    interval = (
-        statistics.intervals.clopper_pearson(agreeing, len(table)) if rows else None
-    )
-    agreement = agreeing / len(table) if rows else None
-    return PhotoAgreement(
-        photos=len(table),
-        agreement=agreement,
-        interval=interval,
-        renderings=renderings,
-        **counts,
-    )
+    columns = [*STORED_FIELDS, "model", "correct", "predicted"]
+    table = pd.DataFrame(rows, columns=columns)
+    table["agrees"] = table["right"] == table["correct"]
+    return table
 
 
-def _photo_of(row: workbench.Row) -> dict[str, Any]:
-    """What was kept of a photograph: its file, `source` of one that was no browser's,
-    and what its rendering says.
+def _stored_photo(row: workbench.Row) -> dict[str, Any]:
+    """Return what is stored of a photograph; empty for rows of another kind.
+
+    It has the `STORED_FIELDS`, and "source", the name of the file that it came from;
+    that is empty if a browser sent it.
     """
     photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
     return photo if isinstance(photo, dict) else {}
 
 
-def photographs_in(folder: Path, task: workbench.AnyTask) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where
-    there is no such folder. An InputError where the task asks where the object is, and
-    one of them was aligned with no rendering.
+def _count_outcomes(table: pd.DataFrame) -> dict[str, int]:
+    """Count photographs by whether the rendering and the photograph are right.
+
+    Keys are those of `PhotoAgreement`: right_right, right_wrong, wrong_right and
+    wrong_wrong, the rendering first.
     """
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    counts = table.groupby(["right", "correct"]).size()
+    word_of = {True: "right", False: "wrong"}
+    return {
+        f"{word_of[rendered]}_{word_of[photographed]}": int(
+            counts.get((rendered, photographed), 0)
+        )
+        for rendered in word_of
+        for photographed in word_of
+    }
+
+
+def _summarize_rendering(
+    name: str, model: str, photos: pd.DataFrame
+) -> PhotographedRendering:
+    """Summarise the photographs of one rendering, as one model predicts them."""
+    n_photos = len(photos)
+    n_agreeing = int(photos["agrees"].sum())
+    latest = photos.iloc[-1]
+    return PhotographedRendering(
+        rendering=name,
+        model=model,
+        label=str(latest["label"]),
+        rendering_right=bool(latest["right"]),
+        photos=n_photos,
+        photos_right=int(photos["correct"].sum()),
+        agreeing=n_agreeing,
+        interval=statistics.intervals.clopper_pearson(n_agreeing, n_photos),
+        labels=list(photos["predicted"]),
+        files=[str(file) for file in photos["file"]],
+    )
+
+
+def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
+    """Return the photographs in a directory by their suffixes; empty without it.
+
+    Raises:
+        InputError: the task needs the object's position, and a photograph was aligned
+            with no rendering.
+    """
+    files = sorted(path.iterdir()) if path.is_dir() else []
     photographs = [
         file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()
     ]
-    loose = [file for file in photographs if not _ALIGNED.fullmatch(file.stem)]
-    if (
-        loose
-        and (made := workbench.make_task(task))
-        and (made.varies or made.calibrates)
-    ):
-        raise InputError(
-            f"{loose[0].name}: the task asks where the object is, and only a rendering "
-            "says that; name the file "
-            "rendering-NUMBER.jpg by the rendering that it was aligned with, or take "
-            "it out"
-        )
+    loose = [file for file in photographs if not ALIGNED_NAME.fullmatch(file.stem)]
+    if loose:
+        task_object = workbench.make_task(task)
+        if task_object and _needs_position(task_object):
+            raise InputError(
+                f"{loose[0].name}: the task asks where the object is, and only a "
+                "rendering says that; name the file rendering-NUMBER.jpg by the "
+                "rendering that it was aligned with, or take it out"
+            )
     return photographs
 
 
+def _needs_position(task: Task) -> bool:
+    """Return whether the ground truth of a task depends on the configuration."""
+    return bool(task.varies or task.calibrates)
+
+
 class Photographs:
-    """Takes photographs in for runs; one at a time, from any thread. What the last run
-    was about stays loaded.
+    """Store photographs in runs, one at a time and from any thread.
+
+    The scene and the models of the last run stay loaded.
 
     Attributes:
         row_kinds: the kinds of rows that photographs have in the results of a run.
@@ -157,172 +208,204 @@ class Photographs:
     row_kinds = (PHOTO, LOOSE_PHOTO)
 
     def __init__(self) -> None:
-        self._judges = lru_cache(maxsize=1)(_judges_of)
-        # a scene is used by the thread that has loaded it
+        self._load_evaluators = lru_cache(maxsize=1)(_load_evaluators)
+        # A scene is used only by the thread that loaded it.
         self._thread = ThreadPoolExecutor(1, "photographs")
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Judge a photograph by the models and the task of a run, keep both beside the
-        rendering that it was aligned with, and return the table. An InputError where
-        there is no such rendering, it is no photograph, another process works on the
-        run, or its scene is another one now.
+        """Evaluate and store a photograph, and return the table of agreement.
+
+        Args:
+            run: the directory of the run.
+            rendering: name of the rendering that it was aligned with.
+            data: the image file.
+
+        Raises:
+            InputError: there is no such rendering, the data is no photograph, another
+                process works on the run, or its scene has changed.
         """
         self._thread.submit(self._add, run, rendering, data, "").result()
         return photo_agreement(run)
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
-        """Judge the photographs in some files that the run, a sweep of one object, does
-        not have yet, by their names. A file ``rendering-12.jpg``, or ``rendering-12-``
-        and anything, was aligned with the rendering 12. All others show the object as
-        it stood by chance: they are judged, but are compared with no single rendering.
+        """Evaluate and store the photographs that a sweep of one object does not have.
+
+        A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with
+        the rendering 12. All others show the object as it stood by chance: they are
+        evaluated, but are compared with no single rendering.
         """
         with Store.open_to_read(run) as store:
-            known = {
-                _photo_of(row).get("source")
+            stored_names = {
+                _stored_photo(row).get("source")
                 for kind in (PHOTO, LOOSE_PHOTO)
                 for row in store.rows(kind)
             }
-        for file in (file for file in files if file.name not in known):
-            aligned = _ALIGNED.fullmatch(file.stem)
+        for file in files:
+            if file.name in stored_names:
+                continue
+            aligned = ALIGNED_NAME.fullmatch(file.stem)
+            rendering = aligned[1] if aligned else None
             data = stored_files.read_bytes(file, "a photograph", markup.LARGEST_SENT)
             try:
-                self._thread.submit(
-                    self._add, run, aligned and aligned[1], data, file.name
-                ).result()
+                self._thread.submit(self._add, run, rendering, data, file.name).result()
             except InputError as error:
                 raise InputError(f"{file.name}: {error}") from None
 
     def agreement(self, run: Path) -> PhotoAgreement:
+        """Return the table of agreement of a run."""
         return photo_agreement(run)
 
     @staticmethod
     def list_files(folder: Path, task: workbench.AnyTask) -> list[Path]:
-        """Return the files in a folder that are photographs; errors as for
-        `photographs_in`.
-        """
-        return photographs_in(folder, task)
+        """Return the photographs in a directory; see `find_photographs`."""
+        return find_photographs(folder, task)
 
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
-        """Judge and keep a photograph of the file `source`; without a rendering only
-        what the models say is kept.
+        """Evaluate a photograph by all models of a run, and store it.
+
+        Without a rendering only the predictions are stored.
         """
         file = None
-        kind = PHOTO if rendering else LOOSE_PHOTO
-        sound = b""
-        kept = dict[str, JsonValue](source=source)
+        cut_photo = b""
         if rendering is not None:
             file = result.rendering_file(run, rendering)
             with Image.open(file, formats=("PNG", "JPEG")) as image:
-                # before anything is loaded
-                sound = result.sound_photo(data, image.size)
-        with RunDirectory.resume(run) as held:
-            number = held.store.last_step(kind) + 1
+                # A bad photograph is rejected before a scene is loaded.
+                cut_photo = result.sound_photo(data, image.size)
+        with RunDirectory.resume(run) as resumed_run:
+            kind = PHOTO if rendering else LOOSE_PHOTO
+            number = resumed_run.store.last_step(kind) + 1
+            photo = dict[str, JsonValue](source=source)
             rows = []
-            judges = self._judges(run)
-            for place, judge in enumerate(judges):
-                values: dict[str, workbench.Value] = {}
+            for evaluator in self._load_evaluators(run):
+                values: Mapping[str, workbench.Value] = {}
                 if file is None or rendering is None:
-                    sound = result.sound_photo(data, judge.size[::-1])
+                    cut_photo = result.sound_photo(data, evaluator.size[::-1])
                 else:
-                    step = (
-                        int(rendering) * len(judges) + place
-                        if rendering.isdigit()
-                        else None
+                    right, label, values = evaluator.evaluate_rendering(
+                        resumed_run.store, rendering, file
                     )
-                    seen = None if step is None else held.store.row("sweep", step)
-                    # a sweep's prediction as it was stored, others' by its file
-                    if seen is not None:
-                        right = bool(seen.correct)
-                        label = seen.label or ""
-                        values = dict(seen.values)
-                    elif file.suffix == ".png":
-                        rendered = judge.judgement(rendering, None, file.read_bytes())
-                        right = rendered.right
-                        label = rendered.prediction.label
-                    else:
-                        raise InputError(
-                            f"rendering: the results have no row for {file.stem}; it "
-                            "belongs to another run"
-                        )
-                    kept |= {"rendering": rendering, "right": right, "label": label}
-                    kept["file"] = f"{rendering}-{number:04d}.jpg"
-                # of a sweep over several
-                shown = str(values["object"]["value"]) if "object" in values else None
-                values["model"] = {"value": judge.model.name, "unit": ""}
+                    photo |= {"rendering": rendering, "right": right, "label": label}
+                    photo["file"] = f"{rendering}-{number:04d}.jpg"
+                # A sweep over several objects stores which one it was.
+                object_name = None
+                if "object" in values:
+                    object_name = str(values["object"]["value"])
+                model_value: workbench.Value = {
+                    "value": evaluator.model.name,
+                    "unit": "",
+                }
                 row = workbench.judged(
-                    workbench.Row(kind, number, values=values),
-                    judge.judgement(rendering, shown, sound),
+                    workbench.Row(
+                        kind, number, values={**values, "model": model_value}
+                    ),
+                    evaluator.evaluate(rendering, object_name, cut_photo),
                 )
-                rows.append(
-                    replace(row, payload={"photo": {**kept}, "answer": row.payload})
-                )
+                payload = {"photo": {**photo}, "answer": row.payload}
+                rows.append(replace(row, payload=payload))
             if file is not None:
-                writing.write_bytes(
-                    run / directory.PHOTOGRAPHS / str(kept["file"]), sound
-                )
-            held.record(*rows)
+                path = run / directory.PHOTOGRAPHS / str(photo["file"])
+                writing.write_bytes(path, cut_photo)
+            resumed_run.record(*rows)
 
 
 @dataclass(frozen=True)
-class _PhotoJudge:
-    """One of a run's models with its task, how large (height, width) pictures it is
-    shown are, and what is true of a photograph by the rendering that it was aligned
-    with and the object on it, None for the only ones.
+class _PhotoEvaluator:
+    """Evaluate photographs by one model of a run.
+
+    Attributes:
+        model: predicts.
+        task: evaluates the prediction.
+        size: (height, width) in pixels of the images that the model is run on.
+        find_truth: returns the ground truth of a photograph by the name of the
+            rendering that it was aligned with and of the object; None for a photograph
+            that was aligned with none, and for the only object.
+        index: of the model, among `n_models` of the run.
     """
 
     model: Model
     task: Task
     size: tuple[int, int]
-    truth: Callable[[str | None, str | None], workbench.Truth]
+    find_truth: Callable[[str | None, str | None], workbench.Truth]
+    index: int
+    n_models: int
 
-    def judgement(
-        self, rendering: str | None, name: str | None, data: bytes
+    def evaluate(
+        self, rendering: str | None, object_name: str | None, data: bytes
     ) -> tasks.Judgement:
-        """What is to be said of a picture, made as large as the run's renderings are:
-        in 8 bits, with Lanczos' filter, which averages where it shrinks.
+        """Evaluate an image file at the size of the run's renderings.
+
+        It is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
         """
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
-            small = image.convert("RGB").resize(
+            resized = image.convert("RGB").resize(
                 self.size[::-1], Image.Resampling.LANCZOS
             )
         pixels = torch.from_numpy(
-            np.asarray(small, dtype=np.float32) / np.float32(255.0)
+            np.asarray(resized, dtype=np.float32) / np.float32(255.0)
         )
         with torch.no_grad():
-            return workbench.judgements(
-                self.task,
-                self.model(pixels),
-                pixels[None],
-                [self.truth(rendering, name)],
-            )[0]
+            output = self.model(pixels)
+            truth = self.find_truth(rendering, object_name)
+            return workbench.judgements(self.task, output, pixels[None], [truth])[0]
+
+    def evaluate_rendering(
+        self, store: Store, rendering: str, file: Path
+    ) -> tuple[bool, str, Mapping[str, workbench.Value]]:
+        """Return whether a rendering is right, its label, and the values of its row.
+
+        A sweep's prediction is read from its row; others are made from the file.
+
+        Raises:
+            InputError: the results have no row of a sweep's rendering.
+        """
+        if rendering.isdigit():
+            row = store.row("sweep", int(rendering) * self.n_models + self.index)
+            if row is not None:
+                return bool(row.correct), row.label or "", row.values
+        if file.suffix != ".png":
+            raise InputError(
+                f"rendering: the results have no row for {file.stem}; it "
+                "belongs to another run"
+            )
+        judgement = self.evaluate(rendering, None, file.read_bytes())
+        return judgement.right, judgement.prediction.label, {}
 
 
-def _judges_of(run: Path) -> list[_PhotoJudge]:
-    """Who judges photographs of a run; where an object is seen is judged by the
-    rendering that it was aligned with.
+def _load_evaluators(run: Path) -> list[_PhotoEvaluator]:
+    """Load what evaluates photographs of a run, one for each of its models.
+
+    Raises:
+        InputError: the run is no attack and no sweep.
     """
-    command = settings.read_yaml(run / directory.CONFIG).get("command")
+    path = run / directory.CONFIG
+    command = settings.read_yaml(path).get("command")
     if command == "sweep":
-        return _by_sweep(SweepConfig.from_yaml(run / directory.CONFIG))
+        return _load_sweep_evaluators(SweepConfig.from_yaml(path))
     if command == "attack":
-        return _by_attack(run, AttackConfig.from_yaml(run / directory.CONFIG))
+        return _load_attack_evaluators(run, AttackConfig.from_yaml(path))
     raise InputError(
         f"{run.name}: photographs belong to renderings of attacks and "
         f"sweeps, not of {command}"
     )
 
 
-def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
+def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
+    """Load the models of a sweep, and find ground truth by the numbers of its images."""
     scenes = workbench.scenes_of(config)
     job = scenes.job
 
-    def truth(model: int, rendering: str | None, name: str | None) -> workbench.Truth:
-        task = job.tasks[model]
-        if rendering is None or not (task.varies or task.calibrates):
-            place = next(
-                (place for place in job.places if place.object == name), job.places[0]
-            )
-            return task.truth(job.facts(place, {}))
+    def find_truth(
+        model_index: int, rendering: str | None, object_name: str | None
+    ) -> workbench.Truth:
+        """Return the ground truth of an image of the sweep, or of the object in view."""
+        task = job.tasks[model_index]
+        if rendering is None or not _needs_position(task):
+            matching = [
+                candidate for candidate in job.places if candidate.object == object_name
+            ]
+            swept_scene = matching[0] if matching else job.places[0]
+            return task.truth(job.facts(swept_scene, {}))
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
             raise InputError(
@@ -330,43 +413,48 @@ def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
                 "belongs to another run"
             )
         scene, queries = scenes.asked(number)
-        return scene.problems[model].truth(queries[model].u, queries[model].values)
+        query = queries[model_index]
+        return scene.problems[model_index].truth(query.u, query.values)
 
-    each = enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
+    models = zip(job.models, job.tasks, job.sizes, strict=True)
     return [
-        _PhotoJudge(model, task, size, partial(truth, number))
-        for number, (model, task, size) in each
+        _PhotoEvaluator(
+            model, task, size, partial(find_truth, index), index, len(job.models)
+        )
+        for index, (model, task, size) in enumerate(models)
     ]
 
 
-def _by_attack(run: Path, config: AttackConfig) -> list[_PhotoJudge]:
+def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
+    """Load the models of an attack, and find ground truth by the names of its images."""
     problem, _ = workbench.problem_from_config(workbench.judged_alone(config))
 
-    def truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
-        """Of the clean configuration, of the adversarial one, or of one of its
-        trials.
-        """
-        known = rendering in (None, "clean") or not (task.varies or task.calibrates)
-        u = (
-            problem.domain.start
-            if known
-            else workbench.kept_configuration(run, problem)
-        )
+    def find_truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
+        """Return the ground truth of the clean or adversarial scene, or of a trial."""
+        u = problem.domain.start
+        is_adversarial = rendering not in (None, "clean")
+        if is_adversarial and _needs_position(task):
+            u = workbench.kept_configuration(run, problem)
         trial = (rendering or "").rpartition("verification-")[2]
-        whole = problem.whole(
-            u,
-            seeds.stream(problem.seed, "verification", int(trial))
-            if trial.isdigit()
-            else None,
-        )
-        look = partial(problem.renderer.surfaces, whole)
-        return task.truth(problem.facts(partial(problem.space.describe, whole), look))
+        seed = None
+        if trial.isdigit():
+            seed = seeds.stream(problem.seed, "verification", int(trial))
+        configuration = problem.whole(u, seed)
+        find_surfaces = partial(problem.renderer.surfaces, configuration)
+        describe = partial(problem.space.describe, configuration)
+        return task.truth(problem.facts(describe, find_surfaces))
 
-    alone: list[tuple[Model, Task]] = [(problem.model, problem.task)]
+    models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.Together):
-        alone = list(zip(problem.task.models, problem.task.tasks, strict=True))
-    size = config.resolution
+        models = list(zip(problem.task.models, problem.task.tasks, strict=True))
     return [
-        _PhotoJudge(model, task, size or model.input_size, partial(truth, task))
-        for model, task in alone
+        _PhotoEvaluator(
+            model,
+            task,
+            config.resolution or model.input_size,
+            partial(find_truth, task),
+            index,
+            len(models),
+        )
+        for index, (model, task) in enumerate(models)
     ]

@@ -1,4 +1,4 @@
-"""What the dashboard's server answers about the photographs of a run."""
+"""The pages of the dashboard's server on which photographs are taken."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from advsearch.questions.photographs.result import (
     table_html,
 )
 
-# the header with which this server's page sends a photograph; another page could not
-# send it
 KEY = "X-Advsearch-Key"
+"""Header with which this server's page sends a photograph; no other page can send it."""
 
 
 class PhotographPages:
-    """The pages on which photographs of a run are taken (see
-    `advsearch.viewer.server.PhotographServer`).
+    """Serve the pages on which photographs of a run are taken.
+
+    See `advsearch.viewer.server.PhotographServer`.
 
     Args:
-        photographs: judges and keeps them; None for `Photographs`, which needs PyTorch,
-            and is loaded when a page of photographs is first opened.
+        photographs: evaluates and stores them; None for `Photographs`, which needs
+            PyTorch, and is loaded when a page of photographs is first opened.
     """
 
     def __init__(self, photographs: Any = None) -> None:
-        self._given = photographs
+        self._injected = photographs
 
     @cached_property
     def _photographs(self) -> Any:
-        if self._given is not None:
-            return self._given
-        # takes seconds
+        if self._injected is not None:
+            return self._injected
+        # The import takes seconds.
         from advsearch.questions.photographs.carry_out import Photographs
 
         return Photographs()
@@ -54,16 +54,23 @@ class PhotographPages:
         )
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
-        """Return the type and the data of a "rendering", or of a "photo" that was
-        kept.
+        """Return the media type and the data of a stored image.
+
+        Args:
+            kind: "rendering" or "photo".
+            run: the directory of the run.
+            name: of the image.
+
+        Raises:
+            Refused: there is no such image.
         """
         with refused(HTTPStatus.NOT_FOUND):
-            file = (
-                rendering_file(run, name)
-                if kind == "rendering"
-                else photo_file(run, name)
-            )
-        return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
+            if kind == "rendering":
+                file = rendering_file(run, name)
+            else:
+                file = photo_file(run, name)
+        media_type = "image/png" if file.suffix == ".png" else "image/jpeg"
+        return media_type, file.read_bytes()
 
     def take(
         self,
@@ -73,14 +80,23 @@ class PhotographPages:
         key: str,
         read_data: Callable[[], bytes],
     ) -> tuple[str, bytes]:
-        """Take a photograph of a rendering in, from this server's own page: another one
-        has no origin, or not the key.
+        """Store a photograph of a rendering, and return the table of agreement as JSON.
 
-        `read_data` reads what was sent, once there is something to compare it with. It
-        is refused where there is no such rendering, or it is no photograph.
+        Args:
+            run: the directory of the run.
+            name: of the rendering.
+            headers: of the request.
+            key: that this server's own page sends. Other pages send no origin, or
+                another key.
+            read_data: reads the photograph, once the rendering is known to exist.
+
+        Raises:
+            Refused: another page sent it, there is no such rendering, or the data is no
+                photograph.
         """
-        sent = headers.get(KEY, "").encode("utf-8", "replace")
-        if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
+        sent_key = headers.get(KEY, "").encode("utf-8", "replace")
+        has_key = hmac.compare_digest(key.encode(), sent_key)
+        if headers.get("Origin") is None or not has_key:
             raise markup.Refused(
                 HTTPStatus.FORBIDDEN,
                 "a photograph is sent by the page that this server shows; open it anew",
@@ -89,14 +105,13 @@ class PhotographPages:
             rendering_file(run, name)
         with refused(HTTPStatus.BAD_REQUEST):
             table = self._photographs.add(run, name, read_data())
-        return "application/json", json.dumps(
-            {"table": str(table_html(table))}
-        ).encode()
+        response = {"table": str(table_html(table))}
+        return "application/json", json.dumps(response).encode()
 
 
 @contextmanager
 def refused(status: HTTPStatus) -> Iterator[None]:
-    """Send what an InputError says, with a status."""
+    """Turn an InputError into a response with a status."""
     try:
         yield
     except InputError as error:

@@ -1,10 +1,9 @@
-"""How renderings and photographs of the same configurations agree, and the page on
-which they are taken.
+"""The table of agreement between renderings and photographs, and its page.
 
 A rendering is named as its file is: a sweep's by the number of its picture, an attack's
 ``adversarial``, ``clean`` or ``verification-00``. A photograph comes from a browser, so
-nothing in it is believed: it is measured before it is decoded, cut to the rendering's
-shape, and written anew without what else its file said (places, names of cameras). The
+it is not trusted: its size is checked before it is decoded, it is cut to the rendering's
+shape, and written again without metadata (coordinates, names of cameras). The
 page lays a rendering, translucent or its edges, over the camera's picture, after the
 phone app of 3DB (Leclerc et al. 2021, appendix D).
 """
@@ -22,16 +21,13 @@ from pydantic import Field
 from advsearch.extend import InputError, directory, markup, results, wording
 
 PHOTO = "photo"
+"""Kind of row in a run's store: a photograph that was aligned with a rendering."""
 LOOSE_PHOTO = "loose photo"
-"""Kinds of rows in a run's store: photographs that were aligned with a rendering, and
-ones that were with none.
-"""
+"""Kind of row in a run's store: a photograph that was aligned with no rendering."""
 
 
 class PhotographedRendering(results.Fields):
-    """One rendering, what one model says of it, and of the photographs that were
-    aligned with it.
-    """
+    """What one model predicts of a rendering and of the photographs aligned with it."""
 
     rendering: str = Field(
         description="its name: the number of a sweep's picture, or "
@@ -56,9 +52,7 @@ class PhotographedRendering(results.Fields):
 
 
 class PhotoAgreement(results.Fields):
-    """The table of agreement between renderings and reality: counts of photographs,
-    each by each model.
-    """
+    """Counts of photographs by whether a model is right in them and in the rendering."""
 
     photos: int
     right_right: int = Field(
@@ -83,26 +77,28 @@ class PhotoAgreement(results.Fields):
     renderings: list[PhotographedRendering]
 
 
-# of a photograph before it is made smaller; the largest phones take 50 million
 MOST_PIXELS = 50_000_000
-# longest side in pixels of a photograph that is kept, and of its JPEG file from 1 to 95
+"""Limit of a photograph as it is sent; the largest phones take 50 million."""
 SIDE = 1024
+"""Longer side, in pixels, of a photograph that is stored."""
 QUALITY = 95
+"""Of its JPEG file, 1 to 95."""
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
 
 def rendering_file(run: Path, name: str) -> Path:
-    """Return the file of a rendering; an InputError where the run has none of that
-    name.
+    """Return the file of a rendering.
+
+    Raises:
+        InputError: the run has none of that name.
     """
     file = None
     if _NAME.fullmatch(name):
-        file = (
-            markup.kept_file(run, int(name))
-            if name.isdigit()
-            else run / directory.IMAGES / f"{name}.png"
-        )
+        if name.isdigit():
+            file = markup.kept_file(run, int(name))
+        else:
+            file = run / directory.IMAGES / f"{name}.png"
     if file is None or not file.is_file():
         raise InputError(
             f"rendering: {run.name} has none called {name[:40]!r}; open "
@@ -112,9 +108,10 @@ def rendering_file(run: Path, name: str) -> Path:
 
 
 def rendering_names(run: Path) -> tuple[str, ...]:
-    """Return the names of a run's renderings; empty where it kept none."""
-    if (kept := markup.kept_pictures(run)) is not None:
-        return tuple(map(str, kept.numbers))
+    """Return the names of a run's renderings; empty if it stored none."""
+    stored_images = markup.kept_pictures(run)
+    if stored_images is not None:
+        return tuple(map(str, stored_images.numbers))
     names = [
         file.stem
         for file in (run / directory.IMAGES).glob("*.png")
@@ -124,8 +121,10 @@ def rendering_names(run: Path) -> tuple[str, ...]:
 
 
 def photo_file(run: Path, name: str) -> Path:
-    """Return the file of a photograph that was kept; an InputError where there is none
-    of that name.
+    """Return the file of a stored photograph.
+
+    Raises:
+        InputError: the run has none of that name.
     """
     file = run / directory.PHOTOGRAPHS / name
     if not _PHOTO.fullmatch(name) or not file.is_file():
@@ -134,9 +133,15 @@ def photo_file(run: Path, name: str) -> Path:
 
 
 def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
-    """Return a photograph, sent as JPEG, PNG or WebP, as a JPEG of at most `SIDE`
-    pixels a side, its middle cut to the ratio of a shape (width, height). An InputError
-    where it is too large, or no such picture.
+    """Return the center of a photograph as a JPEG without metadata.
+
+    Args:
+        data: a file in JPEG, PNG or WebP.
+        shape: (width, height) whose aspect ratio it is cut to. The longer side is at
+            most `SIDE` pixels.
+
+    Raises:
+        InputError: it is too large, or no such image.
     """
     if len(data) > markup.LARGEST_SENT:
         raise InputError(
@@ -150,7 +155,7 @@ def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
                     f"photo: expected at most {MOST_PIXELS:,} pixels, got "
                     f"{image.width} x {image.height}"
                 )
-            # a JPEG is decoded at about the size that is needed
+            # A JPEG is decoded at about the size that is needed.
             image.draft("RGB", (2 * SIDE, 2 * SIDE))
             upright = ImageOps.exif_transpose(image).convert("RGB")
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -162,17 +167,16 @@ def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
             "photo: expected a picture in JPEG, PNG or WebP, got "
             "something else or a part"
         ) from None
-    shrunk = min(SIDE, max(upright.size)) / max(shape)
-    width, height = (max(1, round(side * shrunk)) for side in shape)
+    scale = min(SIDE, max(upright.size)) / max(shape)
+    width, height = (max(1, round(length * scale)) for length in shape)
+    cut_photo = ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
-    ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS).save(
-        buffer, "JPEG", quality=QUALITY
-    )
+    cut_photo.save(buffer, "JPEG", quality=QUALITY)
     return buffer.getvalue()
 
 
 # ---- the page
-# -------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------
 
 
 def align_page(
@@ -182,22 +186,60 @@ def align_page(
     key: str,
     elsewhere: str | None,
 ) -> str:
-    """Return the page of a run as HTML: the first of its renderings is shown, `key` is
-    what the server wants to see with a photograph, and `elsewhere` the address by which
-    another device opens the page, if one can.
+    """Return the page on which photographs of a run are taken, as HTML.
+
+    Args:
+        run: name of the run.
+        renderings: names of its renderings, of which the page shows the first.
+        table: of agreement, below.
+        key: that the server expects with a photograph.
+        elsewhere: address by which another device opens the page; None if none can.
     """
-    named = ", ".join(renderings[:8]) + (
-        f", ... {renderings[-1]}" if len(renderings) > 8 else ""
+    main = markup.element(
+        "main",
+        _align_section(renderings),
+        markup.element("h2", "Renderings and reality"),
+        markup.element("div", table_html(table), id="agreement"),
+        None if elsewhere is None else _phone_section(elsewhere),
     )
-    how = (
+    header = markup.element(
+        "header",
+        markup.element("p", "Photographs", class_="eyebrow"),
+        markup.element("h1", f"{run}, photographed"),
+    )
+    data = []
+    scripts: tuple[str, ...] = ()
+    if renderings:
+        page_data = {"key": key, "names": list(renderings[:1])}
+        data = [markup.data_script(page_data, "photographing")]
+        scripts = ("make.js", "align.js")
+    return markup.document(
+        f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
+    )
+
+
+def _align_section(renderings: Sequence[str]) -> markup.Html:
+    """Return the camera with a rendering over it, or why there is none."""
+    if not renderings:
+        reason = (
+            "This run kept no pictures to align with. An attack keeps them when it "
+            "ends; a sweep with "
+        )
+        return markup.element(
+            "p", reason, markup.element("code", "keep_pictures=all"), "."
+        )
+    names = ", ".join(renderings[:8])
+    if len(renderings) > 8:
+        names += f", ... {renderings[-1]}"
+    instructions = (
         "Lay a rendering over what the camera sees, move the real object until both "
         "agree, and take a photograph."
     )
-    align = markup.join_html(
-        markup.element("p", how),
+    content = markup.join_html(
+        markup.element("p", instructions),
         markup.element(
             "p",
-            f"Renderings of this run ({len(renderings)}): {named}.",
+            f"Renderings of this run ({len(renderings)}): {names}.",
             class_="soft",
             id="renderings",
         ),
@@ -206,121 +248,96 @@ def align_page(
             markup.element("p", "The camera needs JavaScript, which is switched off."),
         ),
     )
-    none = (
-        "This run kept no pictures to align with. An attack keeps them when it "
-        "ends; a sweep with "
-    )
-    without = markup.element(
-        "p", none, markup.element("code", "keep_pictures=all"), "."
-    )
-    code = None
-    if elsewhere is not None:
-        made = markup.qr_code(elsewhere)
-        svg = made and markup.Html(
-            made.svg_inline(
-                omitsize=True, light="#fff", title="QR code of the address below"
-            )
-        )
-        shown = svg or markup.element(
+    return markup.element("div", content, id="align")
+
+
+def _phone_section(address: str) -> markup.Html:
+    """Return an address and its QR code, by which a phone opens the page."""
+    code = markup.qr_code(address)
+    if code:
+        title = "QR code of the address below"
+        content = markup.Html(code.svg_inline(omitsize=True, light="#fff", title=title))
+    else:
+        content = markup.element(
             "p", f"A code to point the phone at would stand here: {markup.NO_QR}"
         )
-        summary = markup.element("summary", "Open this page on a phone")
-        address = markup.element("pre", elsewhere, class_="wrap", tabindex="0")
-        code = markup.element(
-            "details", summary, markup.element("div", shown, class_="qr"), address
-        )
-    main = markup.element(
-        "main",
-        markup.element("div", align, id="align") if renderings else without,
-        markup.element("h2", "Renderings and reality"),
-        markup.element("div", table_html(table), id="agreement"),
-        code,
-    )
-    header = markup.element(
-        "header",
-        markup.element("p", "Photographs", class_="eyebrow"),
-        markup.element("h1", f"{run}, photographed"),
-    )
-    data = (
-        [
-            markup.data_script(
-                {"key": key, "names": list(renderings[:1])}, "photographing"
-            )
-        ]
-        if renderings
-        else []
-    )
-    scripts = ("make.js", "align.js") if renderings else ()
-    return markup.document(
-        f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True
+    return markup.element(
+        "details",
+        markup.element("summary", "Open this page on a phone"),
+        markup.element("div", content, class_="qr"),
+        markup.element("pre", address, class_="wrap", tabindex="0"),
     )
 
 
 def table_html(table: PhotoAgreement) -> markup.Html:
-    """Return the counts of right and wrong predictions in rendering and photograph, in
-    all and by rendering.
-    """
+    """Return the counts of right and wrong predictions, in all and by rendering."""
     if not table.photos or table.interval is None:
         return markup.element("p", "No photographs yet.", class_="soft")
+    heads = ("photographs", "right in the photograph", "wrong in the photograph")
     counts = [
         ["right in the rendering", str(table.right_right), str(table.right_wrong)],
         ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
     ]
-    agreeing = table.right_right + table.wrong_wrong
+    n_agreeing = table.right_right + table.wrong_wrong
     text = (
-        f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: "
+        f"They agree in {n_agreeing} of {wording.count(table.photos, 'photograph')}: "
         f"{wording.percent(table.agreement)}, 95 % interval "
         f"{wording.interval_text(table.interval)}."
     )
-    several = len({row.model for row in table.renderings}) > 1
-    rows = []
-    for row in table.renderings:
-        photos = [
-            markup.join_html(
-                markup.element(
-                    "a", label or "nothing", href=f"photos/{markup.in_address(file)}"
-                ),
-                " ",
-            )
-            for label, file in zip(row.labels, row.files, strict=True)
-        ]
-        rendered = f"{'right' if row.rendering_right else 'wrong'}: {row.label}"
-        photographed = markup.join_html(
-            f"{row.photos_right} of {row.photos} right: ", *photos
-        )
-        agree = f"{row.agreeing} of {row.photos}", wording.interval_text(row.interval)
-        rows.append(
-            [
-                row.rendering,
-                *([row.model] if several else []),
-                rendered,
-                photographed,
-                *agree,
-            ]
-        )
-    heads = [
-        "rendering",
-        *(["model"] if several else []),
-        "in the rendering",
-        "in photographs",
-        "agree",
-        "interval",
-    ]
-    each = markup.study_table(
-        heads,
-        rows,
-        [f"renderings/{markup.in_address(row.rendering)}" for row in table.renderings],
-    )
-    counted = ("photographs", "right in the photograph", "wrong in the photograph")
     return markup.join_html(
-        markup.element("div", markup.study_table(counted, counts), class_="agreement"),
+        markup.element("div", markup.study_table(heads, counts), class_="agreement"),
         markup.element("p", text),
         markup.element(
             "div",
-            each,
+            _rendering_table(table.renderings),
             class_="scroll",
             tabindex="0",
             role="region",
             aria_label="by rendering",
         ),
     )
+
+
+def _rendering_table(renderings: Sequence[PhotographedRendering]) -> markup.Html:
+    """Return the table of agreement by rendering, with models if there are several."""
+    has_models = len({rendering.model for rendering in renderings}) > 1
+    model_head = ["model"] if has_models else []
+    heads = [
+        "rendering",
+        *model_head,
+        "in the rendering",
+        "in photographs",
+        "agree",
+        "interval",
+    ]
+    rows = []
+    for rendering in renderings:
+        links = [
+            markup.join_html(
+                markup.element(
+                    "a", label or "nothing", href=f"photos/{markup.in_address(file)}"
+                ),
+                " ",
+            )
+            for label, file in zip(rendering.labels, rendering.files, strict=True)
+        ]
+        outcome = "right" if rendering.rendering_right else "wrong"
+        model_cell = [rendering.model] if has_models else []
+        n_photos = rendering.photos
+        rows.append(
+            [
+                rendering.rendering,
+                *model_cell,
+                f"{outcome}: {rendering.label}",
+                markup.join_html(
+                    f"{rendering.photos_right} of {n_photos} right: ", *links
+                ),
+                f"{rendering.agreeing} of {n_photos}",
+                wording.interval_text(rendering.interval),
+            ]
+        )
+    addresses = [
+        f"renderings/{markup.in_address(rendering.rendering)}"
+        for rendering in renderings
+    ]
+    return markup.study_table(heads, rows, addresses)

@@ -1,6 +1,4 @@
-"""Render the adversarial scene of a run again under other conditions, beside the clean
-scene.
-"""
+"""Render the adversarial scene of a run again under other conditions."""
 
 from __future__ import annotations
 
@@ -19,10 +17,11 @@ from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims
     view=shown,
     claims=claims,
 )
-def replay(asked: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
-    """Render the adversarial scene of a run under other conditions, each beside the
-    clean scene.
-    """
-    from advsearch.questions.replay.conditions import rendered_again  # imports torch
+def replay(context: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
+    """Render the adversarial scene of a run under other conditions.
 
-    return rendered_again(asked, parts)
+    The clean scene is rendered under each of them too.
+    """
+    from advsearch.questions.replay.conditions import run_replay  # imports torch
+
+    return run_replay(context, parts)

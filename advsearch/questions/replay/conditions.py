@@ -1,5 +1,8 @@
-"""`replay`: the adversarial scene of a run under other conditions than it was searched
-and verified under, in other pictures.
+"""Render the adversarial scene of a run under conditions that it was not verified under.
+
+A condition changes the samples, the renderer, the tone curve, the file format, the
+camera or the model. The clean scene is rendered under each condition too, so that a
+prediction which is wrong in both is not counted as a success.
 """
 
 from __future__ import annotations
@@ -36,172 +39,270 @@ from advsearch.questions.replay.result import (
 AttackResult = workbench.AttackResult
 Watched = workbench.Watched
 
-OWN = "as verified"  # The way in which nothing is changed
-# What conditions share whose pictures come of the radiance that the run itself would
-# render
-OWN_LIGHT = "own"
-QUALITIES = (90, 75, 50)
+AS_VERIFIED = "as verified"
+"""Name of the condition that changes nothing."""
+RUN_LIGHT = "own"
+"""Conditions with this `light` start from the radiance that the run itself renders."""
+RUN_MODEL = "the run's own"
+"""Stands for the run's model in the check that no model is named twice."""
+DEFAULT_SPP = 64
+JPEG_QUALITIES = (90, 75, 50)
+MIN_SIZE = 8
+MAX_SIZE = 4096
+PATH_LENGTHS = (2, 16)
+"""Longest light paths, in segments: direct light only, and many more than a run uses."""
 
 SENSORS: dict[str, dict[str, float]] = {
     "a good camera": {"shot": 0.02, "read": 0.005, "mosaic": 1.0},
     "a phone in a dim room": {
-        "shot": 0.08, "read": 0.02, "mosaic": 1.0, "aberration": 0.002, "red": 0.1, "blue": -0.1, "compression": 25.0,
+        "shot": 0.08,
+        "read": 0.02,
+        "mosaic": 1.0,
+        "aberration": 0.002,
+        "red": 0.1,
+        "blue": -0.1,
+        "compression": 25.0,
     },
-}  # fmt: skip
-"""Values of the control `sensor`, by what they stand for; those that are not named are
-0.
-"""
+}
+"""Values of the control `sensor` by the camera that they imitate; all others are 0."""
 CURVES = {
     "gamma": "a power of 1/2.2 in place of sRGB",
     "reinhard": "highlights rolled off, x / (1 + x)",
 }
 """Other tone curves, by `ImageFormation.transfer`."""
-OWN_MODEL = "the run's own"  # What no other model is called
-# Longest light paths in segments: direct light alone, and far more than a run renders
-SHORT = 2
-LONG = 16
+
+ImageChange = Callable[[Tensor, int], Tensor]
+"""Changes an image (H, W, 3), sRGB in [0, 1]; the integer is the seed of the trial."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """One condition of a replay: what is changed and to what; the problem under it,
-    made anew, as it may hold a scene of its own; and why it cannot be had, empty where
-    it can. The others are as those of `RetrialCondition`, by default with pictures of
-    its own.
+class ReplayCondition:
+    """One condition of a replay.
+
+    Attributes:
+        name: what is changed, as the setting `ways` names it.
+        description: what it is changed to.
+        make_problem: creates the problem under this condition, which may hold a scene
+            of its own.
+        spp: samples per pixel.
+        light: conditions of equal light share one radiance; None renders its own.
+        source: conditions of equal source share one image; None has its own.
+        change: is applied to the image before the model sees it.
+        unavailable_reason: why it cannot be rendered here; empty if it can.
     """
 
     name: str
-    text: str
-    problem: Callable[[], Problem]
+    description: str
+    make_problem: Callable[[], Problem]
     spp: int
     light: Hashable = None
     source: Hashable = None
-    change: Callable[[Tensor, int], Tensor] | None = None
-    missing: str = ""
+    change: ImageChange | None = None
+    unavailable_reason: str = ""
 
-    def condition(self) -> workbench.RetrialCondition:
-        title = self.text if self.name == OWN else f"{self.name}: {self.text}"
-        source = self.source or title
+    def to_retrial(self) -> workbench.RetrialCondition:
+        """Create the condition that the verifier renders, and its problem."""
+        title = self.description
+        if self.name != AS_VERIFIED:
+            title = f"{self.name}: {self.description}"
         return workbench.RetrialCondition(
-            title, self.problem(), self.spp, source, self.change, self.light
+            title,
+            self.make_problem(),
+            self.spp,
+            self.source or title,
+            self.change,
+            self.light,
         )
 
 
-def ways_of(
-    problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]
-) -> Iterator[Way]:
-    """Yield every condition of a problem's configuration but other models; the first
-    changes nothing. `spp` is that of the run's verification, and `sized` makes the same
-    problem at another (height, width) in pixels.
+# ---- the conditions
+# ----------------------------------------------------------------------------------
+
+
+def list_conditions(
+    problem: Problem, spp: int, resize: Callable[[tuple[int, int]], Problem]
+) -> Iterator[ReplayCondition]:
+    """Yield every condition of a problem except other models, unchanged first.
+
+    Args:
+        problem: the problem of the run.
+        spp: samples per pixel of the run's verification.
+        resize: creates the same problem at another (height, width) in pixels.
     """
-    renderer = problem.renderer
-    scene = renderer.scene
-    formation = renderer.formation
+    yield same_render(problem, AS_VERIFIED, AS_VERIFIED, spp)
+    yield from sampling_conditions(problem, spp)
+    yield from resolution_conditions(problem, spp, resize)
+    yield from scene_conditions(problem, spp)
+    yield from image_formation_conditions(problem, spp)
+    for quality in JPEG_QUALITIES:
+        compress = partial(compress_as_jpeg, quality)
+        yield same_render(problem, "jpeg", f"quality {quality}", spp, compress)
+    for camera, sensor_values in SENSORS.items():
+        apply = partial(apply_sensor, sensor_values)
+        yield same_render(problem, "sensor", camera, spp, apply)
+    yield blender_condition(problem, spp)
 
-    def same(
-        name: str,
-        text: str,
-        count: int = spp,
-        change: Callable[[Tensor, int], Tensor] | None = None,
-    ) -> Way:
-        return Way(name, text, lambda: problem, count, OWN_LIGHT, OWN_LIGHT, change)
 
-    def traced(name: str, text: str, **made: Any) -> Way:
-        sampler = {"sampler": made["sampler"]} if "sampler" in made else {}
-        return Way(
-            name,
-            text,
-            lambda: replace(
-                problem, renderer=renderer.like(scene.like(**made), **sampler)
-            ),
-            spp,
-        )
+def same_render(
+    problem: Problem,
+    name: str,
+    description: str,
+    spp: int,
+    change: ImageChange | None = None,
+) -> ReplayCondition:
+    """Return a condition that takes the run's renders and may change the image."""
+    return ReplayCondition(
+        name, description, lambda: problem, spp, RUN_LIGHT, RUN_LIGHT, change
+    )
 
-    def formed(name: str, text: str, light: str | None = None, **fields: Any) -> Way:
-        return Way(
-            name,
-            text,
-            lambda: replace(problem, renderer=renderer.like(**fields)),
-            spp,
-            light,
-        )
 
-    yield same(OWN, OWN)
-    for count in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
-        if count != spp:
-            yield same("samples", f"{count} a pixel", count)
-    height, width = formation.resolution
-    for size in (
-        (max(8, height // 2), max(8, width // 2)),
-        (min(4096, 2 * height), min(4096, 2 * width)),
-    ):
+def sampling_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
+    """Yield conditions with a quarter and with four times the samples."""
+    for other_spp in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
+        if other_spp != spp:
+            yield same_render(problem, "samples", f"{other_spp} a pixel", other_spp)
+
+
+def resolution_conditions(
+    problem: Problem, spp: int, resize: Callable[[tuple[int, int]], Problem]
+) -> Iterator[ReplayCondition]:
+    """Yield conditions with half and with twice the resolution."""
+    height, width = problem.renderer.formation.resolution
+    half = (max(MIN_SIZE, height // 2), max(MIN_SIZE, width // 2))
+    double = (min(MAX_SIZE, 2 * height), min(MAX_SIZE, 2 * width))
+    for size in (half, double):
         if size != (height, width):
-            yield Way(
-                "resolution", f"{size[0]} x {size[1]} pixels", partial(sized, size), spp
-            )
-    for depth in (SHORT, LONG):
-        if depth != scene.max_depth:
-            yield traced("depth", f"light paths of {depth} segments", max_depth=depth)
+            description = f"{size[0]} x {size[1]} pixels"
+            yield ReplayCondition("resolution", description, partial(resize, size), spp)
+
+
+def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
+    """Yield conditions with other light paths, another integrator or sampler."""
+    scene = problem.renderer.scene
+    for max_depth in PATH_LENGTHS:
+        if max_depth != scene.max_depth:
+            make_problem = partial(with_scene, problem, max_depth=max_depth)
+            description = f"light paths of {max_depth} segments"
+            yield ReplayCondition("depth", description, make_problem, spp)
+
+    # Mitsuba's path integrator renders no volumes.
     if not scene.volumetric:
-        yield traced("integrator", "Mitsuba's path in place of prb", integrator="path")
-    sampler = "independent" if formation.sampler != "independent" else "multijitter"
-    yield traced("sampler", sampler, sampler=sampler)
-    denoiser = "none" if formation.denoiser != "none" else "oidn"
-    yield formed("denoiser", denoiser, denoiser=denoiser)
+        make_problem = partial(with_scene, problem, integrator="path")
+        description = "Mitsuba's path in place of prb"
+        yield ReplayCondition("integrator", description, make_problem, spp)
+
+    sampler = "independent"
+    if problem.renderer.formation.sampler == "independent":
+        sampler = "multijitter"
+    make_problem = partial(with_scene, problem, sampler=sampler)
+    yield ReplayCondition("sampler", sampler, make_problem, spp)
+
+
+def with_scene(problem: Problem, **changes: Any) -> Problem:
+    """Return the problem with a new scene in which some of its options are changed."""
+    scene = problem.renderer.scene.like(**changes)
+    renderer_changes = {}
+    # The renderer has a sampler of its own.
+    if "sampler" in changes:
+        renderer_changes["sampler"] = changes["sampler"]
+    return replace(problem, renderer=problem.renderer.like(scene, **renderer_changes))
+
+
+def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
+    """Yield conditions with another denoiser or tone curve."""
+    denoiser = "none"
+    if problem.renderer.formation.denoiser == "none":
+        denoiser = "oidn"
+    make_problem = partial(with_renderer, problem, denoiser=denoiser)
+    yield ReplayCondition("denoiser", denoiser, make_problem, spp)
     for curve, text in CURVES.items():
-        yield formed("curve", f"{curve}, {text}", OWN_LIGHT, transfer=curve)
-    for quality in QUALITIES:
-        yield same("jpeg", f"quality {quality}", change=partial(_file, quality))
-    for name, values in SENSORS.items():
-        yield same("sensor", name, change=partial(_sensed, values))
-
-    def by_blender() -> Problem:
-        return replace(problem, renderer=renderer.like(source=cycles.radiance))
-
-    denoise = formation.denoiser != "none"
-    missing = ""
-    try:
-        cycles = Cycles(
-            scene.made[0],
-            formation.resolution,
-            max_depth=scene.max_depth,
-            denoise=denoise,
-        )
-    except BlenderError as error:
-        missing = str(error)
-    yield Way("blender", "Cycles, Blender's renderer", by_blender, spp, missing=missing)
+        make_problem = partial(with_renderer, problem, transfer=curve)
+        description = f"{curve}, {text}"
+        yield ReplayCondition("curve", description, make_problem, spp, RUN_LIGHT)
 
 
-def _file(quality: int, picture: Tensor, _seed: int) -> Tensor:
-    return images.coded(picture, quality).clamp(0.0, 1.0)
+def with_renderer(problem: Problem, **changes: Any) -> Problem:
+    """Return the problem with a renderer in which some of its options are changed."""
+    return replace(problem, renderer=problem.renderer.like(**changes))
 
 
-def _sensed(values: Mapping[str, float], picture: Tensor, seed: int) -> Tensor:
+def compress_as_jpeg(quality: int, image: Tensor, _seed: int) -> Tensor:
+    """Return an image (H, W, 3) after JPEG compression."""
+    return images.coded(image, quality).clamp(0.0, 1.0)
+
+
+def apply_sensor(
+    sensor_values: Mapping[str, float], image: Tensor, seed: int
+) -> Tensor:
+    """Return an image (H, W, 3) as a camera's sensor records it.
+
+    Args:
+        sensor_values: of the control `sensor`; all other parameters are 0.
+        image: sRGB in [0, 1].
+        seed: of the sensor's noise.
+    """
     control = workbench.CONTROLS["sensor"]()
     control.chosen["seed"] = seed
-    of_control = {
-        parameter.name: values.get(parameter.name, 0.0)
+    parameters = {
+        parameter.name: torch.tensor(sensor_values.get(parameter.name, 0.0))
         for parameter in control.parameters
     }
-    changed: Tensor = control.on_picture(
-        {name: torch.tensor(value) for name, value in of_control.items()}, picture
+    sensor_image: Tensor = control.on_picture(parameters, image)
+    return sensor_image
+
+
+def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
+    """Return the condition that renders with Cycles, available or not."""
+    renderer = problem.renderer
+    condition = ReplayCondition(
+        "blender", "Cycles, Blender's renderer", lambda: problem, spp
     )
-    return changed
+    try:
+        cycles = Cycles(
+            renderer.scene.made[0],
+            renderer.formation.resolution,
+            max_depth=renderer.scene.max_depth,
+            denoise=renderer.formation.denoiser != "none",
+        )
+    except BlenderError as error:
+        return replace(condition, unavailable_reason=str(error))
+    make_problem = partial(with_renderer, problem, source=cycles.radiance)
+    return replace(condition, make_problem=make_problem)
+
+
+def model_condition(
+    problem: Problem, other_problem: Problem, name: str, spp: int
+) -> ReplayCondition:
+    """Return the condition that asks another model.
+
+    A model that takes the same images as the run's own shares the run's renders.
+    """
+    light = name
+    if other_problem.renderer.formation == problem.renderer.formation:
+        light = RUN_LIGHT
+        other_problem = replace(other_problem, renderer=problem.renderer)
+    make_problem = partial(replace, other_problem)
+    return ReplayCondition("model", name, make_problem, spp, light, light)
+
+
+# ---- the experiment
+# ----------------------------------------------------------------------------------
 
 
 @workbench.asks(ReplayConfig)
 def replay(
     attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any
 ) -> ReplayResult:
-    """Render the adversarial scene of a run under other conditions, each beside the
-    clean scene (docs/questions.md).
+    """Render the adversarial scene of a run under other conditions (docs/questions.md).
+
+    The clean scene is rendered under each of them too.
 
     Args:
         attack: one that was kept and has ended: its result, or name or folder of its
             run.
     """
     parts = None
-    only_now = list[settings.PythonOnly]()
+    python_only = list[settings.PythonOnly]()
     run = attack
     if isinstance(attack, AttackResult):
         if attack.run is None:
@@ -210,97 +311,145 @@ def replay(
                 "was not; give it a `run`"
             )
         run = attack.run
-        only_now = [
+        python_only = [
             part
             for part in directory.read_python_only(Path(run))
             if part.role not in workbench.ROLES_IN_SEARCH
         ]
-        parts = None if attack.parts is None else attack.parts()
+        if attack.parts is not None:
+            parts = attack.parts()
     config = workbench.configured(ReplayConfig, attack=run, **options)
-    config = config.with_only_here(only_now) if only_now else config
-    made: ReplayResult = workbench.get_experiment("replay").run(
+    if python_only:
+        config = config.with_only_here(python_only)
+    result: ReplayResult = workbench.get_experiment("replay").run(
         config, progress=workbench.watcher(progress), parts=parts
     )
-    return made
+    return result
 
 
-def rendered_again(
-    asked: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None
+def run_replay(
+    context: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None
 ) -> ReplayResult:
-    """Render an adversarial scene again as a configuration describes; every trial is
-    stored at once, and a run goes on with the next. `parts` is what the attack was
-    asked with; None loads what its run names. Raises InputError where the run has no
-    adversarial configuration, or its scene is another one now, and FileFormatError
-    where it did not end, or is of another command.
+    """Render an adversarial scene again as the settings of a run say.
+
+    Every trial is stored at once, so that a resumed run continues with the next.
+
+    Args:
+        context: the settings and the run.
+        parts: Python objects that the attack was called with; None loads what its run
+            names.
+
+    Raises:
+        InputError: the attack has no adversarial configuration, or its scene has
+            changed.
+        FileFormatError: the run did not end, or is not an attack.
     """
-    config = asked.config
-    asked.progress.stage(workbench.LOADING)
-    folder = directory.find_run(config.attack)
-    summary = workbench.attack_of(folder)
-    if summary.adversarial is None:
+    config = context.config
+    context.progress.stage(workbench.LOADING)
+    attack_directory = directory.find_run(config.attack)
+    attack = workbench.attack_of(attack_directory)
+    if attack.adversarial is None:
         raise InputError(
-            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial "
-            "configuration to render again"
+            f"{attack_directory}: ended with {attack.ending!r}, so that there is no "
+            "adversarial configuration to render again"
         )
-    settings.check_once((OWN_MODEL, *config.models), "model")
-    parts = parts or workbench.parts_in(folder)
+    settings.check_once((RUN_MODEL, *config.models), "model")
+    parts = parts or workbench.parts_in(attack_directory)
     threads = {} if config.threads is None else {"threads": config.threads}
-    again = partial(workbench.problem_of_parts, parts, **threads)
-    problem, warnings = again()
-    warnings += _changed(folder, parts)
-    u = workbench.kept_configuration(folder, problem)
-    spp = (
-        summary.sample_count.spp
-        if summary.sample_count
-        else summary.verified.spp
-        if summary.verified
-        else 64
-    )
-    own, *others = ways_of(problem, spp, lambda size: again(resolution=size)[0])
-    ways = [own, *(way for way in others if way.name in config.chosen)]
-    # those that are shown pictures as the run's own model is take its renders
-    for name in config.models:
-        other = again(model=name, ensemble=None)[0]
-        light = (
-            OWN_LIGHT
-            if other.renderer.formation == problem.renderer.formation
-            else name
-        )
-        other = (
-            replace(other, renderer=problem.renderer) if light == OWN_LIGHT else other
-        )
-        ways.append(Way("model", name, partial(replace, other), spp, light, light))
-    table = _Table(
-        u,
-        config.trials,
-        seeds.stream(parts.config.seed, "replay"),
-        asked.run,
-        asked.progress,
-    )
-    together = [way for way in ways if way.light == OWN_LIGHT and way.spp == spp]
-    with asked.until_interrupted():
-        for batch in (together, *([way] for way in ways if way not in together)):
+    load_problem = partial(workbench.problem_of_parts, parts, **threads)
+    problem, warnings = load_problem()
+    warnings += describe_changed_file(attack_directory, parts)
+
+    u = workbench.kept_configuration(attack_directory, problem)
+    spp = verification_spp(attack)
+    conditions = select_conditions(config, problem, spp, load_problem)
+    seed = seeds.stream(parts.config.seed, "replay")
+    table = _Table(u, config.trials, seed, context.run, context.progress)
+    with context.until_interrupted():
+        for batch in batch_by_light(conditions, spp):
             table.fill(batch)
-    return asked.result(
+    return context.result(
         ReplayResult,
-        answer=str(folder),
-        answered=summary.ending,
-        object=summary.object,
-        model=summary.model,
-        task=summary.task,
-        environment=summary.environment,
-        controls=summary.controls,
-        table=[table.rows[way] for way in ways if way in table.rows],
+        answer=str(attack_directory),
+        answered=attack.ending,
+        object=attack.object,
+        model=attack.model,
+        task=attack.task,
+        environment=attack.environment,
+        controls=attack.controls,
+        table=[
+            table.rows[condition] for condition in conditions if condition in table.rows
+        ],
         renders=table.renders,
         warnings=warnings,
         seed=parts.config.seed,
     )
 
 
+def verification_spp(attack: workbench.AttackSummary) -> int:
+    """Return the samples per pixel that an attack was verified with."""
+    if attack.sample_count:
+        return attack.sample_count.spp
+    if attack.verified:
+        return attack.verified.spp
+    return DEFAULT_SPP
+
+
+def select_conditions(
+    config: ReplayConfig,
+    problem: Problem,
+    spp: int,
+    load_problem: Callable[..., tuple[Problem, list[str]]],
+) -> list[ReplayCondition]:
+    """Return the conditions that the settings select, the unchanged one first.
+
+    Args:
+        config: the settings.
+        problem: the problem of the run.
+        spp: samples per pixel of the run's verification.
+        load_problem: loads the problem again, with changes to its settings.
+    """
+    unchanged, *other_conditions = list_conditions(
+        problem, spp, lambda size: load_problem(resolution=size)[0]
+    )
+    conditions = [unchanged]
+    conditions += [
+        condition for condition in other_conditions if condition.name in config.chosen
+    ]
+    for model_name in config.models:
+        other_problem = load_problem(model=model_name, ensemble=None)[0]
+        conditions.append(model_condition(problem, other_problem, model_name, spp))
+    return conditions
+
+
+def batch_by_light(
+    conditions: Sequence[ReplayCondition], spp: int
+) -> list[list[ReplayCondition]]:
+    """Put the conditions that share the run's renders into the first batch.
+
+    Every other condition is a batch by itself.
+    """
+    shared = [
+        condition
+        for condition in conditions
+        if condition.light == RUN_LIGHT and condition.spp == spp
+    ]
+    single = [[condition] for condition in conditions if condition not in shared]
+    return [shared, *single]
+
+
 @dataclass
 class _Table:
-    """The rows so far, by their condition, for a configuration (d,), and the pictures
-    rendered.
+    """The rows of a replay so far.
+
+    Attributes:
+        u: the adversarial configuration (d,).
+        trials: of the clean and of the adversarial scene under each condition.
+        seed: root of the seeds of the trials.
+        run: stores the trials.
+        progress: reports them.
+        rows: the results, by condition.
+        renders: number of images rendered so far.
     """
 
     u: torch.Tensor
@@ -308,71 +457,92 @@ class _Table:
     seed: int
     run: RunDirectory
     progress: Progress
-    rows: dict[Way, ReplayRow] = field(default_factory=dict)
+    rows: dict[ReplayCondition, ReplayRow] = field(default_factory=dict)
     renders: int = 0
 
-    def fill(self, ways: Sequence[Way]) -> None:
-        """Add the rows of some conditions that share their renders: the clean scene
-        under all of them, then the adversarial one. A condition that cannot be had, or
-        that Blender fails at, gets a row that says why.
+    def fill(self, conditions: Sequence[ReplayCondition]) -> None:
+        """Add the rows of conditions that share their renders.
+
+        A condition that is not available, or that Blender fails at, gets a row with the
+        reason.
         """
-        renderers = list[Any]()
-        before = 0
-        try:
-            if missing := next((way.missing for way in ways if way.missing), ""):
-                raise BlenderError(missing)
-            text = ", ".join(dict.fromkeys(way.name for way in ways)) + (
-                f": {ways[0].text}" if len(ways) == 1 else ""
-            )
-            total = 2 * self.trials * len(ways)
-            self.progress.stage(
-                f"replaying, {text}", total, hint="`trials` or `ways` shorten it"
-            )
-            conditions = {way: way.condition() for way in ways}
-            renderers += {
-                id(one.problem.renderer): one.problem.renderer
-                for one in conditions.values()
-            }.values()
-            before = sum(renderer.renders for renderer in renderers)
-            retrials = workbench.Retrials(
-                [*conditions.values()],
-                self.run,
-                self.progress,
-                trials=self.trials,
-                seed=self.seed,
-            )
-            clean = {
-                way: workbench.control_group(retrials.clean(one), one.spp)
-                for way, one in conditions.items()
-            }
-            for way, condition in conditions.items():
-                checked = retrials.adversarial("answer", self.u, condition)
-                ending = checked.ending.value
-                rate = workbench.verified_rate(checked)
-                self.rows[way] = ReplayRow(
-                    way=way.name,
-                    condition=way.text,
-                    ending=ending,
-                    clean=clean[way],
-                    verified=rate,
-                )
-        except BlenderError as error:
-            for way in ways:
-                self.rows[way] = ReplayRow(
-                    way=way.name, condition=way.text, ending=NOT_DONE, reason=str(error)
-                )
-        finally:
-            self.renders += sum(renderer.renders for renderer in renderers) - before
-
-
-def _changed(folder: Path, parts: workbench.AttackParts) -> list[str]:
-    """A caution where a file was another one when the run was made."""
-    name = RunDirectory.find_file_changed_since(folder, parts.config)
-    return (
-        [
-            f"{name} is not what it was when the run was made: what does not hold may "
-            "come from that."
+        reasons = [
+            condition.unavailable_reason
+            for condition in conditions
+            if condition.unavailable_reason
         ]
-        if name
-        else []
-    )
+        if reasons:
+            self._add_not_done(conditions, reasons[0])
+            return
+        try:
+            self._render(conditions)
+        except BlenderError as error:
+            self._add_not_done(conditions, str(error))
+
+    def _add_not_done(self, conditions: Sequence[ReplayCondition], reason: str) -> None:
+        for condition in conditions:
+            self.rows[condition] = ReplayRow(
+                way=condition.name,
+                condition=condition.description,
+                ending=NOT_DONE,
+                reason=reason,
+            )
+
+    def _render(self, conditions: Sequence[ReplayCondition]) -> None:
+        """Render the trials of conditions, and count the renders even if it stops."""
+        names = ", ".join(dict.fromkeys(condition.name for condition in conditions))
+        if len(conditions) == 1:
+            names = f"{names}: {conditions[0].description}"
+        self.progress.stage(
+            f"replaying, {names}",
+            2 * self.trials * len(conditions),
+            hint="`trials` or `ways` shorten it",
+        )
+        retrial_of = {condition: condition.to_retrial() for condition in conditions}
+        renderer_by_id = {
+            id(retrial.problem.renderer): retrial.problem.renderer
+            for retrial in retrial_of.values()
+        }
+        renderers = list(renderer_by_id.values())
+        renders_before = sum(renderer.renders for renderer in renderers)
+        try:
+            self._add_trials(retrial_of)
+        finally:
+            renders_after = sum(renderer.renders for renderer in renderers)
+            self.renders += renders_after - renders_before
+
+    def _add_trials(
+        self, retrial_of: Mapping[ReplayCondition, workbench.RetrialCondition]
+    ) -> None:
+        """Try the clean scene under all conditions, then the adversarial one."""
+        retrials = workbench.Retrials(
+            list(retrial_of.values()),
+            self.run,
+            self.progress,
+            trials=self.trials,
+            seed=self.seed,
+        )
+        clean_results = {
+            condition: workbench.control_group(retrials.clean(retrial), retrial.spp)
+            for condition, retrial in retrial_of.items()
+        }
+        for condition, retrial in retrial_of.items():
+            verification = retrials.adversarial("answer", self.u, retrial)
+            self.rows[condition] = ReplayRow(
+                way=condition.name,
+                condition=condition.description,
+                ending=verification.ending.value,
+                clean=clean_results[condition],
+                verified=workbench.verified_rate(verification),
+            )
+
+
+def describe_changed_file(path: Path, parts: workbench.AttackParts) -> list[str]:
+    """Return a warning if a file has changed since the run was made."""
+    name = RunDirectory.find_file_changed_since(path, parts.config)
+    if not name:
+        return []
+    return [
+        f"{name} is not what it was when the run was made: what does not hold may "
+        "come from that."
+    ]

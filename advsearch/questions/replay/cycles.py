@@ -1,8 +1,7 @@
-"""Pictures of a scene by Cycles, Blender's path tracer, in a process of Blender's own
-that reads the scene as glTF.
+"""Render a scene with Cycles, Blender's path tracer, in a process of its own.
 
-It is the same scene in other words, not the same picture: textures have 8 bits,
-surfaces are Blender's, round lamps are faceted, and light is sampled in Cycles' way.
+Blender reads the scene as glTF, so that the images differ in more than noise: textures
+have 8 bits, surfaces are Blender's, and round lamps are faceted.
 """
 
 from __future__ import annotations
@@ -33,102 +32,166 @@ from advsearch.extend import (
     workbench,
 )
 
-LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
-MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
-PAUSE = 0.02  # seconds between looks at whether a picture is there
+MAX_RENDER_SECONDS = 300
+"""Time limit of one image, Blender's start included; `stored_files.scaled` adapts it."""
+POLL_INTERVAL = 0.02
+"""Seconds between two checks whether an image is finished."""
+MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)
+"""Material of the ground."""
 
-RENDER = """
+RENDER_SCRIPT = """
 import json, math, os, sys
 import bpy
 from mathutils import Matrix
+
 folder = sys.argv[-1]
 with open(os.path.join(folder, "scene.json")) as file:
-    told = json.load(file)
+    settings = json.load(file)
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.import_scene.gltf(filepath=os.path.join(folder, "scene.glb"))
 scene = bpy.context.scene
-def put(name, data, matrix):
-    found = bpy.data.objects.new(name, data)
-    found.matrix_world = Matrix(matrix)
-    scene.collection.objects.link(found)
-    return found
-camera = bpy.data.cameras.new("camera")
-camera.sensor_fit, camera.angle, camera.clip_start, camera.clip_end = "AUTO", told["fov"], 0.01, 1e5
-camera.shift_x, camera.shift_y = told["shift"]
-scene.camera = put("camera", camera, told["camera"])
-for one in told["lamps"]:
-    strength = max(one["color"]) or 1.0
-    color = [value / strength for value in one["color"]]
-    if one["ball"] is None:
-        lamp = bpy.data.lights.new("lamp", "POINT")
-        lamp.energy, lamp.color, lamp.shadow_soft_size = 4.0 * math.pi * strength, color, 0.0
-        put("lamp", lamp, one["place"])
-        continue
+
+
+def add_object(name, data, matrix):
+    added = bpy.data.objects.new(name, data)
+    added.matrix_world = Matrix(matrix)
+    scene.collection.objects.link(added)
+    return added
+
+
+def add_point_lamp(lamp):
+    strength = max(lamp["color"]) or 1.0
+    data = bpy.data.lights.new("lamp", "POINT")
+    data.energy = 4.0 * math.pi * strength
+    data.color = [value / strength for value in lamp["color"]]
+    data.shadow_soft_size = 0.0
+    add_object("lamp", data, lamp["to_world"])
+
+
+def add_ball_lamp(lamp):
+    strength = max(lamp["color"]) or 1.0
+    color = [value / strength for value in lamp["color"]]
     bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=1.0)
     ball = bpy.context.object
-    ball.matrix_world, ball.visible_shadow = Matrix(one["ball"]), False
+    ball.matrix_world = Matrix(lamp["ball"])
+    ball.visible_shadow = False
     bpy.ops.object.shade_smooth()
     material = bpy.data.materials.new("lamp")
     material.use_nodes = True
-    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes = material.node_tree.nodes
+    links = material.node_tree.links
     nodes.clear()
-    glow, out = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
-    side, front = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeMath")  # a ball that throws no shadow
-    front.operation, front.inputs[1].default_value = "LESS_THAN", 0.5               # would show its inside too
-    links.new(side.outputs["Backfacing"], front.inputs[0])
+    emission = nodes.new("ShaderNodeEmission")
+    output = nodes.new("ShaderNodeOutputMaterial")
+    # A ball without a shadow would show its inside too: only the front emits.
+    geometry = nodes.new("ShaderNodeNewGeometry")
+    is_front = nodes.new("ShaderNodeMath")
+    is_front.operation = "LESS_THAN"
+    is_front.inputs[1].default_value = 0.5
+    links.new(geometry.outputs["Backfacing"], is_front.inputs[0])
     power = nodes.new("ShaderNodeMath")
-    power.operation, power.inputs[1].default_value = "MULTIPLY", strength
-    links.new(front.outputs[0], power.inputs[0])
-    links.new(power.outputs[0], glow.inputs["Strength"])
-    glow.inputs["Color"].default_value = (*color, 1.0)
-    links.new(glow.outputs[0], out.inputs["Surface"])
+    power.operation = "MULTIPLY"
+    power.inputs[1].default_value = strength
+    links.new(is_front.outputs[0], power.inputs[0])
+    links.new(power.outputs[0], emission.inputs["Strength"])
+    emission.inputs["Color"].default_value = (*color, 1.0)
+    links.new(emission.outputs[0], output.inputs["Surface"])
     ball.data.materials.append(material)
+
+
+def add_environment(world):
+    nodes = world.node_tree.nodes
+    links = world.node_tree.links
+    nodes.clear()
+    background = nodes.new("ShaderNodeBackground")
+    output = nodes.new("ShaderNodeOutputWorld")
+    background.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    links.new(background.outputs[0], output.inputs["Surface"])
+    if not settings["environment"]:
+        return
+    image = bpy.data.images.load(os.path.join(folder, "environment.exr"))
+    image.colorspace_settings.name = "Linear Rec.709"
+    texture = nodes.new("ShaderNodeTexEnvironment")
+    texture.image = image
+    rotation = nodes.new("ShaderNodeMapping")
+    rotation.vector_type = "POINT"
+    rotation.inputs["Rotation"].default_value = (0.0, 0.0, settings["turn"])
+    coordinates = nodes.new("ShaderNodeTexCoord")
+    links.new(coordinates.outputs["Generated"], rotation.inputs["Vector"])
+    links.new(rotation.outputs[0], texture.inputs["Vector"])
+    links.new(texture.outputs["Color"], background.inputs["Color"])
+    background.inputs["Strength"].default_value = settings["strength"]
+
+
+camera = bpy.data.cameras.new("camera")
+camera.sensor_fit = "AUTO"
+camera.angle = settings["fov"]
+camera.clip_start = 0.01
+camera.clip_end = 1e5
+camera.shift_x, camera.shift_y = settings["shift"]
+scene.camera = add_object("camera", camera, settings["camera"])
+for lamp in settings["lamps"]:
+    if lamp["ball"] is None:
+        add_point_lamp(lamp)
+    else:
+        add_ball_lamp(lamp)
 world = bpy.data.worlds.new("world")
 scene.world = world
 world.use_nodes = True
-nodes, links = world.node_tree.nodes, world.node_tree.links
-nodes.clear()
-back, out = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
-back.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-links.new(back.outputs[0], out.inputs["Surface"])
-if told["environment"]:
-    image = bpy.data.images.load(os.path.join(folder, "environment.exr"))
-    image.colorspace_settings.name = "Linear Rec.709"
-    texture, turn = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
-    texture.image, turn.vector_type = image, "POINT"
-    turn.inputs["Rotation"].default_value = (0.0, 0.0, told["turn"])
-    links.new(nodes.new("ShaderNodeTexCoord").outputs["Generated"], turn.inputs["Vector"])
-    links.new(turn.outputs[0], texture.inputs["Vector"])
-    links.new(texture.outputs["Color"], back.inputs["Color"])
-    back.inputs["Strength"].default_value = told["strength"]
-render, cycles = scene.render, scene.cycles
-render.engine, render.resolution_x, render.resolution_y = "CYCLES", told["width"], told["height"]
-render.resolution_percentage, render.use_file_extension, render.use_compositing = 100, False, False
-render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
-cycles.device, cycles.pixel_filter_type, cycles.filter_width = "CPU", "BOX", 1.0
-cycles.use_adaptive_sampling, cycles.use_denoising = False, told["denoise"]
-cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
+add_environment(world)
+
+render = scene.render
+render.engine = "CYCLES"
+render.resolution_x = settings["width"]
+render.resolution_y = settings["height"]
+render.resolution_percentage = 100
+render.use_file_extension = False
+render.use_compositing = False
+render.image_settings.file_format = "OPEN_EXR"
+render.image_settings.color_depth = "32"
+cycles = scene.cycles
+cycles.device = "CPU"
+cycles.pixel_filter_type = "BOX"
+cycles.filter_width = 1.0
+cycles.use_adaptive_sampling = False
+cycles.use_denoising = settings["denoise"]
+cycles.sample_clamp_direct = 0.0
+cycles.sample_clamp_indirect = 0.0
+cycles.blur_glossy = 0.0
 for kind in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces"):
-    setattr(cycles, kind, told["bounces"])
+    setattr(cycles, kind, settings["bounces"])
+
 for line in sys.stdin:
-    seed, cycles.samples, name = (int(part) for part in line.split())
+    seed, samples, name = (int(field) for field in line.split())
+    cycles.samples = samples
     cycles.seed = seed % 2 ** 31
     path = os.path.join(folder, str(name))
     render.filepath = path + ".part"
     bpy.ops.render.render(write_still=True)
     os.replace(path + ".part", path + ".exr")
 """
+"""What Blender runs: load the scene, then render an image for each line of its input.
+
+A line has the seed, the samples per pixel and the number of the image.
+"""
 
 
 class BlenderError(Exception):
-    """Blender is not there, cannot show a scene, or stopped."""
+    """Blender is not installed, cannot render a scene, or stopped."""
 
 
 class Cycles:
-    """Renders the configurations of one scene at a size (height, width) by Cycles, with
-    light paths of at most so many segments, and with Blender's Open Image Denoise or
-    without. Raises BlenderError: there is no Blender, or the scene has what is not
-    carried over.
+    """Render the configurations of one scene with Cycles.
+
+    Args:
+        description: the scene.
+        size: (height, width) of the images in pixels.
+        max_depth: segments of the longest light path.
+        denoise: whether Blender's Open Image Denoise is applied.
+
+    Raises:
+        BlenderError: Blender is not installed, or the scene has parts that cannot be
+            transferred.
     """
 
     def __init__(
@@ -145,238 +208,258 @@ class Cycles:
             )
         except errors.FileFormatError as error:
             raise BlenderError(str(error)) from None
-        known = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
-        unknown = [
-            part.name for part in description.parts if not isinstance(part, known)
-        ]
-        own = [name for name, mesh in description.meshes.items() if mesh.surface]
-        unknown += [f"a surface of Mitsuba's own on the {name}" for name in own]
-        unknown += (
-            ["a lens"] if description.thin_lens or description.camera_model else []
-        )
-        unknown += ["a plain background"] if description.backdrop else []
-        if unknown:
+        unsupported = _find_unsupported(description)
+        if unsupported:
             raise BlenderError(
-                f"the scene has {', '.join(unknown[:5])}, which is not "
+                f"the scene has {', '.join(unsupported[:5])}, which is not "
                 "carried over to Blender"
             )
         self._description = description
         self._resolution = size
         self._depth = max_depth
         self._denoise = denoise
-        self._held: dict[str, Tensor] = {}
+        self._inputs: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises
-        BlenderError: Blender stopped, or took too long.
+        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance` does.
+
+        Raises:
+            BlenderError: Blender stopped, or took too long.
         """
-        held = self._held
-        same = held.keys() == inputs.keys() and all(
-            torch.equal(held[name], inputs[name]) for name in inputs
+        is_same_scene = self._inputs.keys() == inputs.keys() and all(
+            torch.equal(self._inputs[name], inputs[name]) for name in inputs
         )
-        if self._process is None or not same:
+        if self._process is None or not is_same_scene:
             self._process = None
-            self._process = _Process(self._command, *self._told(inputs))
-            self._held = {
+            self._process = _Process(self._command, *self._export(inputs))
+            self._inputs = {
                 name: value.detach().clone() for name, value in inputs.items()
             }
-        return self._process.picture(seed, spp)
+        return self._process.render(seed, spp)
 
-    def _told(
+    def _export(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[dict[str, object], bytes, np.ndarray | None]:
+        """Return the settings for Blender, the meshes as glTF, and the environment.
+
+        The environment is linear radiance (H, W, 3), or None.
+        """
         scene = self._description
-        (height, width) = self._resolution
+        height, width = self._resolution
         values = {name: value.detach().cpu() for name, value in inputs.items()}
         meshes = [workbench.posed(part, values) for part in scene.meshes.values()]
-        meshes += _ground(scene, values.get("ground.reflectance"))
-        pose = values.get(
+        meshes += _make_ground(scene, values.get("ground.reflectance"))
+        radiance = None
+        if scene.environment is not None:
+            radiance = np.asarray(scene.environment.radiance, np.float32)
+        if "environment.padded" in values:
+            radiance = values["environment.padded"][:, 1:-1].numpy()
+
+        to_world = values.get(
             "camera.to_world",
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
         )
-        camera = pose.double().numpy()
         fov = float(
             values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0]
         )
-        shift = [
-            float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0])
-            for axis in "xy"
-        ]
-        lamps: list[dict[str, object]] = []
-        for lamp in scene.lamps.values():
-            place = np.eye(4)
-            shape = list[list[float]]()
-            if isinstance(lamp, parts.BallLamp):
-                ball = assets.pose_of(lamp.radius * np.eye(3), lamp.place)
-                shape = (
-                    values.get(f"{lamp.name}.ball", torch.from_numpy(ball))
-                    .double()
-                    .tolist()
-                )
-                color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
-            else:
-                assert isinstance(lamp, parts.PointLamp)  # others are refused before
-                place[:3, 3] = values.get(
-                    f"{lamp.name}.position", torch.tensor(lamp.position)
-                ).numpy()
-                color = values.get(
-                    f"{lamp.name}.intensity", torch.tensor(lamp.intensity)
-                )
-            if bool((color > 0.0).any()):
-                lamps.append(
-                    {
-                        "ball": shape or None,
-                        "place": place.tolist(),
-                        "color": color.tolist(),
-                    }
-                )
-        radiance = (
-            None
-            if scene.environment is None
-            else np.asarray(scene.environment.radiance, np.float32)
-        )
-        if "environment.padded" in values:
-            radiance = values["environment.padded"][:, 1:-1].numpy()
-        message: dict[str, object] = {
+        shift_x = float(values.get("camera.shift_x", torch.zeros(1))[0])
+        shift_y = float(values.get("camera.shift_y", torch.zeros(1))[0])
+        longer_side = max(width, height)
+        blender_settings: dict[str, object] = {
             "width": width,
             "height": height,
-            # Blender's look along their own -z
-            "camera": (camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist(),
+            # Blender's cameras look along their own -z.
+            "camera": (
+                to_world.double().numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])
+            ).tolist(),
             "fov": math.radians(fov),
-            "shift": [
-                shift[0] * width / max(width, height),
-                -shift[1] * height / max(width, height),
-            ],
-            "lamps": lamps,
+            "shift": [shift_x * width / longer_side, -shift_y * height / longer_side],
+            "lamps": _describe_lamps(scene, values),
             "environment": radiance is not None,
             "turn": math.pi / 2.0 - math.radians(scene.number("environment.rotation")),
             "strength": 2.0 ** scene.number("environment.exposure"),
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return (
-            message,
-            workbench.glb([_turn_for_blender(mesh) for mesh in meshes]),
-            radiance,
-        )
+        shapes = [_turn_for_blender(mesh) for mesh in meshes]
+        return blender_settings, workbench.glb(shapes), radiance
+
+
+def _find_unsupported(description: SceneDescription) -> list[str]:
+    """Return what a scene has that cannot be transferred to Blender."""
+    supported_types = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
+    unsupported = [
+        part.name for part in description.parts if not isinstance(part, supported_types)
+    ]
+    for name, mesh in description.meshes.items():
+        if mesh.surface:
+            unsupported.append(f"a surface of Mitsuba's own on the {name}")
+    if description.thin_lens or description.camera_model:
+        unsupported.append("a lens")
+    if description.backdrop:
+        unsupported.append("a plain background")
+    return unsupported
+
+
+def _describe_lamps(
+    scene: SceneDescription, values: Mapping[str, Tensor]
+) -> list[dict[str, object]]:
+    """Return the lamps that are switched on, for `RENDER_SCRIPT`.
+
+    Each has a "color", linear radiance or intensity; and either "ball", the matrix
+    (4, 4) of a unit sphere, or None and "to_world", that of a point.
+    """
+    lamps: list[dict[str, object]] = []
+    for lamp in scene.lamps.values():
+        to_world = np.eye(4)
+        ball: list[list[float]] | None = None
+        if isinstance(lamp, parts.BallLamp):
+            default_ball = torch.from_numpy(
+                assets.pose_of(lamp.radius * np.eye(3), lamp.place)
+            )
+            ball = values.get(f"{lamp.name}.ball", default_ball).double().tolist()
+            color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
+        else:
+            assert isinstance(lamp, parts.PointLamp)  # see `_find_unsupported`
+            position = values.get(f"{lamp.name}.position", torch.tensor(lamp.position))
+            to_world[:3, 3] = position.numpy()
+            color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+        if bool((color > 0.0).any()):
+            lamps.append(
+                {"ball": ball, "to_world": to_world.tolist(), "color": color.tolist()}
+            )
+    return lamps
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Return a mesh turned so that Blender, for which the front of a glTF file is -y,
-    has our axes.
-    """
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
-    mesh = shape.mesh
-    turned = replace(
-        mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T
+    """Rotate a mesh so that Blender, which imports glTF with -y in front, has our axes."""
+    rotation = np.array(
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32
     )
-    return replace(shape, mesh=turned)
+    mesh = shape.mesh
+    rotated = replace(
+        mesh, vertices=mesh.vertices @ rotation.T, normals=mesh.normals @ rotation.T
+    )
+    return replace(shape, mesh=rotated)
 
 
-def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[assets.Shape]:
+def _make_ground(
+    scene: SceneDescription, reflectance: Tensor | None
+) -> list[assets.Shape]:
+    """Return the ground of a scene as a mesh; empty if it has none, or one already.
+
+    Args:
+        scene: the scene.
+        reflectance: linear (H, W, 3) of a ground that is a photograph; None for the
+            photograph itself.
+    """
     photograph = scene.photograph
     if photograph is not None:
-        shown = photograph.base if reflectance is None else reflectance
-        return [
-            assets.Shape(
-                "ground",
-                photograph.mesh,
-                color.linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(),
-                MATT,
-            )
-        ]
-    half = np.float32(scene.number("ground.size") / 2.0)
-    if half <= 0.0 or workbench.paved(scene):
+        base = photograph.base if reflectance is None else reflectance
+        texture = color.linear_to_srgb(base.clamp(0.0, 1.0)).numpy()
+        return [assets.Shape("ground", photograph.mesh, texture, MATT)]
+
+    half_size = np.float32(scene.number("ground.size") / 2.0)
+    if half_size <= 0.0 or workbench.paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-    up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    mesh = assets.Mesh(
-        corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5)
-    )
-    return [
-        assets.Shape(
-            "ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT
-        )
-    ]
+    normals = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
+    texture_coordinates = corners[:, :2] * np.float32(0.5) + np.float32(0.5)
+    mesh = assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
+    texture = np.full((1, 1, 3), scene.ground_color, np.float32)
+    return [assets.Shape("ground", mesh, texture, MATT)]
 
 
 class _Process:
-    """Blender with one configuration."""
+    """A process of Blender that has loaded one configuration.
+
+    Args:
+        program: the command that starts Blender with a script.
+        blender_settings: for `RENDER_SCRIPT`.
+        meshes: the scene as glTF.
+        radiance: of the environment, linear (H, W, 3); None without.
+
+    Raises:
+        BlenderError: Blender can't be started.
+    """
 
     def __init__(
         self,
         program: list[str],
-        told: dict[str, object],
+        blender_settings: dict[str, object],
         meshes: bytes,
         radiance: np.ndarray | None,
     ) -> None:
-        self._keeper = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
-        self._folder = Path(self._keeper.name)
-        self._count = 0
-        (self._folder / "scene.json").write_text(json.dumps(told), "utf-8")
-        (self._folder / "scene.glb").write_bytes(meshes)
-        (self._folder / "render.py").write_text(RENDER, "utf-8")
+        self._temporary = tempfile.TemporaryDirectory(prefix="advsearch-cycles-")
+        self._directory = Path(self._temporary.name)
+        self._n_images = 0
+        script = self._directory / "render.py"
+        settings_text = json.dumps(blender_settings)
+        (self._directory / "scene.json").write_text(settings_text, "utf-8")
+        (self._directory / "scene.glb").write_bytes(meshes)
+        script.write_text(RENDER_SCRIPT, "utf-8")
         if radiance is not None:
-            with OpenEXR.File({}, {"RGB": np.ascontiguousarray(radiance)}) as picture:
-                picture.write(str(self._folder / "environment.exr"))
-        between = [] if "-I" in program else ["--"]
-        self._said = self._folder / "said.txt"
-        with self._said.open("wb") as said:
+            with OpenEXR.File({}, {"RGB": np.ascontiguousarray(radiance)}) as image:
+                image.write(str(self._directory / "environment.exr"))
+        # Blender takes the arguments after "--" as the script's; Python needs none.
+        separator = [] if "-I" in program else ["--"]
+        self._log = self._directory / "log.txt"
+        with self._log.open("wb") as log:
             try:
                 self._process = subprocess.Popen(
-                    [
-                        *program,
-                        str(self._folder / "render.py"),
-                        *between,
-                        str(self._folder),
-                    ],
-                    cwd=self._folder,
-                    env=workbench.surroundings(str(self._folder)),
+                    [*program, str(script), *separator, str(self._directory)],
+                    cwd=self._directory,
+                    env=workbench.surroundings(str(self._directory)),
                     stdin=subprocess.PIPE,
-                    stdout=said,
-                    stderr=said,
+                    stdout=log,
+                    stderr=log,
                 )
             except OSError as error:
                 raise BlenderError(
                     f"Blender can't be started ({error.strerror}); check {program[0]}"
                 ) from error
-        weakref.finalize(self, _end, self._process, self._keeper)
+        weakref.finalize(self, _stop, self._process, self._temporary)
 
-    def picture(self, seed: int, spp: int) -> Tensor:
-        """One picture with its own noise, (H, W, 3)."""
-        self._count += 1
-        path = self._folder / f"{self._count}.exr"
-        until = time.monotonic() + stored_files.scaled(LONGEST)
+    def render(self, seed: int, spp: int) -> Tensor:
+        """Render one image with its own noise, linear (H, W, 3).
+
+        Raises:
+            BlenderError: Blender stopped, or took too long.
+        """
+        self._n_images += 1
+        path = self._directory / f"{self._n_images}.exr"
+        time_limit = stored_files.scaled(MAX_RENDER_SECONDS)
+        deadline = time.monotonic() + time_limit
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
+            self._process.stdin.write(f"{seed} {spp} {self._n_images}\n".encode())
             self._process.stdin.flush()
         except OSError:
-            pass  # it has stopped, which is words below
+            pass  # Blender has stopped, which is reported below
         while not path.is_file():
             if self._process.poll() is not None and not path.is_file():
-                words = workbench.last_line(self._said.read_text("utf-8", "replace"))
-                raise BlenderError(f"Blender stopped{words}")
-            if time.monotonic() > until:
+                log = self._log.read_text("utf-8", "replace")
+                raise BlenderError(f"Blender stopped{workbench.last_line(log)}")
+            if time.monotonic() > deadline:
                 raise BlenderError(
-                    "Blender had not rendered it after "
-                    f"{stored_files.scaled(LONGEST)} seconds"
+                    f"Blender had not rendered it after {time_limit} seconds"
                 )
-            time.sleep(PAUSE)
-        with OpenEXR.File(str(path)) as picture:
-            pixels = next(iter(picture.channels().values())).pixels
+            time.sleep(POLL_INTERVAL)
+        with OpenEXR.File(str(path)) as image:
+            pixels = next(iter(image.channels().values())).pixels
             radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
         path.unlink()
         return radiance
 
 
-def _end(
-    process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]
+def _stop(
+    process: subprocess.Popen[bytes], temporary: tempfile.TemporaryDirectory[str]
 ) -> None:
+    """Kill Blender, and remove its directory."""
     process.kill()
     process.wait()
     if process.stdin is not None:
         process.stdin.close()
-    keeper.cleanup()
+    temporary.cleanup()

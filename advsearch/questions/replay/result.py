@@ -1,4 +1,4 @@
-"""Settings and result of `replay`, and what is shown of it."""
+"""Settings and result of `replay`, and the views of its result."""
 
 from __future__ import annotations
 
@@ -42,13 +42,11 @@ REPLAY_TRIALS = 10
 
 
 class ReplayConfig(Config):
-    """Everything that decides what `replay` does: which run's adversarial scene is
-    rendered again, and under what conditions.
-    """
+    """Settings of `replay`: which adversarial scene is rendered, and under what."""
 
     command: ClassVar[str] = "replay"
     clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
-        one for one in SceneConfig.clashes if one.setting == "overwrite"
+        clash for clash in SceneConfig.clashes if clash.setting == "overwrite"
     )
 
     attack: str = setting(
@@ -65,13 +63,21 @@ class ReplayConfig(Config):
         otherwise="all",
     )
     model: str | None = setting(
-        None, "replay", "other models that the scene is tried on, separated by commas", "models as `attack` takes them",
+        None,
+        "replay",
+        "other models that the scene is tried on, separated by commas",
+        "models as `attack` takes them",
         otherwise="none",
-    )  # fmt: skip
+    )
     trials: int = setting_as_in(
-        AttackConfig, "trials", default=REPLAY_TRIALS, group="replay", description="fresh renders under each condition",
-        expects="", otherwise="",
-    )  # fmt: skip
+        AttackConfig,
+        "trials",
+        default=REPLAY_TRIALS,
+        group="replay",
+        description="fresh renders under each condition",
+        expects="",
+        otherwise="",
+    )
     threads: int | None = setting_as_in(SceneConfig, "threads")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
@@ -81,17 +87,19 @@ class ReplayConfig(Config):
 
     @field_validator("ways")
     @classmethod
-    def _known_ways(cls, value: str | None) -> str | None:
+    def _check_names(cls, value: str | None) -> str | None:
         if value is not None and set(settings.split_names(value)) - set(WAYS):
             raise ValueError("an unknown way")
         return value
 
     @property
     def chosen(self) -> tuple[str, ...]:
+        """The names of the conditions that are rendered."""
         return WAYS if self.ways is None else settings.split_names(self.ways)
 
     @property
     def models(self) -> tuple[str, ...]:
+        """The names of the other models."""
         return () if self.model is None else settings.split_names(self.model)
 
     @property
@@ -99,11 +107,16 @@ class ReplayConfig(Config):
         return Path(self.attack).name, self.command
 
 
-NOT_DONE = "not done"  # How a condition ends that could not be had
+NOT_DONE = "not done"
+"""Status of a condition that could not be rendered."""
+HOLDS = "found"
+"""Status of a condition under which the adversarial scene is verified."""
+CLEAN_IS_WRONG = "already wrong"
+"""Status of a condition under which the model is wrong in the clean scene too."""
 
 
 class ReplayRow(results.Fields):
-    """One condition, and what is left of the adversarial scene under it."""
+    """Trials of the clean and of the adversarial scene under one condition."""
 
     way: str = Field(description="what is changed; `as verified` where nothing is")
     condition: str = Field(description="to what")
@@ -126,9 +139,7 @@ class ReplayRow(results.Fields):
 
 
 class ReplayResult(views.InNotebook, results.SceneResult):
-    """The adversarial scene of a run under other conditions than it was searched and
-    verified under.
-    """
+    """How an adversarial scene fares under other conditions than it was verified under."""
 
     command: ClassVar[str] = "replay"
 
@@ -141,11 +152,10 @@ class ReplayResult(views.InNotebook, results.SceneResult):
     @property
     def brief(self) -> str:
         done = [row for row in self.table if row.ending != NOT_DONE]
-        return (
-            (f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}")
-            if done
-            else ""
-        )
+        if not done:
+            return ""
+        n_holding = sum(row.ending == HOLDS for row in done)
+        return f"holds under {n_holding} of {len(done)}"
 
 
 HEADS = (
@@ -159,63 +169,76 @@ HEADS = (
 )
 
 
+TRIALS_NOTE = (
+    "Trials with fresh seeds, the same under every condition, rounded to 8 bits, "
+    "with 95 % Clopper-Pearson intervals. A success is what the search sought, where "
+    "the clean scene is right with the same seed under the same condition."
+)
+VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
+"""By status; all others do not hold."""
+
+
 def shown(result: ReplayResult) -> ShownResult:
-    note = (
-        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, "
-        "with 95 % Clopper-Pearson "
-        "intervals. A success is what the search sought, where the clean scene is "
-        "right with the same seed under the "
-        "same condition."
+    """Return the table of conditions, for a terminal or a page."""
+    table = ResultPart(
+        "Under other conditions",
+        heads=HEADS,
+        rows=[make_cells(row) for row in result.table],
+        note=TRIALS_NOTE,
     )
-    rows = []
-    for row in result.table:
-        told = ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
-        if row.clean is not None and row.verified is not None:
-            verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(
-                row.ending, "does not hold"
-            )
-            told = [
-                *wording.rated_cells(row.clean),
-                *wording.rated_cells(row.verified),
-                verdict,
-            ]
-        rows.append([row.way, "" if row.way == row.condition else row.condition, *told])
-    table = ResultPart("Under other conditions", heads=HEADS, rows=rows, note=note)
     about = [
         f"{PurePath(result.answer).name} ({result.answered})",
         result.object,
         ", ".join(result.controls),
     ]
-    return ShownResult(
-        replay_text(result),
-        [table],
-        {"attack": result.answer, "model": result.model},
-        about,
-    )
+    facts = {"attack": result.answer, "model": result.model}
+    return ShownResult(replay_text(result), [table], facts, about)
+
+
+def make_cells(row: ReplayRow) -> list[str]:
+    """Return the cells of a condition under `HEADS`."""
+    condition = "" if row.way == row.condition else row.condition
+    if row.clean is None or row.verified is None:
+        return [row.way, condition, "", "", "", "", f"{NOT_DONE}: {row.reason}"]
+    return [
+        row.way,
+        condition,
+        *wording.rated_cells(row.clean),
+        *wording.rated_cells(row.verified),
+        VERDICTS.get(row.ending, "does not hold"),
+    ]
 
 
 def claims(result: ReplayResult) -> Iterator[views.Claim]:
+    """Yield a claim for each condition."""
     for row in result.table:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
-        name += "" if row.way == row.condition else f": {row.condition}"
+        if row.way != row.condition:
+            name += f": {row.condition}"
         yield views.Claim.of_case(name, row.ending, row.verified)
 
 
 def replay_text(result: ReplayResult) -> str:
+    """Summarise in words under which conditions the adversarial scene holds."""
     changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
     if not result.table or (result.table[0].ending == NOT_DONE and not changed):
         return "Nothing was rendered again."
-    own = "holds" if result.table[0].ending == "found" else "does not hold"
-    own = "was not rendered" if result.table[0].ending == NOT_DONE else own
-    held = [row for row in changed if row.ending == "found"]
-    worthless = [row for row in changed if row.ending == "already wrong"]
-    under = (
-        f"changed, it holds under {len(held)} of {len(changed)} conditions"
-        if changed
-        else "no change was rendered"
-    )
-    text = f"As verified, the adversarial scene {own}; {under}."
-    if worthless:
-        names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)
+
+    unchanged_status = result.table[0].ending
+    unchanged_text = "does not hold"
+    if unchanged_status == HOLDS:
+        unchanged_text = "holds"
+    elif unchanged_status == NOT_DONE:
+        unchanged_text = "was not rendered"
+    changed_text = "no change was rendered"
+    if changed:
+        n_holding = sum(row.ending == HOLDS for row in changed)
+        changed_text = (
+            f"changed, it holds under {n_holding} of {len(changed)} conditions"
+        )
+    text = f"As verified, the adversarial scene {unchanged_text}; {changed_text}."
+    clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
+    if clean_wrong:
+        names = ", ".join(f"{row.way}: {row.condition}" for row in clean_wrong)
         text += f" The clean scene itself fails under {names}, where it says nothing."
     return text

@@ -1,5 +1,6 @@
-"""The bundled object classes: parametric families of household objects, and things of
-the street, in numpy.
+"""The bundled classes of objects: parametric families in numpy.
+
+Household objects, which the reference model is trained on, and things of the street.
 """
 
 from __future__ import annotations
@@ -20,8 +21,21 @@ from advsearch.questions.harden.objects.vessels import (
 )
 
 _HOUSEHOLD = (
-    mug, bowl, bottle, vase, teapot, wine_glass, frying_pan, hammer, banana, ball, chair, lamp, book, dumbbell,
-)  # fmt: skip
+    mug,
+    bowl,
+    bottle,
+    vase,
+    teapot,
+    wine_glass,
+    frying_pan,
+    hammer,
+    banana,
+    ball,
+    chair,
+    lamp,
+    book,
+    dumbbell,
+)
 HOUSEHOLD: dict[str, ObjectFamily] = {family.name: family for family in _HOUSEHOLD}
 """What the reference model is trained on."""
 STREET: dict[str, ObjectFamily] = {

@@ -41,50 +41,68 @@ Height = Callable[[Array, Array, Array], Array]
 def _outline(
     angle: Array, front: float, rear: float, half: float, power: float, middle: float
 ) -> tuple[Array, Array]:
-    """x and y of a superellipse about (middle, 0) that reaches from `rear` to `front`
-    and `half` to each side.
+    """Return x and y of a superellipse.
+
+    Args:
+        angle: parameters of its points (N,).
+        front, rear: x of its ends.
+        half: its extent along y and -y.
+        power: of the superellipse.
+        middle: x of its center.
     """
-    c = np.cos(angle)
-    s = np.sin(angle)
-    reach = np.where(c >= 0.0, front - middle, middle - rear)
-    return middle + reach * np.sign(c) * np.abs(c) ** (2 / power), half * np.sign(
-        s
-    ) * np.abs(s) ** (2 / power)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    reach = np.where(cosine >= 0.0, front - middle, middle - rear)
+    return middle + reach * np.sign(cosine) * np.abs(cosine) ** (
+        2 / power
+    ), half * np.sign(sine) * np.abs(sine) ** (2 / power)
 
 
 def _shell(
     rows: Array, power: float, middle: float, height: Height, corner: float
 ) -> list[Patch]:
-    """Painted patches of a stack of superellipses with a power about an x: of each a
-    share of the height, half the width, front and rear end, (R, 4); they are cut at a
-    share of the columns from the middles of front and rear.
+    """Create the painted patches of a stack of superellipses.
+
+    Args:
+        rows: (R, 4), for each superellipse the fraction of the height, half the width, and
+            x of the front and of the rear end.
+        power: of the superellipses.
+        middle: x of their center.
+        height: returns z from fractions of the height, x and y.
+        corner: fraction of the columns, from the middle of front and rear, at which the
+            charts are cut.
     """
     # angles are equally far apart along the widest outline, symmetrical, from the
     # rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
-    at = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    angle = np.interp(np.linspace(0.0, at[-1], COLUMNS + 1), at, fine)
+    arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    angle = np.interp(np.linspace(0.0, arc_length[-1], COLUMNS + 1), arc_length, fine)
     points = np.empty((len(rows), COLUMNS + 1, 3))
     for row, (share, half, front, rear) in zip(points, rows, strict=True):
         x, y = _outline(angle, front, rear, half, power, middle)
         row[:, 0], row[:, 1], row[:, 2] = x, y, height(np.full_like(x, share), x, y)
-    around = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
-    across = np.gradient(around, axis=1)[:, 1:-1]
-    normals = shapes.unit(np.cross(across, np.gradient(points, axis=0)))
+    wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
+    column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
+    normals = shapes.unit(np.cross(column_tangent, np.gradient(points, axis=0)))
     opposite = COLUMNS // 2
     cut = int(COLUMNS * corner)
     patches = []
     for first, last in pairwise(
         (0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)
     ):
-        part = points[:, first : last + 1]
-        u, v = (shapes.mean_lengths(part, axis) for axis in (1, 0))
+        part_points = points[:, first : last + 1]
+        u, v = (shapes.mean_lengths(part_points, axis) for axis in (1, 0))
         size = (float(u[-1]), float(v[-1]))
         patches.append(
             shapes.grid(
-                "paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]
+                "paint",
+                part_points,
+                normals[:, first : last + 1],
+                size,
+                v / v[-1],
+                u / u[-1],
             )
         )
     return patches
@@ -96,7 +114,7 @@ def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
 
 
 def _softest(*fields: Array) -> Array:
-    """The least of some distances, with corners rounded by about 3 cm."""
+    """Return the minimum of several distances, with corners rounded by about 3 cm."""
     return np.asarray(
         logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
     )
@@ -105,10 +123,18 @@ def _softest(*fields: Array) -> Array:
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
 _WAIST = _line(
     [
-        (-2.2, 1.0), (-1.9, 0.995), (-1.2, 0.975), (-0.4, 0.945), (0.4, 0.925), (0.95, 0.9), (1.4, 0.845),
-        (1.75, 0.775), (2.0, 0.7), (2.2, 0.62),
+        (-2.2, 1.0),
+        (-1.9, 0.995),
+        (-1.2, 0.975),
+        (-0.4, 0.945),
+        (0.4, 0.925),
+        (0.95, 0.9),
+        (1.4, 0.845),
+        (1.75, 0.775),
+        (2.0, 0.7),
+        (2.2, 0.62),
     ]
-)  # fmt: skip
+)
 _ROOF = _line(
     [
         (-2.2, 1.26),
@@ -121,14 +147,29 @@ _ROOF = _line(
     ]
 )
 _BODY = [  # share of the height, half the width, front end, rear end
-    (0.0, 0.80, 1.98, -2.0), (0.03, 0.835, 2.06, -2.06), (0.1, 0.86, 2.1, -2.1), (0.28, 0.872, 2.135, -2.135),
-    (0.45, 0.878, 2.14, -2.14), (0.62, 0.889, 2.13, -2.125), (0.75, 0.898, 2.1, -2.1), (0.82, 0.885, 2.06, -2.085),
-    (0.9, 0.868, 2.01, -2.065), (0.96, 0.845, 1.95, -2.04), (0.985, 0.82, 1.89, -2.01), (1.0, 0.78, 1.79, -1.965),
-]  # fmt: skip
+    (0.0, 0.80, 1.98, -2.0),
+    (0.03, 0.835, 2.06, -2.06),
+    (0.1, 0.86, 2.1, -2.1),
+    (0.28, 0.872, 2.135, -2.135),
+    (0.45, 0.878, 2.14, -2.14),
+    (0.62, 0.889, 2.13, -2.125),
+    (0.75, 0.898, 2.1, -2.1),
+    (0.82, 0.885, 2.06, -2.085),
+    (0.9, 0.868, 2.01, -2.065),
+    (0.96, 0.845, 1.95, -2.04),
+    (0.985, 0.82, 1.89, -2.01),
+    (1.0, 0.78, 1.79, -1.965),
+]
 _CABIN = [
-    (0.0, 0.795, 1.0, -1.955), (0.25, 0.765, 0.79, -1.9), (0.5, 0.732, 0.57, -1.83), (0.75, 0.692, 0.34, -1.74),
-    (0.88, 0.663, 0.2, -1.66), (0.95, 0.63, 0.08, -1.58), (0.985, 0.58, -0.06, -1.47), (1.0, 0.5, -0.22, -1.3),
-]  # fmt: skip
+    (0.0, 0.795, 1.0, -1.955),
+    (0.25, 0.765, 0.79, -1.9),
+    (0.5, 0.732, 0.57, -1.83),
+    (0.75, 0.692, 0.34, -1.74),
+    (0.88, 0.663, 0.2, -1.66),
+    (0.95, 0.63, 0.08, -1.58),
+    (0.985, 0.58, -0.06, -1.47),
+    (1.0, 0.5, -0.22, -1.3),
+]
 _BODY_POWER = 4.2
 _CABIN_POWER = 4.6
 
@@ -147,57 +188,69 @@ def _cabin_height(share: Array, x: Array, y: Array) -> Array:
 
 
 def _inside(p: Array) -> dict[str, Array]:
-    """About how far points of the body and the cabin lie inside each of `OPENINGS`."""
+    """Return about how far points (N, 3) lie inside each of `OPENINGS` (N,)."""
     x, y, z = p.T
-    out = np.abs(y)
+    abs_y = np.abs(y)
     reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
-    size = (
+    cabin_radius = (
         np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
     ) ** (1 / _CABIN_POWER)
     # about half the cabin's width
-    half = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
+    half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     sill = _WAIST(x) + 0.04
     lintel = sill + 0.83 * (_ROOF(x) - sill)
     # distance behind the line of the windscreen's pillar
     pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    lamp = out - 0.42
+    lamp = abs_y - 0.42
     lens = _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
-    low_grille = _softest(0.62 - out, z - 0.24 + 0.02 * out, 0.37 - 0.02 * out - z)
-    high_grille = _softest(0.41 - out, z - 0.5 - 0.04 * out, 0.64 + 0.04 * out - z)
+    low_grille = _softest(
+        0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
+    )
+    high_grille = _softest(
+        0.41 - abs_y, z - 0.5 - 0.04 * abs_y, 0.64 + 0.04 * abs_y - z
+    )
     arches = [
-        np.where(out > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
+        np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
         for axle in AXLES
     ]
     return {
-        "cabin": 0.72 * (1.0 - size),
+        "cabin": 0.72 * (1.0 - cabin_radius),
         "front arch": arches[0],
         "rear arch": arches[1],
         "headlight": np.where(x > 1.2, lens, -1.0),
         "taillight": np.where(
-            x < -1.0, _softest(out - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0
+            x < -1.0, _softest(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0
         ),
         "low grille": np.where(x > 1.5, low_grille, -1.0),
         "high grille": np.where(x > 1.5, high_grille, -1.0),
         # the dark lower edge, higher at the back
         "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,
-        "windscreen": np.where(x > 0.0, _softest(0.85 * half - out, 1.36 - z), -1.0),
+        "windscreen": np.where(
+            x > 0.0, _softest(0.85 * half_width - abs_y, 1.36 - z), -1.0
+        ),
         "rear window": np.where(
-            x < -1.5, _softest(0.86 * half - out, z - 1.045, 1.325 - z), -1.0
+            x < -1.5, _softest(0.86 * half_width - abs_y, z - 1.045, 1.325 - z), -1.0
         ),
         "side windows": np.where(
-            out > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0
+            abs_y > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0
         ),
     }
 
 
 OPENINGS: dict[str, dict[str, str | None]] = {
     "body": {
-        "cabin": None, "front arch": None, "rear arch": None, "headlight": "headlight", "taillight": "taillight",
-        "low grille": "trim", "high grille": "trim", "valance": "trim",
+        "cabin": None,
+        "front arch": None,
+        "rear arch": None,
+        "headlight": "headlight",
+        "taillight": "taillight",
+        "low grille": "trim",
+        "high grille": "trim",
+        "valance": "trim",
     },
     "cabin": dict.fromkeys(("windscreen", "rear window", "side windows"), "glass"),
-}  # fmt: skip
+}
 """What is carved out of the body and out of the cabin, and what it becomes."""
 
 
@@ -206,6 +259,7 @@ def _opening(name: str) -> shapes.Field:
 
 
 def _body_and_cabin() -> list[Patch]:
+    """Create the body and the cabin with their openings."""
     deck = [
         (1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)
     ]
@@ -226,6 +280,7 @@ def _body_and_cabin() -> list[Patch]:
 
 
 def _wheels() -> list[Patch]:
+    """Create the four wheels, the front ones turned."""
     half = TYRE / 2  # about the z axis, the outer side up, in the middle of the tyre
     rim = 0.212
     outside = [
@@ -272,6 +327,7 @@ def _wheels() -> list[Patch]:
 
 
 def _wells() -> list[Patch]:
+    """Create the wheel wells and the floor."""
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     patches = []
@@ -304,6 +360,7 @@ def _wells() -> list[Patch]:
 
 
 def _fittings() -> list[Patch]:
+    """Create mirrors, plates, badges, door handles and other fittings."""
     patches = []
     for side in (1.0, -1.0):  # mirrors
         shell = shapes.box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
@@ -317,13 +374,13 @@ def _fittings() -> list[Patch]:
     badge = shapes.lathe(
         [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24
     )
-    for thing, lean, place in (
+    for fitting, tilt, position in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
         (plate, 3.0, (-2.138, 0.0, 0.705)),
         (badge, 78.0, (2.118, 0.0, 0.575)),
         (badge, -80.0, (-2.075, 0.0, 0.86)),
     ):
-        patches += shapes.placed(thing, shapes.rotation("y", lean), place)
+        patches += shapes.placed(fitting, shapes.rotation("y", tilt), position)
     for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
         patches += shapes.box(
             "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1
@@ -379,9 +436,7 @@ def _lacquer(t: Texels, color: Array) -> Array:
 
 
 def _panes(t: Texels) -> Array:
-    """Dark glass, with the pillar between the doors, and behind the windscreen what one
-    sees of two seats.
-    """
+    """Paint dark glass with the pillar between the doors, and the seats behind the windscreen."""
     x, y, z = t.xyz.T
     color = mix(hexed("20272b"), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
     out = np.abs(y)
@@ -431,9 +486,9 @@ def _plate(t: Texels, ground: Array) -> Array:
         & (np.floor(cell) != 3)
         & (t.xyz[:, 0] > -1.0)
     )
-    place = np.abs(cell % 1.0 - 0.5)
-    strokes = (np.abs(place - 0.27) < 0.09) | (
-        (place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
+    cell_fraction = np.abs(cell % 1.0 - 0.5)
+    strokes = (np.abs(cell_fraction - 0.27) < 0.09) | (
+        (cell_fraction < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
     )
     return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
 
@@ -454,6 +509,7 @@ FINISHES = {
 
 @family(metres=1.0, texels=384)
 def car(draw: Draw) -> Instance:
+    """Make a car of random proportions and paint."""
     color = draw.colour(
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
     )
@@ -463,10 +519,16 @@ def car(draw: Draw) -> Instance:
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
     metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
-        "paint": _lacquer(color), "glass": _panes, "headlight": _lamps, "taillight": _tail, "rubber": solid("1c1c1d"),
-        "rim": solid(metal), "trim": _slats, "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
+        "paint": _lacquer(color),
+        "glass": _panes,
+        "headlight": _lamps,
+        "taillight": _tail,
+        "rubber": solid("1c1c1d"),
+        "rim": solid(metal),
+        "trim": _slats,
+        "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
         "well": solid("0a0a0b"),
-    }  # fmt: skip
+    }
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(
         shapes.stretched(patches, stretch),

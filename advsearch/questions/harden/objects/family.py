@@ -1,4 +1,4 @@
-"""What a family of objects is, and how one of its instances is put together."""
+"""Families of objects, and how the mesh and the texture of an instance are made."""
 
 from __future__ import annotations
 
@@ -12,87 +12,112 @@ from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import Draw, Paint, Texels
 
-# ---------------------------------------------------------------------------------------------------------------------
-# From patches and paints to one mesh with one texture: packs the charts, paints them,
-# joins the pieces.
-#
-# Charts get rectangles of one square atlas at one common scale, so that texels are
-# equally large all over the object, with `GUTTER` texels of their own colour around
-# them, so that filtering and halving the resolution do not bleed.
+# ---- the atlas
+# ----------------------------------------------------------------------------------
+# Charts get rectangles of a square atlas at a common scale, so that texels are equally
+# large all over the object. `GUTTER` texels of their own color around them prevent
+# bleeding when the texture is filtered or its resolution is halved.
 
-SIZE = 256  # texels along the atlas, where a family says nothing else
-GUTTER = 2  # texels around each chart, on every side
-# coordinates are rounded to this: machines differ in the last bits of a sine
+SIZE = 256
+"""Default width of the atlas in texels."""
+GUTTER = 2
+"""Texels around each chart, on every side."""
 DECIMALS = 6
+"""Coordinates are rounded to these: machines differ in the last bits of a sine."""
 
 
 @dataclass(frozen=True)
 class AtlasPlace:
-    """Where a chart lies: left, bottom, width and height in texels (gutters included);
-    turned by 90 degrees or not.
+    """Rectangle of a chart in the atlas.
+
+    Attributes:
+        x, y: left and bottom in texels.
+        width, height: in texels, gutters included.
+        is_rotated: whether the chart is rotated by 90 degrees.
     """
 
     x: int
     y: int
     width: int
     height: int
-    turned: bool
+    is_rotated: bool
+
+
+@dataclass
+class _Shelf:
+    """A row of rectangles: its bottom, its height, and the width that is filled."""
+
+    bottom: int
+    height: int
+    filled: int
 
 
 def _shelves(
     sizes: Sequence[tuple[float, float]], scale: float, side: int
 ) -> list[AtlasPlace] | None:
-    """Pack rectangles (w, h), w >= h, on shelves of a square, tallest first; None where
-    they do not fit.
+    """Pack rectangles (w, h), w >= h, on shelves of a square, the highest first.
+
+    None if they do not fit.
     """
     cells = [
-        (int(np.ceil(w * scale)) + 2 * GUTTER, int(np.ceil(h * scale)) + 2 * GUTTER)
-        for w, h in sizes
+        (
+            int(np.ceil(width * scale)) + 2 * GUTTER,
+            int(np.ceil(height * scale)) + 2 * GUTTER,
+        )
+        for width, height in sizes
     ]
-    order = sorted(range(len(cells)), key=lambda i: (-cells[i][1], -cells[i][0], i))
-    places: dict[int, AtlasPlace] = {}
-    shelves: list[list[int]] = []  # bottom, height, filled width
+    order = sorted(
+        range(len(cells)), key=lambda index: (-cells[index][1], -cells[index][0], index)
+    )
+    rectangles: dict[int, AtlasPlace] = {}
+    shelves: list[_Shelf] = []
     top = 0
-    for i in order:
-        width, height = cells[i]
+    for index in order:
+        width, height = cells[index]
         if width > side:
             return None
-        shelf = next((s for s in shelves if s[2] + width <= side), None)
-        if shelf is None:
+        fitting = [shelf for shelf in shelves if shelf.filled + width <= side]
+        if fitting:
+            shelf = fitting[0]
+        else:
             if top + height > side:
                 return None
-            shelf = [top, height, 0]
+            shelf = _Shelf(top, height, 0)
             shelves.append(shelf)
             top += height
-        places[i] = AtlasPlace(shelf[2], shelf[0], width, height, False)
-        shelf[2] += width
-    return [places[i] for i in range(len(cells))]
+        rectangles[index] = AtlasPlace(shelf.filled, shelf.bottom, width, height, False)
+        shelf.filled += width
+    return [rectangles[index] for index in range(len(cells))]
 
 
 def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[AtlasPlace]:
-    """Return a place for every chart of size (width, height), at the largest common
-    scale that was found to fit.
+    """Pack charts of size (width, height) into a square at the largest scale that fits.
+
+    The scale is found by bisection.
     """
-    exact = [(round(w, DECIMALS), round(h, DECIMALS)) for w, h in sizes]
-    wide = [(max(s), min(s)) for s in exact]
-    low = 0.0
-    high = side / max(w for w, _ in wide)
-    best = _shelves(wide, low, side)
+    exact = [
+        (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
+    ]
+    wide = [(max(size), min(size)) for size in exact]
+    lower = 0.0
+    upper = side / max(width for width, _ in wide)
+    best = _shelves(wide, lower, side)
     for _ in range(12):
-        middle = (low + high) / 2
-        places = _shelves(wide, middle, side)
-        if places is None:
-            high = middle
+        scale = (lower + upper) / 2
+        rectangles = _shelves(wide, scale, side)
+        if rectangles is None:
+            upper = scale
         else:
-            low = middle
-            best = places
+            lower = scale
+            best = rectangles
     if best is None:
         raise ValueError(
             f"{len(sizes)} charts do not fit an atlas of {side} texels; "
             "use fewer patches"
         )
     return [
-        replace(place, turned=h > w) for place, (w, h) in zip(best, exact, strict=True)
+        replace(rectangle, is_rotated=height > width)
+        for rectangle, (width, height) in zip(best, exact, strict=True)
     ]
 
 
@@ -102,60 +127,79 @@ def painted(
     paints: Mapping[str, Paint],
     side: int = SIZE,
 ) -> npt.NDArray[np.float32]:
-    """Return the (side, side, 3) texture, display-referred sRGB, multiples of 1/255,
-    row 0 at the top.
+    """Paint the texture (side, side, 3), display-referred sRGB, row 0 at the top.
+
+    Values are multiples of 1/255.
     """
     image = np.zeros((side, side, 3))
-    used = np.zeros((side, side), dtype=bool)
-    for patch, place in zip(patches, places, strict=True):
-        # of every texel, row by row from the bottom, clamped in the gutter
-        a, b = (
-            np.clip((np.arange(n) + 0.5 - GUTTER) / (n - 2 * GUTTER), 0.0, 1.0)
-            for n in (place.width, place.height)
-        )
-        a = np.tile(a, place.height)
-        b = np.repeat(b, place.width)
-        u, v = (b, 1.0 - a) if place.turned else (a, b)
+    is_used = np.zeros((side, side), dtype=bool)
+    for patch, rectangle in zip(patches, places, strict=True):
+        # Texels are in rows from the bottom.
+        a = np.tile(_texel_centers(rectangle.width), rectangle.height)
+        b = np.repeat(_texel_centers(rectangle.height), rectangle.width)
+        u, v = (b, 1.0 - a) if rectangle.is_rotated else (a, b)
         color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
-        area = np.s_[place.y : place.y + place.height, place.x : place.x + place.width]
-        image[area] = color.reshape(place.height, place.width, 3)
-        used[area] = True
-    image[~used] = np.round(image[used].mean(axis=0), 2)
+        area = np.s_[
+            rectangle.y : rectangle.y + rectangle.height,
+            rectangle.x : rectangle.x + rectangle.width,
+        ]
+        image[area] = color.reshape(rectangle.height, rectangle.width, 3)
+        is_used[area] = True
+    image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(
         np.uint8
     )
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
 
+def _texel_centers(count: int) -> Array:
+    """Return chart coordinates (count,) of texels along an edge, clamped in gutters."""
+    return np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
+
+
 def joined(
     patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE
 ) -> assets.Mesh:
-    """Return one mesh, largest extent 1, standing on z = 0 and centred, every number
-    rounded to `DECIMALS`.
+    """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
+
+    Every value is rounded to `DECIMALS`.
     """
-    starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
-    vertices = np.concatenate([p.vertices for p in patches])
+    first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
+    vertices = np.concatenate([patch.vertices for patch in patches])
     origin, extent = assets.footing(vertices)
     vertices = (vertices - origin) / extent
-    normals = np.concatenate([p.normals for p in patches])
-    uvs = []
-    for patch, place in zip(patches, places, strict=True):
-        local = (
-            np.stack([1.0 - patch.uvs[:, 1], patch.uvs[:, 0]], axis=1)
-            if place.turned
-            else patch.uvs
-        )
-        inner = np.array([place.width - 2 * GUTTER, place.height - 2 * GUTTER])
-        uvs.append((np.array([place.x, place.y]) + GUTTER + local * inner) / side)
+    normals = np.concatenate([patch.normals for patch in patches])
+    uvs = np.concatenate(
+        [
+            _atlas_coordinates(patch, rectangle, side)
+            for patch, rectangle in zip(patches, places, strict=True)
+        ]
+    )
     faces = np.concatenate(
-        [p.faces + start for p, start in zip(patches, starts, strict=True)]
+        [
+            patch.faces + first
+            for patch, first in zip(patches, first_vertex, strict=True)
+        ]
     )
-    used = np.unique(faces)  # poles leave vertices behind that no triangle needs
-    renumbered = np.searchsorted(used, faces).astype(np.uint32)
-    corners = np.clip(np.concatenate(uvs)[used], 0.0, 1.0)
+    # No triangle uses some vertices at poles.
+    used = np.unique(faces)
+    renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
     return assets.Mesh(
-        _exact(vertices[used]), renumbered, _exact(normals[used]), _exact(corners)
+        _exact(vertices[used]),
+        renumbered_faces,
+        _exact(normals[used]),
+        _exact(np.clip(uvs[used], 0.0, 1.0)),
     )
+
+
+def _atlas_coordinates(patch: Patch, rectangle: AtlasPlace, side: int) -> Array:
+    """Return the texture coordinates (V, 2) of a patch's vertices in the atlas."""
+    chart_uvs = patch.uvs
+    if rectangle.is_rotated:
+        chart_uvs = np.stack([1.0 - patch.uvs[:, 1], patch.uvs[:, 0]], axis=1)
+    inner_size = np.array([rectangle.width - 2 * GUTTER, rectangle.height - 2 * GUTTER])
+    corner = np.array([rectangle.x, rectangle.y])
+    return np.asarray((corner + GUTTER + chart_uvs * inner_size) / side)
 
 
 def _exact(values: Array) -> npt.NDArray[np.float32]:
@@ -163,32 +207,50 @@ def _exact(values: Array) -> npt.NDArray[np.float32]:
     return (np.round(values, DECIMALS) + 0.0).astype(np.float32)
 
 
+# ---- families
+# ----------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Instance:
-    """One member of a family before its texture is baked."""
+    """A member of a family before its texture is baked.
 
-    patches: Sequence[Patch]  # the surface
-    paints: Mapping[str, Paint]  # a paint for every tag of the patches
-    material: assets.Material  # the other surface parameters
-    # texels along an edge relative to the rest of the object, by tag, for parts that
-    # are hardly seen
+    Attributes:
+        patches: the surface.
+        paints: a paint for every tag of the patches.
+        material: the other surface parameters.
+        detail: width of texels by tag, relative to the rest of the object, for parts
+            that are hardly visible.
+        finishes: materials by tag, of an object of several materials; its tags are then
+            names of materials.
+        rig: moves the vertices of all patches, in the order of the patches.
+        drives: as `ObjectAsset.drives`.
+    """
+
+    patches: Sequence[Patch]
+    paints: Mapping[str, Paint]
+    material: assets.Material
     detail: Mapping[str, float] = field(default_factory=dict)
-    # of an object of several materials, what each tag is like; its tags are then names
-    # of materials
     finishes: Mapping[str, assets.Material] = field(default_factory=dict)
-    # what moves the vertices of all patches, in the order of the patches
     rig: assets.MeshRig | None = None
-    drives: bool = False  # as `ObjectAsset.drives`
+    drives: bool = False
 
 
 @dataclass(frozen=True)
 class ObjectFamily:
-    """A class of objects whose members differ in proportions, texture and material."""
+    """A class of objects whose members differ in proportions, texture and material.
 
-    name: str  # the class, usable on the command line
-    make: Callable[[Draw], Instance]  # builds an instance from a `Draw`
-    metres: float  # of the unit in which it is made
-    texels: int = SIZE  # along each side of its texture
+    Attributes:
+        name: of the class, usable on the command line.
+        make: builds an instance from a `Draw`.
+        metres: length of the unit in which it is built.
+        texels: width of its texture.
+    """
+
+    name: str
+    make: Callable[[Draw], Instance]
+    metres: float
+    texels: int = SIZE
 
     @property
     def label(self) -> str:
@@ -196,59 +258,66 @@ class ObjectFamily:
         return self.name.replace("-", " ")
 
     def generate(self, rng: np.random.Generator | None) -> assets.ObjectAsset:
-        """Return the canonical instance (None), or one with drawn proportions, texture
-        and material.
+        """Return the canonical instance (None), or a random one.
 
         The mesh has largest extent 1 and rests on z = 0. The same state of the
         generator gives the same asset.
         """
         instance = self.make(Draw(rng))
-        if instance.finishes:  # the faces of a material in one row
-            tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
-            instance = replace(
-                instance,
-                patches=sorted(
-                    instance.patches, key=lambda patch: tags.index(patch.tag)
-                ),
-            )
-        patches = instance.patches
-        details = [instance.detail.get(patch.tag, 1.0) for patch in instance.patches]
-        sizes = [
-            (patch.size[0] * share, patch.size[1] * share)
-            for patch, share in zip(patches, details, strict=True)
-        ]
-        charts = pack(sizes, self.texels)
-        mesh = joined(patches, charts, self.texels)
         if instance.finishes:
-            tags_of = np.repeat(
-                [patch.tag for patch in patches],
-                [len(patch.faces) for patch in patches],
-            )
-            materials = {
-                str(tag): np.nonzero(tags_of == tag)[0]
-                for tag in dict.fromkeys(tags_of)
-            }
-            mesh = replace(mesh, materials=materials, rig=instance.rig)
-        extent = np.ptp(
-            np.concatenate([patch.vertices for patch in patches]), axis=0
-        ).max()
+            instance = _sort_by_material(instance)
+        patches = instance.patches
+        chart_sizes = []
+        for patch in patches:
+            detail = instance.detail.get(patch.tag, 1.0)
+            chart_sizes.append((patch.size[0] * detail, patch.size[1] * detail))
+        rectangles = pack(chart_sizes, self.texels)
+        mesh = joined(patches, rectangles, self.texels)
         surface = None
         if instance.finishes:
+            materials = _faces_by_material(patches)
+            mesh = replace(mesh, materials=materials, rig=instance.rig)
             surface = workbench.library.finished(
                 mesh, instance.finishes, instance.material
             )
+        vertices = np.concatenate([patch.vertices for patch in patches])
+        extent = np.ptp(vertices, axis=0).max()
         return assets.ObjectAsset(
-            name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
-            material=instance.material, label=self.label, source=workbench.library.BUNDLED_OBJECT,
+            name=self.name,
+            mesh=mesh,
+            base_color=painted(patches, rectangles, instance.paints, self.texels),
+            material=instance.material,
+            label=self.label,
+            source=workbench.library.BUNDLED_OBJECT,
             surface=surface,
-            finishes=instance.finishes, metres=round(float(extent) * self.metres, 4), drives=instance.drives,
-        )  # fmt: skip
+            finishes=instance.finishes,
+            metres=round(float(extent) * self.metres, 4),
+            drives=instance.drives,
+        )
+
+
+def _sort_by_material(instance: Instance) -> Instance:
+    """Return the instance with the patches of each material after each other."""
+    tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
+    patches = sorted(instance.patches, key=lambda patch: tags.index(patch.tag))
+    return replace(instance, patches=patches)
+
+
+def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.Ints]:
+    """Return the indices of the faces of each tag in the joined mesh."""
+    tag_of_face = np.repeat(
+        [patch.tag for patch in patches], [len(patch.faces) for patch in patches]
+    )
+    return {
+        str(tag): np.nonzero(tag_of_face == tag)[0]
+        for tag in dict.fromkeys(tag_of_face)
+    }
 
 
 def family(
     metres: float, texels: int = SIZE
 ) -> Callable[[Callable[[Draw], Instance]], ObjectFamily]:
-    """Make a family of the function below, with its name; see `ObjectFamily`."""
+    """Decorate a function that makes instances into a family with the function's name."""
     return lambda make: ObjectFamily(
         make.__name__.replace("_", "-"), make, metres, texels
     )
@@ -257,18 +326,14 @@ def family(
 def finish(
     draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2
 ) -> assets.Material:
-    """Return a material near the given one: roughness within `spread`, and now and then
-    another coat.
-    """
-    rough = min(
-        max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95
-    )
-    coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
-    metal = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
-    numbers = {
-        "roughness": rough,
-        "metallic": metal,
+    """Sample a material with a roughness within `spread`, and sometimes another coat."""
+    sampled_roughness = draw(roughness, roughness - spread, roughness + spread)
+    sampled_clearcoat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
+    metallic = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
+    values = {
+        "roughness": min(max(sampled_roughness, 0.12), 0.95),
+        "metallic": metallic,
         "specular": draw(0.5, 0.3, 0.7),
-        "clearcoat": coat,
+        "clearcoat": sampled_clearcoat,
     }
-    return assets.Material(**{name: round(value, 4) for name, value in numbers.items()})
+    return assets.Material(**{name: round(value, 4) for name, value in values.items()})

@@ -10,6 +10,7 @@ import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.questions.harden.objects.family import Instance, family, finish
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
+    Color,
     Draw,
     Paint,
     between,
@@ -27,15 +28,13 @@ from advsearch.questions.harden.objects.textures import (
     wood,
 )
 
-Place = tuple[float, float, float]
+Point = tuple[float, float, float]
 
 
 def _post(
-    tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]
+    tag: str, low: Point, high: Point, section: Array, ends: tuple[float, float]
 ) -> list[Patch]:
-    """A straight post between two points, scaled from the first to the second end
-    value.
-    """
+    """Create a straight post between two points, scaled from one end to the other."""
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
@@ -93,23 +92,30 @@ def chair(draw: Draw) -> Instance:
         )
     if draw.chance(0.55, True):
         low = seat * draw(0.36, 0.25, 0.6)
-        ahead, aside = (one + splay * (1.0 - low / seat) for one in (x, y))
+        spread = splay * (1.0 - low / seat)
+        front_x = x + spread
+        side_y = y + spread
         thin = (0.55 * leg, 0.55 * leg)
         thinner = (0.5 * leg, 0.5 * leg)
         for sy in (-1.0, 1.0):
             patches += _post(
                 "along",
-                (-ahead, sy * aside, low),
-                (ahead, sy * aside, low),
+                (-front_x, sy * side_y, low),
+                (front_x, sy * side_y, low),
                 section,
                 thin,
             )
         patches += _post(
-            "cross", (0.0, -aside, low), (0.0, aside, low), section, thinner
+            "cross", (0.0, -side_y, low), (0.0, side_y, low), section, thinner
         )
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
-    turned = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
+    rotated = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
+    paints = _chair_paints(draw, total)
+    return Instance(rotated, paints, finish(draw, 0.45, 0.2))
 
+
+def _chair_paints(draw: Draw, total: float) -> dict[str, Paint]:
+    """Sample the paints of a chair of a height."""
     offset = draw.offset()
     timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
     paint_color = draw.colour(
@@ -123,18 +129,19 @@ def chair(draw: Draw) -> Instance:
 
     fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        clouded(fabric, 0.8, 1.5, offset), stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, hexed("efe6d4"), 4.0), dots(solid(fabric), hexed("f4efe4"), 6.0),
-    )  # fmt: skip
+        clouded(fabric, 0.8, 1.5, offset),
+        stripes(fabric, shade(fabric, 1.5), 6.0),
+        checks(fabric, hexed("efe6d4"), 4.0),
+        dots(solid(fabric), hexed("f4efe4"), 6.0),
+    )
     seat_paint = cover if draw.chance(0.25) else grain(0)
-    paints = {
+    return {
         "up": grain(2),
         "along": grain(0),
         "cross": grain(1),
         "seat": seat_paint,
         "cushion": cover,
     }
-    return Instance(turned, paints, finish(draw, 0.45, 0.2))
 
 
 def _chair_back(
@@ -147,6 +154,7 @@ def _chair_back(
     leg: float,
     section: Array,
 ) -> list[Patch]:
+    """Create the back of a chair of one of several kinds."""
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
     foot = seat - 2.0
@@ -220,22 +228,30 @@ def _shade(
     )
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
-        ("shade", shapes.dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner),
+        ("shade", shapes.dense(outer, 2.0)),
+        ("rim", [outer[-1], inner[0]]),
+        ("lining", inner),
         ("rim", [inner[-1], outer[0]]),
-    ]  # fmt: skip
+    ]
     return shapes.lathe(pieces, 56)
 
 
 def _lamp_base(
     draw: Draw, style: str, low: float, radius: float, stem: float
 ) -> list[Patch]:
+    """Create the base of a lamp of one of several kinds."""
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
     top = [(stem, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, 1.2, 3.2)
         corners = [
-            under[-1], (radius, 0.4), (radius * 0.96, thick), (stem * 2.0, thick * 1.4), (stem, thick * 2.2), top[0],
-        ]  # fmt: skip
+            under[-1],
+            (radius, 0.4),
+            (radius * 0.96, thick),
+            (stem * 2.0, thick * 1.4),
+            (stem, thick * 2.2),
+            top[0],
+        ]
         side = shapes.dense(shapes.rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
         return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
     belly = radius * draw(1.12, 0.95, 1.4)
@@ -244,8 +260,13 @@ def _lamp_base(
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
     knots = [
-        (radius * 0.96, 1.2), (radius * 0.8, 2.4), (belly, at), *waist, (stem * 1.5, 0.86 * low), (stem, 0.93 * low),
-    ]  # fmt: skip
+        (radius * 0.96, 1.2),
+        (radius * 0.8, 2.4),
+        (belly, at),
+        *waist,
+        (stem * 1.5, 0.86 * low),
+        (stem, 0.93 * low),
+    ]
     body = shapes.spline(knots, 34)
     ring = shapes.rounded(
         [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3
@@ -263,8 +284,33 @@ def _lamp_base(
     )
 
 
+def _shade_paint(
+    draw: Draw, linen: Color, offset: Array, low: float, total: float
+) -> Paint:
+    """Sample the paint of a lamp's shade between two heights."""
+    weave = clouded(linen, 0.93, 1.2, offset)
+    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
+    if kind == "band":
+        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
+            weave = over(weave, band, solid(accent))
+    elif kind == "stripes":
+        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
+    elif kind == "dots":
+        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
+    elif kind == "rings":
+        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
+    elif kind == "gradient":
+        weave = gradient(linen, shade(linen, 0.6), low, total)
+    else:
+        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
+            weave = over(weave, hem, solid(shade(linen, 0.75)))
+    return natural(draw, total, weave, 0.3)
+
+
 @family(metres=0.01)
 def lamp(draw: Draw) -> Instance:
+    """Make a table lamp of random proportions, shade and base."""
     total = draw(48.0, 42.0, 58.0)
     tall = draw(20.0, 14.0, 24.0)
     wide = draw(16.5, 12.0, 19.0)
@@ -299,31 +345,19 @@ def lamp(draw: Draw) -> Instance:
     linen = draw.colour(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
     )
-    weave = clouded(linen, 0.93, 1.2, offset)
-    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
-    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
-    if kind == "band":
-        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
-            weave = over(weave, band, solid(accent))
-    elif kind == "stripes":
-        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
-    elif kind == "dots":
-        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
-    elif kind == "rings":
-        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
-    elif kind == "gradient":
-        weave = gradient(linen, shade(linen, 0.6), low, total)
-    else:
-        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
-            weave = over(weave, hem, solid(shade(linen, 0.75)))
-    cloth = natural(draw, total, weave, 0.3)
+    cloth = _shade_paint(draw, linen, offset, low, total)
     clay = draw.colour(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
     body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
-        "shade": cloth, "rim": solid(shade(linen, 0.8)), "lining": solid("f4f0e4"), "bulb": solid("fbf6e6"),
-        "body": body, "foot": solid(metal), "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
-    }  # fmt: skip
+        "shade": cloth,
+        "rim": solid(shade(linen, 0.8)),
+        "lining": solid("f4f0e4"),
+        "bulb": solid("fbf6e6"),
+        "body": body,
+        "foot": solid(metal),
+        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+    }
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})

@@ -9,6 +9,7 @@ from advsearch.questions.harden.objects.family import Instance, family, finish
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
     Draw,
+    Paint,
     Texels,
     between,
     clouded,
@@ -59,24 +60,45 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
 
 @family(metres=0.01)
 def teapot(draw: Draw) -> Instance:
+    """Make a teapot with spout, handle and lid of random proportions."""
     radius = draw(7.2, 6.4, 8.0)
     height = draw(10.2, 8.0, 12.5)
+    side, body = _teapot_body(draw, radius, height)
+    grip = _teapot_handle(draw, side, radius, height)
+    patches = [
+        *body,
+        *_spout(draw, radius, height),
+        *shapes.placed(grip, shapes.rotation("z", 180.0)),
+    ]
+    patches = shapes.placed(patches, shapes.rotation("z", 118.0))
+    paints = _teapot_paints(draw, height)
+    return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
+
+
+def _teapot_body(draw: Draw, radius: float, height: float) -> tuple[Array, list[Patch]]:
+    """Return the profile of the side, and the body with its lid and knob."""
     foot = radius * draw(0.58, 0.5, 0.75)
     mouth = radius * draw(0.48, 0.42, 0.6)
-    at = draw(0.45, 0.35, 0.58)
-    full = draw(0.9, 0.82, 0.97)
+    belly_height = draw(0.45, 0.35, 0.58)
+    fullness = draw(0.9, 0.82, 0.97)
     knots = [
-        (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
-        (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
-    ]  # fmt: skip
+        (foot, 0.5),
+        (radius * fullness, 0.5 * belly_height * height),
+        (radius, belly_height * height),
+        (radius * (0.97 * fullness), (0.42 * belly_height + 0.58) * height),
+        (mouth, height),
+    ]
     side = shapes.spline(knots, 26)
     dome = draw(1.5, 0.7, 2.4)
-    r = draw(1.0, 0.7, 1.4)
+    knob_radius = draw(1.0, 0.7, 1.4)
     top = height + dome + 0.2
     rim = [
-        (mouth, height), (mouth * 0.97, height + 0.02), (mouth * 0.94, height - 0.12), (mouth * 0.94, height + 0.05),
+        (mouth, height),
+        (mouth * 0.97, height + 0.02),
+        (mouth * 0.94, height - 0.12),
+        (mouth * 0.94, height + 0.05),
         (mouth * 0.97, height + 0.05),
-    ]  # fmt: skip
+    ]
     lid = shapes.spline(
         [
             rim[-1],
@@ -87,14 +109,32 @@ def teapot(draw: Draw) -> Instance:
         10,
     )
     knob = shapes.spline(
-        [(0.45, top), (0.5, top + 0.3), (r, top + 0.45 + r * 0.6), (0.7 * r, top + 0.45 + 1.35 * r),
-         (0.0, top + 0.45 + 1.6 * r)], 12,
-    )  # fmt: skip
+        [
+            (0.45, top),
+            (0.5, top + 0.3),
+            (knob_radius, top + 0.45 + knob_radius * 0.6),
+            (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
+            (0.0, top + 0.45 + 1.6 * knob_radius),
+        ],
+        12,
+    )
     profile: list[tuple[str, Points]] = [
-        ("base", [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]),
-        ("body", [(foot * 0.97, 0.0), *side]), ("body", rim), ("lid", lid), ("knob", [lid[-1], *knob]),
-    ]  # fmt: skip
-    body = shapes.lathe(profile, 56)
+        (
+            "base",
+            [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)],
+        ),
+        ("body", [(foot * 0.97, 0.0), *side]),
+        ("body", rim),
+        ("lid", lid),
+        ("knob", [lid[-1], *knob]),
+    ]
+    return side, shapes.lathe(profile, 56)
+
+
+def _teapot_handle(
+    draw: Draw, side: Array, radius: float, height: float
+) -> list[Patch]:
+    """Create the handle on the +x side of a body with a profile (K, 2)."""
     span = draw(0.9, 0.75, 1.0)
     high = height * 0.84
     low = height * (0.84 - 0.62 * span)
@@ -102,24 +142,24 @@ def teapot(draw: Draw) -> Instance:
     reach = radius * draw(0.72, 0.5, 0.9)
     lift = draw(0.05, -0.02, 0.2) * height
     knots = [
-        (top_root, high), (radius + 0.35 * reach, high + lift), (radius + 0.9 * reach, high - 0.1 * (high - low)),
-        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)), (radius + 0.4 * reach, low + 0.08 * (high - low)),
+        (top_root, high),
+        (radius + 0.35 * reach, high + lift),
+        (radius + 0.9 * reach, high - 0.1 * (high - low)),
+        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)),
+        (radius + 0.4 * reach, low + 0.08 * (high - low)),
         (low_root, low),
-    ]  # fmt: skip
+    ]
     section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
-    grip = shapes.sweep(
+    return shapes.sweep(
         "handle",
         shapes.upright(shapes.spline(knots, 26)),
         section,
         1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,
     )
-    patches = [
-        *body,
-        *_spout(draw, radius, height),
-        *shapes.placed(grip, shapes.rotation("z", 180.0)),
-    ]
-    patches = shapes.placed(patches, shapes.rotation("z", 118.0))
 
+
+def _teapot_paints(draw: Draw, height: float) -> dict[str, Paint]:
+    """Sample the paints of a teapot."""
     offset = draw.offset()
     clay = draw.colour(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
@@ -146,15 +186,19 @@ def teapot(draw: Draw) -> Instance:
         paint = glaze
     paint = natural(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
-    paints = {
-        "base": solid("a98663"), "body": paint, "lid": draw.pick(paint, trim), "spout": draw.pick(glaze, paint),
-        "handle": draw.pick(glaze, trim), "knob": solid(second) if draw.chance(0.5, True) else trim,
-    }  # fmt: skip
-    return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
+    return {
+        "base": solid("a98663"),
+        "body": paint,
+        "lid": draw.pick(paint, trim),
+        "spout": draw.pick(glaze, paint),
+        "handle": draw.pick(glaze, trim),
+        "knob": solid(second) if draw.chance(0.5, True) else trim,
+    }
 
 
 @family(metres=0.01)
 def frying_pan(draw: Draw) -> Instance:
+    """Make a frying pan with a random handle."""
     base = draw(10.5, 9.0, 11.5)
     rim = draw(13.0, 12.2, 14.5)
     depth = draw(4.2, 2.8, 5.5)
@@ -173,41 +217,9 @@ def frying_pan(draw: Draw) -> Instance:
     length = draw(18.0, 14.0, 21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
-    along = [
-        (0.0, 0.0),
-        (0.22 * length, 0.55 * rise),
-        (0.6 * length, rise),
-        (length, rise * draw(1.05, 0.8, 1.2)),
-    ]
-    path = shapes.spline(root + shapes.upright(np.array(along)), 26)
-    t = np.linspace(0.0, 1.0, 26)
-    width = draw(1.15, 0.85, 1.5)
-    thick = draw(0.62, 0.45, 0.9)
-    shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
-        1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t)
-    )
-    end = np.sqrt(np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0))
-    scale = (
-        np.stack(
-            [thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)), width * shape], axis=1
-        )
-        * end[:, None]
-    )
-    section = (
-        shapes.ellipse(1.0, 1.0, 20)
-        if draw.chance(0.5, True)
-        else shapes.rectangle(2.0, 2.0, 0.7)
-    )
-    grip = shapes.sweep("handle", path, section, scale)
-    inner = shapes.at_height(side, 0.72 * depth) - wall
-    rivet = shapes.sphere(
-        "rivet", 0.38, (inner + 0.02, 0.0, 0.72 * depth), rows=8, columns=12
-    )
-    rivets = [
-        patch
-        for y in (-1.1, 1.1)
-        for patch in shapes.placed(rivet, offset=(0.0, y, 0.0))
-    ]
+    grip = _pan_handle(draw, root, length, rise)
+    inner_radius = shapes.at_height(side, 0.72 * depth) - wall
+    rivets = _pan_rivets(inner_radius, 0.72 * depth)
     spine = [
         (rim - 1.4, 0.72 * depth),
         (rim - 0.3, 0.75 * depth),
@@ -223,12 +235,53 @@ def frying_pan(draw: Draw) -> Instance:
     patches = shapes.placed(
         [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
     )
+    paints = _pan_paints(draw, rim, depth)
+    return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})
 
+
+def _pan_handle(draw: Draw, root: Array, length: float, rise: float) -> list[Patch]:
+    """Create a handle along x from a root (3,), which rises and has a round end."""
+    knots = [
+        (0.0, 0.0),
+        (0.22 * length, 0.55 * rise),
+        (0.6 * length, rise),
+        (length, rise * draw(1.05, 0.8, 1.2)),
+    ]
+    path = shapes.spline(root + shapes.upright(np.array(knots)), 26)
+    t = np.linspace(0.0, 1.0, 26)
+    width = draw(1.15, 0.85, 1.5)
+    thick = draw(0.62, 0.45, 0.9)
+    shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
+        1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t)
+    )
+    round_end = np.sqrt(
+        np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0)
+    )
+    thickness = thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0))
+    scale = np.stack([thickness, width * shape], axis=1) * round_end[:, None]
+    if draw.chance(0.5, True):
+        section = shapes.ellipse(1.0, 1.0, 20)
+    else:
+        section = shapes.rectangle(2.0, 2.0, 0.7)
+    return shapes.sweep("handle", path, section, scale)
+
+
+def _pan_rivets(radius: float, height: float) -> list[Patch]:
+    """Create the two rivets of the bracket on the inside of a pan."""
+    center = (radius + 0.02, 0.0, height)
+    rivet = shapes.sphere("rivet", 0.38, center, rows=8, columns=12)
+    left = shapes.placed(rivet, offset=(0.0, -1.1, 0.0))
+    right = shapes.placed(rivet, offset=(0.0, 1.1, 0.0))
+    return left + right
+
+
+def _pan_paints(draw: Draw, rim: float, depth: float) -> dict[str, Paint]:
+    """Sample the paints of a pan with a radius and a depth."""
     offset = draw.offset()
     coat = draw.colour("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
 
     def turned(t: Texels) -> Array:
-        """Faint rings, as turning leaves."""
+        """Return the mask of faint rings, as turning leaves."""
         return (
             step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8)
             * 0.35
@@ -249,7 +302,7 @@ def frying_pan(draw: Draw) -> Instance:
     outside = natural(draw, 2 * rim, enamel, 0.3)
     inside = natural(draw, 2 * rim, inside, 0.2)
     style = draw.pick("black", "wood", "wild")
-    holds = {
+    handle_paints = {
         "black": solid(draw.colour("1b1b1d", "2a2a2c", wild=0.1)),
         "wood": wood(draw.colour("8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0),
         "wild": solid(draw.colour("a9231f")),
@@ -258,9 +311,9 @@ def frying_pan(draw: Draw) -> Instance:
     paints = {
         "outside": outside,
         "inside": inside,
-        "handle": holds[style],
+        "handle": handle_paints[style],
         "rivet": steel,
         "bracket": steel,
     }
     paints["base"] = solid(draw.colour("77797c", "2b2c2e"))
-    return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})
+    return paints

@@ -1,5 +1,6 @@
-"""The family of people: bodies of every phenotype in a shirt, trousers and shoes
-(`advsearch.scene.people`).
+"""The family of people: bodies of every phenotype in a shirt, trousers and shoes.
+
+The bodies are those of `advsearch.scene.people`.
 """
 
 from __future__ import annotations
@@ -23,27 +24,32 @@ from advsearch.questions.harden.objects.textures import (
 )
 
 FINISHES = {
-    "shirt": assets.Material(roughness=0.85, specular=0.2), "trousers": assets.Material(roughness=0.9, specular=0.2),
-    "skin": assets.Material(roughness=0.5, specular=0.35), "hair": assets.Material(roughness=0.55, specular=0.3),
-    "shoes": assets.Material(roughness=0.4), "eyes": assets.Material(roughness=0.1),
-}  # fmt: skip
+    "shirt": assets.Material(roughness=0.85, specular=0.2),
+    "trousers": assets.Material(roughness=0.9, specular=0.2),
+    "skin": assets.Material(roughness=0.5, specular=0.35),
+    "hair": assets.Material(roughness=0.55, specular=0.3),
+    "shoes": assets.Material(roughness=0.4),
+    "eyes": assets.Material(roughness=0.1),
+}
 
 
 def _rest(charts: Array, points: Array) -> Rest:
-    """From chart coordinates to places on a body that stands as MakeHuman's does,
-    whatever this one is like.
+    """Return the function from chart coordinates to points of the reference body.
+
+    That stands as MakeHuman's does, whatever this body is like.
     """
-    inside = LinearNDInterpolator(charts, points)
-    beside = NearestNDInterpolator(charts, points)
+    linear = LinearNDInterpolator(charts, points)
+    nearest = NearestNDInterpolator(charts, points)
 
-    def places(u: Array, v: Array) -> Array:
-        at: Array = inside(u, v)
-        return np.where(np.isnan(at), beside(u, v), at)
+    def interpolate(u: Array, v: Array) -> Array:
+        points_inside: Array = linear(u, v)
+        return np.where(np.isnan(points_inside), nearest(u, v), points_inside)
 
-    return places
+    return interpolate
 
 
 def _patches(person: Any) -> list[Patch]:
+    """Return the patches of a body, with smooth normals across the seams of charts."""
     data = person.data
     vertices = person.standing.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
@@ -52,36 +58,40 @@ def _patches(person: Any) -> list[Patch]:
     )
     reference[:, 2] -= reference[:, 2].min()
     charts = data["charts"].astype(np.float64)
-    starts = np.cumsum([0, *data["points"]])
-    ends = np.cumsum([0, *data["triangles"]])
+    first_vertex = np.cumsum([0, *data["points"]])
+    first_face = np.cumsum([0, *data["triangles"]])
     faces = data["faces"].astype(np.int64)
-    whole = np.concatenate(
+    all_faces = np.concatenate(
         [
             faces[a:b] + start
-            for a, b, start in zip(ends, ends[1:], starts, strict=False)
+            for a, b, start in zip(
+                first_face, first_face[1:], first_vertex, strict=False
+            )
         ]
     )
-    summed = np.zeros((int(index.max()) + 1, 3))  # smooth across the seams of charts
+    normal_sum = np.zeros(
+        (int(index.max()) + 1, 3)
+    )  # smooth across the seams of charts
     np.add.at(
-        summed,
-        index[whole].reshape(-1),
-        np.repeat(assets.face_vectors(vertices[whole]), 3, axis=0),
+        normal_sum,
+        index[all_faces].reshape(-1),
+        np.repeat(assets.face_vectors(vertices[all_faces]), 3, axis=0),
     )
-    normals = summed[index]
+    normals = normal_sum[index]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     patches = []
     for number, tag in enumerate(data["tags"]):
-        mine = slice(starts[number], starts[number + 1])
-        own = faces[ends[number] : ends[number + 1]]
+        chart_vertices = slice(first_vertex[number], first_vertex[number + 1])
+        chart_faces = faces[first_face[number] : first_face[number + 1]]
         width, height = map(float, data["sizes"][number])
-        rest = _rest(charts[mine], reference[mine])
+        rest = _rest(charts[chart_vertices], reference[chart_vertices])
         patches.append(
             Patch(
                 str(tag),
-                vertices[mine],
-                normals[mine],
-                charts[mine],
-                own,
+                vertices[chart_vertices],
+                normals[chart_vertices],
+                charts[chart_vertices],
+                chart_faces,
                 (width, height),
                 rest,
             )
@@ -101,6 +111,7 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 
 @painter
 def _jeans(t: Texels, color: Array) -> Array:
+    """Paint woven cloth with seams and hems."""
     x, _, z = t.xyz.T
     seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
     hem = np.abs(z - 0.085)
@@ -113,19 +124,20 @@ def _jeans(t: Texels, color: Array) -> Array:
 
 @painter
 def _face(t: Texels, color: Array, hair: Array) -> Array:
+    """Paint skin with lips, cheeks and eyebrows."""
     x, y, z = t.xyz.T
-    aside = np.abs(y)
-    ahead = x > 0.1
+    abs_y = np.abs(y)
+    is_front = x > 0.1
     skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
-    lips = np.where(ahead, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
+    lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
     skin = mix(skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, 0.25))
     cheeks = np.where(
-        ahead, 1.0 - np.hypot((aside - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
+        is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
     )
     skin = mix(skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, 0.6))
-    arch = 1.659 - 14.0 * (aside - 0.034) ** 2
+    arch = 1.659 - 14.0 * (abs_y - 0.034) ** 2
     brow = np.where(
-        ahead & (np.abs(aside - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0
+        is_front & (np.abs(abs_y - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0
     )
     return mix(skin, hair, 0.8 * step(brow, 0.0, 0.0015))
 
@@ -143,26 +155,32 @@ def _leather(t: Texels, color: Array) -> Array:
 
 @painter
 def _irises(t: Texels, color: Array) -> Array:
-    """Eyes that look ahead: white, iris and pupil."""
+    """Paint eyes that look ahead: white, iris and pupil."""
     x, y, z = t.xyz.T
-    out = np.where(
+    pupil_distance = np.where(
         x > 0.128,
         np.hypot(np.abs(y) - 0.031, z - float(0.5 * (z.min() + z.max()))),
         1.0,
     )
-    iris = mix(hexed("e6e2dc"), color, step(0.0065 - out, 0.0, 0.001))
-    return mix(iris, hexed("101010"), step(0.003 - out, 0.0, 0.001))
+    iris = mix(hexed("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, 0.001))
+    return mix(iris, hexed("101010"), step(0.003 - pupil_distance, 0.0, 0.001))
 
 
 @family(metres=1.0, texels=512)
 def person(draw: Draw) -> Instance:
-    woman = draw.chance(0.5)
-    about = {
-        "gender": 0.0 if woman else 1.0, "height": draw(1.7, 1.52, 1.9) - (0.08 if woman else 0.0),
-        "weight": draw(0.5, 0.25, 0.8), "age": draw(35.0, 16.0, 75.0), "stride": draw(0.0, 0.0, 1.2),
+    """Make a person of random phenotype, pose and clothes."""
+    is_woman = draw.chance(0.5)
+    gender = 0.0 if is_woman else 1.0
+    height_reduction = 0.08 if is_woman else 0.0
+    phenotype = {
+        "gender": gender,
+        "height": draw(1.7, 1.52, 1.9) - height_reduction,
+        "weight": draw(0.5, 0.25, 0.8),
+        "age": draw(35.0, 16.0, 75.0),
+        "stride": draw(0.0, 0.0, 1.2),
         "walk": draw(0.0, 0.0, 360.0),
-    }  # fmt: skip
-    body = workbench.library.make_person(about)
+    }
+    body = workbench.library.make_person(phenotype)
     skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
     hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
     paints = {

@@ -1,5 +1,4 @@
-"""Primitives of the bundled objects: patches of surface that carry their own chart of
-the texture.
+"""Geometric primitives of the bundled objects: patches with a chart of the texture each.
 
 A `Patch` is a piece of mesh with local texture coordinates in [0, 1]^2 and a function
 that says which point of the surface a texture coordinate is, so that textures are
@@ -10,7 +9,7 @@ counter-clockwise seen from outside, and the charts are not mirrored.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import TypeAlias
@@ -21,44 +20,40 @@ from scipy.interpolate import CubicHermiteSpline, RegularGridInterpolator
 
 from advsearch.extend import assets
 
-# ---- Plane and space curves from which the bundled objects are made. Float64; lengths
-# in the object's units ---------
+# ---- plane and space curves
+# ----------------------------------------------------------------------------------
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Points: TypeAlias = Array | Sequence[Sequence[float] | Array]
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors (..., 3) or (..., 2) scaled to length one; zero vectors stay
-    zero.
-    """
+    """Normalize vectors (..., 3) or (..., 2); zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def at_height(profile: Array, height: float) -> float:
-    """Return how far from the axis a profile (K, 2) of points (r, z) with rising z is
-    at a height.
-    """
+    """Return the radius of a profile (K, 2) of points (r, z), with rising z, at a height."""
     return float(np.interp(height, profile[:, 1], profile[:, 0]))
 
 
 def lengths(curve: Array) -> Array:
-    """Return how far along a polyline (K, D) its points are: (K,), from 0."""
+    """Return the arc length (K,) from the start of a polyline (K, D) to each point."""
     return np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
     )
 
 
 def away_from(x: Array, y: Array, *paths: Points) -> Array:
-    """Return how far points (N,) are from the nearest of some polylines (K, 2)."""
-    away = np.full(len(x), np.inf)
+    """Return the distance of points (N,) to the nearest of several polylines (K, 2)."""
+    distance = np.full(len(x), np.inf)
     for (x0, y0), (x1, y1) in chain.from_iterable(map(pairwise, paths)):
         dx = x1 - x0
         dy = y1 - y0
         t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
-        away = np.minimum(away, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
-    return away
+        distance = np.minimum(distance, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
+    return distance
 
 
 def upright(curve: Array) -> Array:
@@ -67,73 +62,84 @@ def upright(curve: Array) -> Array:
 
 
 def rotation(axis: str, degrees: float) -> Array:
-    """Return the (3, 3) right-handed rotation about the axis "x", "y" or "z" by an
-    angle in degrees.
-    """
-    c = np.cos(np.radians(degrees))
-    s = np.sin(np.radians(degrees))
+    """Return the right-handed rotation (3, 3) about the axis "x", "y" or "z", in degrees."""
+    cosine = np.cos(np.radians(degrees))
+    sine = np.sin(np.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    turn = np.eye(3)
-    turn[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
-    return turn
+    matrix = np.eye(3)
+    matrix[[i, i, j, j], [i, j, i, j]] = cosine, -sine, sine, cosine
+    return matrix
 
 
 def spline(points: Points, count: int) -> Array:
-    """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K,
-    D) points, ends included.
+    """Sample the Catmull-Rom curve through points (K, D) at `count` points, ends included.
+
+    Its knots are spaced by chord length.
     """
     knots = np.asarray(points, dtype=np.float64)
-    at = lengths(knots)
+    arc_length = lengths(knots)
     return np.asarray(
-        CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(
-            np.linspace(0.0, at[-1], count)
+        CubicHermiteSpline(arc_length, knots, np.gradient(knots, arc_length, axis=0))(
+            np.linspace(0.0, arc_length[-1], count)
         )
     )
 
 
 def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
-    """Return the open polyline (K, D) with its inner corners rounded off, from a
-    distance on, one number or K - 2 of them and at most half an edge, in so many steps.
+    """Round the inner corners of an open polyline (K, D).
+
+    Args:
+        corners: the polyline.
+        radius: distance from a corner at which its rounding begins, for all corners or
+            (K - 2,); at most half an edge.
+        steps: edges of a rounded corner.
     """
     points = np.asarray(corners, dtype=np.float64)
     radii = np.broadcast_to(
         np.asarray(radius, dtype=np.float64), (max(len(points) - 2, 0),)
     )
-    out = [points[0]]
-    for before, corner, after, wanted in zip(
+    rounded_points = [points[0]]
+    for previous, corner, following, corner_radius in zip(
         points, points[1:], points[2:], radii, strict=False
     ):
-        a = before - corner
-        b = after - corner
+        to_previous = previous - corner
+        to_next = following - corner
         reach = min(
-            float(wanted),
-            0.499 * float(np.linalg.norm(a)),
-            0.499 * float(np.linalg.norm(b)),
+            float(corner_radius),
+            0.499 * float(np.linalg.norm(to_previous)),
+            0.499 * float(np.linalg.norm(to_next)),
         )
         if reach <= 1e-9:
-            out.append(corner)
+            rounded_points.append(corner)
             continue
-        p = corner + unit(a) * reach
-        q = corner + unit(b) * reach
+        start = corner + unit(to_previous) * reach
+        end = corner + unit(to_next) * reach
         t = np.linspace(0.0, 1.0, steps + 1)[:, None]
-        out.extend((1 - t) ** 2 * p + 2 * t * (1 - t) * corner + t**2 * q)
-    out.append(points[-1])
-    return np.array(out)
+        rounded_points.extend(
+            (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
+        )
+    rounded_points.append(points[-1])
+    return np.array(rounded_points)
 
 
 def dense(points: Points, longest: float) -> Array:
-    """Return the polyline with edges longer than `longest` cut into equal pieces."""
+    """Divide the edges of a polyline that are longer than `longest` into equal pieces."""
     curve = np.asarray(points, dtype=np.float64)
-    out = [curve[:1]]
-    for a, b in pairwise(curve):
-        pieces = max(1, int(np.ceil(round(float(np.linalg.norm(b - a)) / longest, 6))))
-        out.append(a + (b - a) * (np.arange(1, pieces + 1) / pieces)[:, None])
-    return np.concatenate(out)
+    parts = [curve[:1]]
+    for start, end in pairwise(curve):
+        n_pieces = max(
+            1, int(np.ceil(round(float(np.linalg.norm(end - start)) / longest, 6)))
+        )
+        parts.append(
+            start + (end - start) * (np.arange(1, n_pieces + 1) / n_pieces)[:, None]
+        )
+    return np.concatenate(parts)
 
 
 def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
-    """Return a regular polygon of circumradius 1, a flat side down, corners rounded: a
-    closed section (M, 2).
+    """Return a regular polygon with rounded corners as a closed section (M, 2).
+
+    Its circumradius is 1, and a flat side is at the bottom.
     """
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -141,41 +147,52 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
-    """Return a rounded rectangle, centred, counter-clockwise, as a closed section (M,
-    2).
-    """
-    w = width / 2
-    h = height / 2
-    corners = [(w, -h), (w, h), (-w, h), (-w, -h), (w, -h), (w, h)]
+    """Return a centered rounded rectangle as a closed counter-clockwise section (M, 2)."""
+    half_width = width / 2
+    half_height = height / 2
+    corners = [
+        (half_width, -half_height),
+        (half_width, half_height),
+        (-half_width, half_height),
+        (-half_width, -half_height),
+        (half_width, -half_height),
+        (half_width, half_height),
+    ]
     return rounded(corners, bevel, steps)[1:-1]
 
 
 def ellipse(width: float, height: float, count: int = 20) -> Array:
-    """Return an ellipse with the given half-axes, counter-clockwise, as a closed
-    section (count, 2).
-    """
-    t = 2 * np.pi * np.arange(count) / count
-    return np.stack([width * np.cos(t), height * np.sin(t)], axis=1)
+    """Return an ellipse with two half-axes as a closed counter-clockwise section (count, 2)."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([width * np.cos(angle), height * np.sin(angle)], axis=1)
 
 
 Rest = Callable[[Array, Array], Array]
-# degrees; where two parts of a profile meet at more than this, the edge stays hard
 HARD_ANGLE = 40.0
+"""Degrees; where two parts of a profile meet at more, the edge stays hard."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A piece of surface with one chart."""
+    """A piece of surface with one chart.
 
-    tag: str  # which paint it gets; any string. So it is in all functions here.
-    vertices: Array  # (V, 3) positions
-    normals: Array  # (V, 3) unit normals, outwards
-    uvs: Array  # (V, 2) chart coordinates in [0, 1]
-    faces: assets.Ints  # (F, 3) vertex indices
-    # width and height of the chart, in object units; its share of the atlas follows
-    # from it
+    Attributes:
+        tag: selects the paint; any string. It is the same in all functions here.
+        vertices: positions (V, 3).
+        normals: unit normals (V, 3), outwards.
+        uvs: chart coordinates (V, 2) in [0, 1].
+        faces: vertex indices (F, 3).
+        size: width and height of the chart in object units, which its size in the atlas
+            follows from.
+        rest: maps u (N,) and v (N,) to surface points (N, 3) before any transform.
+    """
+
+    tag: str
+    vertices: Array
+    normals: Array
+    uvs: Array
+    faces: assets.Ints
     size: tuple[float, float]
-    # maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`
     rest: Rest
 
 
@@ -184,27 +201,29 @@ def placed(
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Patch]:
-    """Rotate patches by a (3, 3) rotation, then move them. What is painted on them
-    moves along.
-    """
-    turn = np.eye(3) if rotation is None else rotation
-    move = np.asarray(offset, dtype=np.float64)
+    """Rotate patches by a matrix (3, 3), then translate them, with what is painted on them."""
+    matrix = np.eye(3) if rotation is None else rotation
+    translation = np.asarray(offset, dtype=np.float64)
     return [
-        replace(p, vertices=p.vertices @ turn.T + move, normals=p.normals @ turn.T)
-        for p in patches
+        replace(
+            patch,
+            vertices=patch.vertices @ matrix.T + translation,
+            normals=patch.normals @ matrix.T,
+        )
+        for patch in patches
     ]
 
 
 def stretched(
     patches: Iterable[Patch], factors: Sequence[float] | Array
 ) -> list[Patch]:
-    """Stretch patches along x, y and z by three factors. What is painted on them
-    stretches along.
-    """
-    by = np.asarray(factors, dtype=np.float64)
+    """Scale patches along x, y and z, with what is painted on them."""
+    scale = np.asarray(factors, dtype=np.float64)
     return [
-        replace(p, vertices=p.vertices * by, normals=unit(p.normals / by))
-        for p in patches
+        replace(
+            patch, vertices=patch.vertices * scale, normals=unit(patch.normals / scale)
+        )
+        for patch in patches
     ]
 
 
@@ -216,9 +235,15 @@ def grid(
     down: Array,
     across: Array,
 ) -> Patch:
-    """Return the patch over a grid of points (R, C, 3) with unit normals: u runs along
-    columns, v along rows, du x dv points outwards; `down` (R,) and `across` (C,) are
-    the rows' v and the columns' u, which increase from 0 to 1.
+    """Create the patch of a grid of points (R, C, 3) with unit normals.
+
+    Args:
+        tag: of the paint.
+        points: u runs along columns and v along rows; du x dv points outwards.
+        normals: (R, C, 3).
+        size: width and height of the chart.
+        down: v of the rows (R,), increasing from 0 to 1.
+        across: u of the columns (C,), increasing from 0 to 1.
     """
     rows, columns = points.shape[:2]
     u = np.broadcast_to(across, (rows, columns))
@@ -235,12 +260,12 @@ def grid(
     area = np.linalg.norm(assets.face_vectors(points.reshape(-1, 3)[faces]), axis=1)
     # none where a row shrinks to a point
     faces = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
-    places = RegularGridInterpolator(
+    interpolate = RegularGridInterpolator(
         (down, across), points, bounds_error=False, fill_value=None
     )
 
     def rest(at_u: Array, at_v: Array) -> Array:
-        return np.asarray(places(np.stack([at_v, at_u], axis=-1)))
+        return np.asarray(interpolate(np.stack([at_v, at_u], axis=-1)))
 
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
     return Patch(
@@ -249,15 +274,13 @@ def grid(
 
 
 def _along(curve: Array) -> tuple[Array, float]:
-    """Return (K,) normalised arc lengths of a polyline, and its length."""
-    at = lengths(curve)
-    return at / at[-1], float(at[-1])
+    """Return the normalized arc lengths (K,) of a polyline, and its length."""
+    arc_length = lengths(curve)
+    return arc_length / arc_length[-1], float(arc_length[-1])
 
 
 def _fan(count: int) -> assets.Ints:
-    """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count`
-    vertices after it.
-    """
+    """Return the faces (count, 3) between vertex 0 and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(
         np.int64
@@ -265,81 +288,85 @@ def _fan(count: int) -> assets.Ints:
 
 
 def _profile_normals(parts: Sequence[Array]) -> list[Array]:
-    """Unit normals (dz, -dr) of consecutive (r, z) polylines, shared where they meet
-    smoothly or on the axis.
+    """Return the unit normals (dz, -dr) of consecutive polylines (r, z).
+
+    They are shared where the polylines meet smoothly or on the axis.
     """
     directions = []
-    for part in parts:
-        step = np.diff(part, axis=0)
-        direction = np.concatenate([step[:1], part[2:] - part[:-2], step[-1:]])
+    for polyline in parts:
+        step = np.diff(polyline, axis=0)
+        direction = np.concatenate([step[:1], polyline[2:] - polyline[:-2], step[-1:]])
         for end, row in ((0, 0), (-1, -1)):
-            if part[end, 0] < 1e-9:
+            if polyline[end, 0] < 1e-9:
                 direction[row] = (step[row][0], 0.0)
         directions.append(unit(direction))
     for before, after, p, q in zip(
         directions, directions[1:], parts, parts[1:], strict=False
     ):
-        meets = float(np.linalg.norm(p[-1] - q[0])) < 1e-9
-        if meets and float(before[-1] @ after[0]) > np.cos(np.radians(HARD_ANGLE)):
+        is_joined = float(np.linalg.norm(p[-1] - q[0])) < 1e-9
+        if is_joined and float(before[-1] @ after[0]) > np.cos(np.radians(HARD_ANGLE)):
             before[-1] = after[0] = unit(before[-1] + after[0])
     return [np.stack([d[:, 1], -d[:, 0]], axis=1) for d in directions]
 
 
 def _around(curve: Array, theta: Array) -> Array:
-    """Points (K, M, 3) of a curve (K, 2) of points (r, z) at angles (M,) about the z
-    axis.
-    """
-    up = np.broadcast_to(curve[:, 1:], (len(curve), len(theta)))
+    """Rotate a curve (K, 2) of points (r, z) to angles (M,) about the z axis: (K, M, 3)."""
+    heights = np.broadcast_to(curve[:, 1:], (len(curve), len(theta)))
     return np.stack(
-        [curve[:, :1] * np.cos(theta), curve[:, :1] * np.sin(theta), up], axis=-1
+        [curve[:, :1] * np.cos(theta), curve[:, :1] * np.sin(theta), heights], axis=-1
     )
 
 
 def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
-    """A piece of a surface of revolution that starts or ends on the axis, charted by
-    its distance from the pole.
+    """Create a piece of a surface of revolution that starts or ends on the axis.
+
+    Its chart is a disc with the distance from the pole as radius.
     """
-    inwards = profile[-1, 0] < 1e-9
-    curve, normal = (profile[::-1], normals[::-1]) if inwards else (profile, normals)
-    at, length = _along(curve)
+    ends_on_axis = profile[-1, 0] < 1e-9
+    curve, normal = (
+        (profile[::-1], normals[::-1]) if ends_on_axis else (profile, normals)
+    )
+    radial_fraction, length = _along(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
     # a profile that ends on the axis faces up: seen from above it is not mirrored
-    side = 1.0 if inwards else -1.0
+    mirror = 1.0 if ends_on_axis else -1.0
     vertices, vertex_normals = (
         np.concatenate(
             [[[0.0, 0.0, rows[0, 1]]], _around(rows[1:], theta).reshape(-1, 3)]
         )
         for rows in (curve, normal)
     )
-    around = [
-        0.5 + 0.5 * side * at[1:, None] * np.cos(theta),
-        0.5 + 0.5 * at[1:, None] * np.sin(theta),
+    disc_uvs = [
+        0.5 + 0.5 * mirror * radial_fraction[1:, None] * np.cos(theta),
+        0.5 + 0.5 * radial_fraction[1:, None] * np.sin(theta),
     ]
-    uvs = np.concatenate([[[0.5, 0.5]], np.stack(around, axis=-1).reshape(-1, 2)])
+    uvs = np.concatenate([[[0.5, 0.5]], np.stack(disc_uvs, axis=-1).reshape(-1, 2)])
 
-    j = np.arange(columns)
-    k = (j + 1) % columns
+    column = np.arange(columns)
+    next_column = (column + 1) % columns
     faces = [_fan(columns)]
     for row in range(len(curve) - 2):
-        a = 1 + row * columns
-        b = 1 + (row + 1) * columns
+        inner = 1 + row * columns
+        outer = 1 + (row + 1) * columns
         faces += [
-            np.stack([a + j, b + j, b + k], axis=1),
-            np.stack([a + j, b + k, a + k], axis=1),
+            np.stack([inner + column, outer + column, outer + next_column], axis=1),
+            np.stack(
+                [inner + column, outer + next_column, inner + next_column], axis=1
+            ),
         ]
     triangles = np.concatenate(faces)
 
     def rest(u: Array, v: Array) -> Array:
-        x = (2 * u - 1) * side
+        x = (2 * u - 1) * mirror
         y = 2 * v - 1
-        rho = np.minimum(np.hypot(x, y), 1.0)
-        radius = np.interp(rho, at, curve[:, 0])
+        pole_distance = np.minimum(np.hypot(x, y), 1.0)
+        radius = np.interp(pole_distance, radial_fraction, curve[:, 0])
         angle = np.arctan2(y, x)
         return np.stack(
             [
                 radius * np.cos(angle),
                 radius * np.sin(angle),
-                np.interp(rho, at, curve[:, 1]),
+                np.interp(pole_distance, radial_fraction, curve[:, 1]),
             ],
             axis=-1,
         )
@@ -350,15 +377,16 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         vertices,
         vertex_normals,
         uvs,
-        triangles if inwards else triangles[:, ::-1],
+        triangles if ends_on_axis else triangles[:, ::-1],
         size,
         rest,
     )
 
 
 def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
-    """A piece of a surface of revolution charted as an unrolled band, cut in 2 or 4
-    where it would be a long strip.
+    """Create a piece of a surface of revolution as an unrolled band.
+
+    A band that would be a long strip is cut into 2 or 4 charts.
     """
     theta = 2 * np.pi * np.arange(columns + 1) / columns
     theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
@@ -366,21 +394,24 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     normal = _around(normals, theta)
     down, length = _along(profile)
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
-    pieces = (
-        1 if width <= 3 * length else 2 if width <= 6 * length or columns % 4 else 4
-    )
-    each = columns // pieces
-    columns_of = (np.s_[:, at : at + each + 1] for at in range(0, each * pieces, each))
-    across = np.arange(each + 1) / each
-    size = (width / pieces, length)
-    return [
-        grid(tag, points[piece], normal[piece], size, down, across)
-        for piece in columns_of
-    ]
+    if width <= 3 * length:
+        n_pieces = 1
+    elif width <= 6 * length or columns % 4:
+        n_pieces = 2
+    else:
+        n_pieces = 4
+    piece_columns = columns // n_pieces
+    across = np.arange(piece_columns + 1) / piece_columns
+    size = (width / n_pieces, length)
+    patches = []
+    for start in range(0, piece_columns * n_pieces, piece_columns):
+        piece = np.s_[:, start : start + piece_columns + 1]
+        patches.append(grid(tag, points[piece], normal[piece], size, down, across))
+    return patches
 
 
 def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patch]:
-    """Turn a profile about the z axis.
+    """Rotate a profile about the z axis.
 
     Args:
         profile: consecutive pieces (tag, (K, 2) points (r, z)), walked with the
@@ -394,57 +425,66 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
     for (tag, _), curve, normals in zip(
         profile, curves, _profile_normals(curves), strict=True
     ):
-        touches = (
-            min(curve[0, 0], curve[-1, 0]) < 1e-9 <= max(curve[0, 0], curve[-1, 0])
-        )
-        flat = abs(curve[-1, 0] - curve[0, 0]) > 0.5 * _along(curve)[1]
-        patches += (
-            [_disc(tag, curve, normals, columns)]
-            if touches and flat
-            else _wall(tag, curve, normals, columns)
-        )
+        end_radii = (curve[0, 0], curve[-1, 0])
+        touches_axis = min(end_radii) < 1e-9 <= max(end_radii)
+        is_flat = abs(end_radii[1] - end_radii[0]) > 0.5 * _along(curve)[1]
+        if touches_axis and is_flat:
+            patches.append(_disc(tag, curve, normals, columns))
+        else:
+            patches += _wall(tag, curve, normals, columns)
     return patches
 
 
 def vessel(
     outside: Array, wall: float, floor: float, *, columns: int = 56, step: float = 0.7
 ) -> list[Patch]:
-    """An open container: an "outside" profile (K, 2) of (r, z) from the foot (z about
-    0, r > 0) up to the lip, which is rounded, an "inside" at constant wall thickness
-    with a floor at a height, and a "base"; with so many faces around, and a longest
-    edge along the profile.
+    """Create an open container with a constant wall thickness.
+
+    Its tags are "base", "outside" (with the rounded lip) and "inside".
+
+    Args:
+        outside: profile (K, 2) of points (r, z) from the foot (z about 0, r > 0) to the
+            lip.
+        wall: thickness of the wall.
+        floor: height of the floor inside.
+        columns: faces around the axis.
+        step: longest edge along the profile.
     """
     normal = _profile_normals([outside])[0]
     inner = outside - wall * normal
-    keep = np.arange(len(outside))
+    remaining = np.arange(len(outside))
     # points at which it runs backwards, as in tight bends, go; the last one stays
-    while len(keep) > 2:
-        back = (np.diff(inner[keep], axis=0) * np.diff(outside[keep], axis=0)).sum(
-            axis=1
-        ) <= 0.0
-        if not back.any():
+    while len(remaining) > 2:
+        is_backward = (
+            np.diff(inner[remaining], axis=0) * np.diff(outside[remaining], axis=0)
+        ).sum(axis=1) <= 0.0
+        if not is_backward.any():
             break
-        keep = np.append(keep[:-1][~back], keep[-1])
-    inner = inner[keep][::-1]
-    half = np.pi * np.arange(1, 6) / 6
-    top = outside[-1] - wall / 2 * normal[-1]
-    across = wall / 2 * normal[-1]
-    up = np.array([-across[1], across[0]])
-    lip = top + np.cos(half)[:, None] * across + np.sin(half)[:, None] * up
+        remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
+    inner = inner[remaining][::-1]
+    lip_angle = np.pi * np.arange(1, 6) / 6
+    lip_center = outside[-1] - wall / 2 * normal[-1]
+    lip_across = wall / 2 * normal[-1]
+    lip_up = np.array([-lip_across[1], lip_across[0]])
+    lip = (
+        lip_center
+        + np.cos(lip_angle)[:, None] * lip_across
+        + np.sin(lip_angle)[:, None] * lip_up
+    )
     fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
-    edge = at_height(inner[::-1], floor)
+    floor_radius = at_height(inner[::-1], floor)
     inner = inner[
         (inner[:, 1] > floor + fillet)
         & (inner[:, 0] > 0.05 * float(outside[:, 0].max()))
     ]
     t = np.linspace(0.0, 1.0, 5)[1:, None]
-    turn = np.array([max(edge - fillet, 0.4 * edge), floor])
+    fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
     inside = np.concatenate(
         [
             inner,
             (1 - t) ** 2 * inner[-1]
-            + 2 * t * (1 - t) * np.array([edge, floor])
-            + t**2 * turn,
+            + 2 * t * (1 - t) * np.array([floor_radius, floor])
+            + t**2 * fillet_end,
         ]
     )
     foot = outside[0]
@@ -459,7 +499,7 @@ def vessel(
         ),
         ("outside", dense(np.concatenate([outside, lip, inner[:1]]), step)),
         ("inside", dense(inside, step)),
-        ("inside", dense([turn, (0.0, floor)], 3 * step)),
+        ("inside", dense([fillet_end, (0.0, floor)], 3 * step)),
     ]
     return lathe(pieces, columns)
 
@@ -471,7 +511,7 @@ def sphere(
     rows: int = 24,
     columns: int = 40,
 ) -> list[Patch]:
-    """A sphere in three charts: two polar caps and a band."""
+    """Create a sphere of three charts: two polar caps and a band."""
     angle = np.pi * np.arange(rows + 1) / rows - np.pi / 2
     curve = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     curve[[0, -1], 0] = 0.0
@@ -485,9 +525,14 @@ def sphere(
 
 
 def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return unit tangents and two normals (N, 3) each along a path (N, 3), turning as
-    little as possible; `first` is a vector, not along the path, whose part across it is
-    the first normal at the start.
+    """Return unit tangents and two normals along a path, with as little twist as possible.
+
+    Args:
+        path: (N, 3).
+        first: vector whose part normal to the path is the first normal at the start.
+
+    Returns:
+        Three arrays (N, 3).
     """
     tangent = unit(np.gradient(path, axis=0))
     normal = np.empty_like(path)
@@ -520,29 +565,42 @@ def sweep(
         frame: tangents and normals to use in place of `frames(path, first)`.
     """
     centres = np.asarray(path, dtype=np.float64)
-    tangent, a, b = frames(centres, first) if frame is None else frame
+    tangent, first_normal, second_normal = (
+        frames(centres, first) if frame is None else frame
+    )
     scales = np.asarray(scale, dtype=np.float64)
     scales = np.broadcast_to(
         scales.reshape(-1, 1) if scales.ndim < 2 else scales, (len(centres), 2)
     )
-    flat = section[None] * scales[:, None]
-    points = centres[:, None] + flat[..., :1] * a[:, None] + flat[..., 1:] * b[:, None]
+    scaled_section = section[None] * scales[:, None]
+    points = (
+        centres[:, None]
+        + scaled_section[..., :1] * first_normal[:, None]
+        + scaled_section[..., 1:] * second_normal[:, None]
+    )
     normals = np.cross(
         np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1),
         np.gradient(points, axis=0),
     )
-    long = np.linalg.norm(normals, axis=-1)
+    normal_length = np.linalg.norm(normals, axis=-1)
     normals = unit(normals)
-    for row, side in ((0, -1.0), (-1, 1.0)):  # where a row is a point
-        normals[row][long[row] < 1e-7 * float(long.max())] = side * tangent[row]
-    ring, around = _along(np.concatenate([section, section[:1]]))
+    for row, direction in ((0, -1.0), (-1, 1.0)):  # where a row is a point
+        normals[row][normal_length[row] < 1e-7 * float(normal_length.max())] = (
+            direction * tangent[row]
+        )
+    ring_fraction, ring_length = _along(np.concatenate([section, section[:1]]))
     closed = np.concatenate([points, points[:, :1]], axis=1)
     closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
     down = mean_lengths(points)
-    width = around * float(np.quantile(scales.mean(axis=1), 0.75))
+    width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
     patches = [
         grid(
-            tag, closed, closed_normals, (width, float(down[-1])), down / down[-1], ring
+            tag,
+            closed,
+            closed_normals,
+            (width, float(down[-1])),
+            down / down[-1],
+            ring_fraction,
         )
     ]
     if caps:
@@ -560,27 +618,28 @@ def mean_lengths(points: Array, axis: int = 0) -> Array:
 
 
 def cap(tag: str, ring: Array, normal: Array) -> Patch:
-    """A flat face bounded by a convex ring (M, 3), counter-clockwise seen from outside,
-    with the given unit normal.
+    """Create a flat face that is bounded by a convex ring (M, 3).
+
+    The ring is counter-clockwise seen from outside; `normal` is the unit normal.
     """
     centre = ring.mean(axis=0)
     x = unit(ring[0] - centre)
     x = unit(x - (x @ normal) * normal)
     y = np.cross(normal, x)
-    flat = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
-    low = flat.min(axis=0)
-    span = flat.max(axis=0) - flat.min(axis=0)
-    uvs = (np.concatenate([[[0.0, 0.0]], flat]) - low) / span
+    plane_points = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
+    lower = plane_points.min(axis=0)
+    extent = plane_points.max(axis=0) - plane_points.min(axis=0)
+    uvs = (np.concatenate([[[0.0, 0.0]], plane_points]) - lower) / extent
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
         return np.asarray(
             centre
-            + (u * span[0] + low[0])[:, None] * x
-            + (v * span[1] + low[1])[:, None] * y
+            + (u * extent[0] + lower[0])[:, None] * x
+            + (v * extent[1] + lower[1])[:, None] * y
         )
 
-    size = (float(span[0]), float(span[1]))
+    size = (float(extent[0]), float(extent[1]))
     return Patch(
         tag,
         vertices,
@@ -600,9 +659,15 @@ def box(
     steps: int = 2,
     cells: int = 1,
 ) -> list[Patch]:
-    """A box with edges and corners rounded by a radius: six charts, smooth normals,
-    cells across half an edge's rounding (`steps`) and across the flat part of a face,
-    each way.
+    """Create a box with rounded edges and smooth normals, with a chart for each face.
+
+    Args:
+        tag: of the paint.
+        centre: of the box.
+        size: along x, y and z.
+        bevel: radius of the edges.
+        steps: cells across half of an edge's rounding.
+        cells: cells across the flat part of a face, along each of its axes.
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = min(bevel, 0.95 * float(half.min()))
@@ -650,7 +715,8 @@ def box(
     return patches
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ---- cutting
+# ----------------------------------------------------------------------------------
 # Cutting patches along curves: what is carved out of a smooth surface becomes a part
 # with an edge of its own.
 #
@@ -659,51 +725,65 @@ def box(
 # the grid.
 
 
-# (N, 3) points to (N,) values, positive inside; about the distance to the edge
 Field = Callable[[Array], Array]
-# share of an edge within which a cut goes through the edge's end: thinner slivers are
-# not worth a triangle
+"""Maps points (N, 3) to values (N,): about the distance to the edge, positive inside."""
 SNAP = 0.1
+"""Fraction of an edge's length within which a cut is moved to the edge's end.
+
+That avoids slivers.
+"""
 
 
 def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:
-    """Return patches, smooth and not placed yet, with what lies inside under a tag of
-    its own; None leaves it out.
+    """Cut patches along the surface of a field, and give the inside another tag.
+
+    Args:
+        patches: smooth ones that are not transformed yet.
+        inside: positive inside.
+        tag: of the inside; None removes it.
     """
-    pieces = []
+    carved_patches = []
     for patch in patches:
         edges = _edges(patch)
         value = np.array(inside(patch.vertices))
-        ends = value[edges]
-        crossed = ends[:, 0] * ends[:, 1] < 0.0
-        share = np.abs(ends[crossed]) / np.abs(ends[crossed]).sum(axis=1, keepdims=True)
-        value[edges[crossed][share < SNAP]] = 0.0
+        end_values = value[edges]
+        crossed = end_values[:, 0] * end_values[:, 1] < 0.0
+        fraction = np.abs(end_values[crossed]) / np.abs(end_values[crossed]).sum(
+            axis=1, keepdims=True
+        )
+        value[edges[crossed][fraction < SNAP]] = 0.0
         if value.max() <= 0.0:
-            pieces.append(patch)
+            carved_patches.append(patch)
             continue
-        cut, side = _split(patch, value)
-        for faces, part in ((cut.faces[~side], patch.tag), (cut.faces[side], tag)):
-            if len(faces) and part is not None:
-                pieces.append(cropped(replace(cut, faces=faces, tag=part)))
-    return pieces
+        cut, is_inside = _split(patch, value)
+        for faces, part_tag in (
+            (cut.faces[~is_inside], patch.tag),
+            (cut.faces[is_inside], tag),
+        ):
+            if len(faces) and part_tag is not None:
+                carved_patches.append(cropped(replace(cut, faces=faces, tag=part_tag)))
+    return carved_patches
 
 
 def cropped(patch: Patch) -> Patch:
-    """Return the patch with a chart that is as large as what its faces use of it."""
-    used = patch.uvs[np.unique(patch.faces)]
-    low = used.min(axis=0)
-    span = np.ptp(used, axis=0)
-    size = (patch.size[0] * float(span[0]), patch.size[1] * float(span[1]))
-    uvs = np.clip((patch.uvs - low) / span, 0.0, 1.0)
+    """Return the patch with a chart that is cropped to what its faces use."""
+    used_uvs = patch.uvs[np.unique(patch.faces)]
+    lower = used_uvs.min(axis=0)
+    extent = np.ptp(used_uvs, axis=0)
+    size = (patch.size[0] * float(extent[0]), patch.size[1] * float(extent[1]))
+    uvs = np.clip((patch.uvs - lower) / extent, 0.0, 1.0)
     return replace(
         patch,
         uvs=uvs,
         size=size,
-        rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]),
+        rest=lambda u, v: patch.rest(
+            lower[0] + u * extent[0], lower[1] + v * extent[1]
+        ),
     )
 
 
 def _edges(patch: Patch) -> assets.Ints:
+    """Return the unique edges (E, 2) of a patch as sorted vertex indices."""
     pairs = np.concatenate(
         [patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]]
     )
@@ -711,46 +791,65 @@ def _edges(patch: Patch) -> assets.Ints:
 
 
 def _split(patch: Patch, value: Array) -> tuple[Patch, assets.Bools]:
-    """The patch with its triangles split where the values change sign, and (F,) whether
-    each face is inside.
+    """Split the triangles of a patch where the values (V,) of its vertices change sign.
+
+    Returns:
+        The patch, and whether each of its faces is inside (F,).
     """
     edges = _edges(patch)
     crossed = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
-    a, b = crossed.T
-    share = (value[a] / (value[a] - value[b]))[:, None]
-    extra = [
-        one[a] + share * (one[b] - one[a])
-        for one in (patch.vertices, patch.normals, patch.uvs)
-    ]
-    extra[1] /= np.linalg.norm(extra[1], axis=1, keepdims=True)
-    number = {
-        (int(i), int(j)): len(patch.vertices) + k for k, (i, j) in enumerate(crossed)
+    first, second = crossed.T
+    fraction = (value[first] / (value[first] - value[second]))[:, None]
+
+    def interpolate(attribute: Array) -> Array:
+        difference = attribute[second] - attribute[first]
+        return np.asarray(attribute[first] + fraction * difference)
+
+    cut_normals = interpolate(patch.normals)
+    cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
+    cut_of_edge = {
+        (int(start), int(end)): len(patch.vertices) + index
+        for index, (start, end) in enumerate(crossed)
     }
     faces: list[tuple[int, int, int]] = []
-    side: list[bool] = []
+    is_inside: list[bool] = []
     for face in patch.faces:
-        here = value[face]
-        if here.min() >= 0.0 or here.max() <= 0.0:
+        face_values = value[face]
+        if face_values.min() >= 0.0 or face_values.max() <= 0.0:
             faces.append(tuple(int(i) for i in face))  # type: ignore[arg-type]
-            side.append(bool(here.sum() > 0.0))
+            is_inside.append(bool(face_values.sum() > 0.0))
             continue
-        around: list[tuple[int, float]] = []  # the outline with the cuts in it
-        for i in range(3):
-            one = int(face[i])
-            other = int(face[(i + 1) % 3])
-            around.append((one, float(value[one])))
-            cut = number.get((min(one, other), max(one, other)))
-            if cut is not None:
-                around.append((cut, 0.0))
+        outline = _outline_with_cuts(face, value, cut_of_edge)
         for sign in (1.0, -1.0):
-            part = [index for index, at in around if at * sign >= 0.0]
-            for k in range(1, len(part) - 1):
-                faces.append((part[0], part[k], part[k + 1]))
-                side.append(sign > 0.0)
-    before = (patch.vertices, patch.normals, patch.uvs)
-    places, normals, uvs = (
-        np.concatenate([one, more]) for one, more in zip(before, extra, strict=True)
+            polygon = [
+                vertex for vertex, vertex_value in outline if vertex_value * sign >= 0.0
+            ]
+            for k in range(1, len(polygon) - 1):
+                faces.append((polygon[0], polygon[k], polygon[k + 1]))
+                is_inside.append(sign > 0.0)
+    split_patch = replace(
+        patch,
+        vertices=np.concatenate([patch.vertices, interpolate(patch.vertices)]),
+        normals=np.concatenate([patch.normals, cut_normals]),
+        uvs=np.concatenate([patch.uvs, interpolate(patch.uvs)]),
+        faces=np.array(faces),
     )
-    return replace(
-        patch, vertices=places, normals=normals, uvs=uvs, faces=np.array(faces)
-    ), np.array(side)
+    return split_patch, np.array(is_inside)
+
+
+def _outline_with_cuts(
+    face: assets.Ints, value: Array, cut_of_edge: Mapping[tuple[int, int], int]
+) -> list[tuple[int, float]]:
+    """Return the vertices of a triangle with the cuts of its edges between them.
+
+    Each has its value; that of a cut is 0.
+    """
+    outline: list[tuple[int, float]] = []
+    for i in range(3):
+        start = int(face[i])
+        end = int(face[(i + 1) % 3])
+        outline.append((start, float(value[start])))
+        cut = cut_of_edge.get((min(start, end), max(start, end)))
+        if cut is not None:
+            outline.append((cut, 0.0))
+    return outline

@@ -1,5 +1,4 @@
-"""Procedural base colours: small functions from surface points to display-referred
-sRGB.
+"""Procedural base colors: functions from surface points to display-referred sRGB.
 
 A `Paint` maps `Texels` to (N, 3) colours in [0, 1]. Painting in object coordinates
 (`xyz`) makes patterns run on across the edges of charts; painting in chart coordinates
@@ -28,21 +27,19 @@ Color = Array  # (3,) display-referred sRGB
 
 
 def hexed(code: str) -> Color:
-    """Return the colour written as six hexadecimal digits."""
+    """Return the color that six hexadecimal digits stand for."""
     return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Draws an instance's proportions; without a generator, gives the canonical
-    ones.
-    """
+    """Samples the parameters of an instance, or returns the canonical ones."""
 
     # the source of randomness, or None for the canonical instance
     rng: np.random.Generator | None
 
     def __call__(self, canonical: float, low: float, high: float) -> float:
-        """Return a number uniform in [low, high], or the canonical one."""
+        """Return a uniform sample in [low, high], or the canonical value."""
         return canonical if self.rng is None else float(self.rng.uniform(low, high))
 
     def pick(self, canonical: T, *others: T) -> T:
@@ -59,9 +56,7 @@ class Draw:
         return canonical if self.rng is None else bool(self.rng.random() < probability)
 
     def offset(self) -> Array:
-        """Return a (3,) shift into the noise, so that no two instances show the same
-        clouds.
-        """
+        """Return an offset (3,) into the noise, so that no two instances have the same clouds."""
         return (
             np.array([1.7, 9.2, 5.5])
             if self.rng is None
@@ -69,8 +64,9 @@ class Draw:
         )
 
     def colour(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
-        """Return the canonical colour; when drawing, one of those given, jittered, or
-        with chance `wild` any colour.
+        """Return a color near one of those named, or with probability `wild` any color.
+
+        Without a generator it is the canonical one.
         """
         rng = self.rng
         if rng is None:
@@ -92,8 +88,12 @@ Options = ParamSpec("Options")
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """Points to colour: positions (N, 3), chart coordinates (N,) in [0, 1], and the
-    chart's size in object units.
+    """Points that are painted.
+
+    Attributes:
+        xyz: positions (N, 3).
+        u, v: chart coordinates (N,) in [0, 1].
+        size: width and height of the chart in object units.
     """
 
     xyz: Array
@@ -109,8 +109,9 @@ Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 def painter(
     paint: Callable[Concatenate[Texels, Options], Array],
 ) -> Callable[Options, Paint]:
-    """Make of a function of texels and options one of the options alone, which returns
-    the paint (or the mask).
+    """Decorate a function of texels and options into a function of the options.
+
+    That returns the paint, or the mask.
     """
 
     @wraps(paint)
@@ -121,9 +122,7 @@ def painter(
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Return the colour made darker (factor below 1) or lighter (above 1), clipped to
-    [0, 1].
-    """
+    """Return a darker (factor below 1) or lighter (above 1) color, clipped to [0, 1]."""
     return np.clip(color * factor, 0.0, 1.0)
 
 
@@ -131,12 +130,13 @@ _LATTICE = np.random.Generator(np.random.PCG64(20)).random((16, 16, 16))
 
 
 def noise(points: Array) -> Array:
-    """Value noise: (N, 3) points to (N,) values in [0, 1], smooth at a scale of 1,
-    period 16 along each axis.
+    """Return smooth value noise (N,) in [0, 1] at points (N, 3).
+
+    Its scale is 1, and its period 16 along each axis.
     """
     cell = np.floor(points)
-    share = points - cell
-    smooth = cell + share * share * (3.0 - 2.0 * share)
+    fraction = points - cell
+    smooth = cell + fraction * fraction * (3.0 - 2.0 * fraction)
     return np.asarray(map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap"))
 
 
@@ -157,7 +157,7 @@ def step(value: Array, edge: float, soft: float) -> Array:
 
 @painter
 def solid(t: Texels, color: Color | str) -> Array:
-    """One colour."""
+    """Paint a single color."""
     return np.broadcast_to(
         hexed(color) if isinstance(color, str) else color, (len(t.u), 3)
     )
@@ -167,25 +167,23 @@ def solid(t: Texels, color: Color | str) -> Array:
 def mottled(
     t: Texels, a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0
 ) -> Array:
-    """Clouds of two colours, `scale` wide."""
-    at = t.xyz / scale + offset
-    clouds = (noise(at) + noise(at * 2.0 + 5.3) * 0.5) / 1.5
+    """Paint clouds of two colors, `scale` wide."""
+    position = t.xyz / scale + offset
+    clouds = (noise(position) + noise(position * 2.0 + 5.3) * 0.5) / 1.5
     return mix(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
 
 
 def clouded(
     color: Color, factor: float, scale: float, offset: Array, contrast: float = 2.0
 ) -> Paint:
-    """Clouds of a colour and a shade of it, `scale` wide."""
+    """Paint clouds of a color and a shade of it, `scale` wide."""
     return mottled(color, shade(color, factor), scale, offset, contrast)
 
 
 def speckled(
     base: Paint, color: Color, scale: float, offset: Array, amount: float = 0.16
 ) -> Paint:
-    """Small irregular specks on another paint; `amount` is about the share of the
-    surface they cover.
-    """
+    """Paint small irregular specks over another paint; `amount` is about their area."""
     return over(
         base,
         lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, 0.12),
@@ -197,7 +195,7 @@ def speckled(
 def gradient(
     t: Texels, a: Color, b: Color, low: float, high: float, axis: int = 2
 ) -> Array:
-    """From colour a at `low` to colour b at `high` along an axis."""
+    """Paint a gradient from color a at `low` to color b at `high` along an axis."""
     return mix(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
 
 
@@ -210,16 +208,18 @@ def wood(
     axis: int = 2,
     contrast: float = 0.45,
 ) -> Array:
-    """Wood with its grain along an axis: wobbling growth rings and fine fibres; rings
-    are about `scale` apart.
-    """
+    """Paint wood with growth rings about `scale` apart, and fibers along an axis."""
     stretch = np.full(3, 1.0 / scale)
     stretch[axis] = 0.12 / scale
-    p = t.xyz * stretch + offset
-    across = [i for i in range(3) if i != axis]
-    ring = p[:, across[0]] + 0.6 * p[:, across[1]] + 1.6 * noise(p * 0.45)
+    grain_position = t.xyz * stretch + offset
+    cross_axes = [i for i in range(3) if i != axis]
+    ring = (
+        grain_position[:, cross_axes[0]]
+        + 0.6 * grain_position[:, cross_axes[1]]
+        + 1.6 * noise(grain_position * 0.45)
+    )
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
-    fibre = noise(p * np.where(np.arange(3) == axis, 1.0, 4.0))
+    fibre = noise(grain_position * np.where(np.arange(3) == axis, 1.0, 4.0))
     grain = contrast * (0.55 * rings**2 + 0.45 * fibre)
     return np.asarray(np.clip(color * (1.0 - grain)[:, None] * 1.12, 0.0, 1.0))
 
@@ -228,16 +228,14 @@ def wood(
 def rings(
     t: Texels, a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2
 ) -> Array:
-    """Stripes across an axis; colour b takes `share` of every period."""
+    """Paint stripes across an axis; color b takes `share` of every period."""
     return mix(
         a, b, step(share / 2 - np.abs(t.xyz[:, axis] / period % 1.0 - 0.5), 0.0, 0.06)
     )
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
-    """Chart coordinates counted in cells about `cell` wide, a whole number of them
-    across the chart.
-    """
+    """Return chart coordinates in cells about `cell` wide, an integer number per chart."""
     return t.u * max(1, round(t.size[0] / cell)), t.v * max(1, round(t.size[1] / cell))
 
 
@@ -245,7 +243,7 @@ def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
 def stripes(
     t: Texels, a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0
 ) -> Array:
-    """Stripes up the chart, `cell` apart; `slant` cells of shift from bottom to top."""
+    """Paint stripes up the chart, `cell` apart; they shift by `slant` cells to the top."""
     across, _ = _cells(t, cell)
     return mix(
         a, b, step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, 0.08)
@@ -254,13 +252,13 @@ def stripes(
 
 @painter
 def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
-    """A chequer board with squares `cell` wide."""
+    """Paint a checkerboard with squares `cell` wide."""
     across, up = _cells(t, 2 * cell)
     return mix(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
 
 
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
-    """Round dots in staggered rows on another paint; radius in cells."""
+    """Paint round dots in staggered rows over another paint; the radius is in cells."""
 
     def staggered(t: Texels) -> Array:
         across, up = _cells(t, cell)
@@ -272,7 +270,7 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
 
 @painter
 def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
-    """Chevrons running around the chart, `cell` high."""
+    """Paint chevrons around the chart, `cell` high."""
     across, up = _cells(t, cell)
     return mix(
         a,
@@ -283,13 +281,13 @@ def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
 
 @painter
 def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
-    """One paint over another, where the mask is above 0."""
+    """Paint one paint over another where the mask is above 0."""
     weight = mask(t)
-    near = np.nonzero(weight)[0]
+    covered = np.nonzero(weight)[0]
     color = np.array(base(t))
-    if len(near):
-        part = Texels(t.xyz[near], t.u[near], t.v[near], t.size)
-        color[near] = mix(color[near], top(part), weight[near])
+    if len(covered):
+        covered_texels = Texels(t.xyz[covered], t.u[covered], t.v[covered], t.size)
+        color[covered] = mix(color[covered], top(covered_texels), weight[covered])
     return color
 
 
@@ -297,9 +295,7 @@ def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
 def between(
     t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02
 ) -> Array:
-    """1 where a coordinate lies between two values; the edges are `soft` wide, in
-    object units.
-    """
+    """Return the mask of texels between two values of a coordinate, with edges `soft` wide."""
     return within(t.xyz[:, axis], low, high, soft)
 
 
@@ -312,25 +308,29 @@ def facing(
     high: float,
     soft: float = 0.02,
 ) -> Array:
-    """1 on a label: within `half_width` degrees of the azimuth `degrees` about z, and
-    between two heights.
+    """Return the mask of a label between two heights.
+
+    It is within `half_width` degrees of the azimuth `degrees` about z.
     """
     weight = within(t.xyz[:, 2], low, high, soft)
-    near = np.nonzero(weight)[0]
-    angle = np.degrees(np.arctan2(t.xyz[near, 1], t.xyz[near, 0]))
-    away = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
-    weight[near] *= step(half_width - away, 0.0, 2.0)
+    in_band = np.nonzero(weight)[0]
+    angle = np.degrees(np.arctan2(t.xyz[in_band, 1], t.xyz[in_band, 0]))
+    angle_distance = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
+    weight[in_band] *= step(half_width - angle_distance, 0.0, 2.0)
     return weight
 
 
 def anything(draw: Draw, size: float) -> Paint:
-    """A paint of any kind in any colours, for instances whose texture says nothing
-    about their class, and which are about so large; `draw` must hold a generator.
+    """Sample a paint of any kind and colors, for textures that do not indicate the class.
+
+    Args:
+        draw: with a generator.
+        size: of the instance, about.
     """
-    a = draw.colour("808080", wild=1.0)
-    b = draw.colour("808080", wild=1.0)
+    first_color = draw.colour("808080", wild=1.0)
+    second_color = draw.colour("808080", wild=1.0)
     cell = size * draw(0.1, 0.05, 0.2)
-    at = draw.offset()
+    noise_offset = draw.offset()
     kind = draw.pick(
         "solid",
         "rings",
@@ -344,33 +344,56 @@ def anything(draw: Draw, size: float) -> Paint:
         "wood",
     )
     if kind == "rings":
-        return rings(a, b, cell, draw(0.5, 0.2, 0.8), axis=int(draw.pick(0, 1, 2)))
+        return rings(
+            first_color,
+            second_color,
+            cell,
+            draw(0.5, 0.2, 0.8),
+            axis=int(draw.pick(0, 1, 2)),
+        )
     if kind == "stripes":
-        return stripes(a, b, cell, draw(0.5, 0.2, 0.8), int(draw.pick(0, 1, 3)))
+        return stripes(
+            first_color,
+            second_color,
+            cell,
+            draw(0.5, 0.2, 0.8),
+            int(draw.pick(0, 1, 3)),
+        )
     if kind == "checks":
-        return checks(a, b, cell)
+        return checks(first_color, second_color, cell)
     if kind == "dots":
-        return dots(solid(a), b, cell, draw(0.3, 0.18, 0.42))
+        return dots(solid(first_color), second_color, cell, draw(0.3, 0.18, 0.42))
     if kind == "zigzag":
-        return zigzag(a, b, cell)
+        return zigzag(first_color, second_color, cell)
     if kind == "mottled":
-        return mottled(a, b, 1.5 * cell, at, draw(2.0, 1.0, 4.0))
+        return mottled(
+            first_color, second_color, 1.5 * cell, noise_offset, draw(2.0, 1.0, 4.0)
+        )
     if kind == "speckled":
-        return speckled(solid(a), b, 0.4 * cell, at, draw(0.2, 0.1, 0.4))
+        return speckled(
+            solid(first_color),
+            second_color,
+            0.4 * cell,
+            noise_offset,
+            draw(0.2, 0.1, 0.4),
+        )
     if kind == "gradient":
-        return gradient(a, b, 0.0, size, axis=int(draw.pick(0, 1, 2)))
+        return gradient(
+            first_color, second_color, 0.0, size, axis=int(draw.pick(0, 1, 2))
+        )
     if kind == "wood":
         return wood(
             draw.colour("9a6a3c", "c89b62", "5b3a22"),
             0.5 * cell,
-            at,
+            noise_offset,
             axis=int(draw.pick(0, 1, 2)),
         )
-    return solid(a)
+    return solid(first_color)
 
 
 def natural(draw: Draw, size: float, paint: Paint, wild: float = 0.35) -> Paint:
-    """Return the paint, or when drawing, with chance `wild`, one of `anything` in its
-    place.
+    """Return the paint, or with probability `wild` a sample of `anything`.
+
+    The canonical instance has the paint.
     """
     return anything(draw, size) if draw.chance(wild) else paint

@@ -54,8 +54,9 @@ HEXAGONS = shapes.unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
-    """Return (N,) distance to the nearest seam and (N,) whether the panel is a
-    pentagon, on a truncated icosahedron.
+    """Return the distance (N,) to the nearest seam of a football, and the pentagons' mask.
+
+    The panels are those of a truncated icosahedron.
     """
     # offsets of the two kinds of faces from the centre
     pentagon = direction @ PENTAGONS.T / 0.9393
@@ -88,8 +89,9 @@ def tennis_seam(d: Array) -> Array:
 def _grooved(
     patches: list[Patch], radius: float, depth: float, seam: Callable[[Array], Array]
 ) -> list[Patch]:
-    """Press the seams into the sphere; normals stay those of the sphere, the groove is
-    a shade, not an edge.
+    """Press the seams into the sphere.
+
+    Normals stay those of the sphere: the groove is a shade, not an edge.
     """
     depths = (
         depth * np.exp(-((seam(patch.vertices / radius) / 0.03) ** 2))
@@ -103,12 +105,12 @@ def _grooved(
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    away, pentagon = football_seams(shapes.unit(t.xyz))
+    seam_distance, pentagon = football_seams(shapes.unit(t.xyz))
     base = (
         mix(light, dark, pentagon.astype(np.float64))
         * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
     )
-    return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
+    return mix(hexed("3a3a3a"), base, step(seam_distance, 0.012, 0.016))
 
 
 @painter
@@ -138,6 +140,7 @@ def _star(t: Texels, radius: float) -> Array:
 
 @family(metres=0.01)
 def ball(draw: Draw) -> Instance:
+    """Make a football, or a ball of another pattern."""
     radius = 11.0
     style = draw.pick(
         "football", "beach", "basket", "tennis", "star", "plain", "wild", "wild"
@@ -193,6 +196,7 @@ def ball(draw: Draw) -> Instance:
 
 @family(metres=0.01)
 def banana(draw: Draw) -> Instance:
+    """Make a banana of random bend and ripeness."""
     length = draw(19.0, 15.0, 22.0)
     bend = draw(105.0, 65.0, 130.0)
     thick = draw(1.65, 1.45, 2.1)
@@ -251,8 +255,9 @@ def banana(draw: Draw) -> Instance:
 
 @family(metres=0.01)
 def book(draw: Draw) -> Instance:
-    """A closed hardback on its back cover; the spine runs along y at -x, the pages show
-    at the other three sides.
+    """Make a closed hardback that lies on its back cover.
+
+    The spine runs along y at -x; the pages show at the other three sides.
     """
     width = draw(15.5, 12.0, 18.0)
     height = 22.5
@@ -324,8 +329,9 @@ def book(draw: Draw) -> Instance:
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
-    """Extrude the spine's section along y: its outer curve (K, 2) upwards in (x, z),
-    its inner one downwards.
+    """Extrude the section of the spine along y.
+
+    Its outer curve (K, 2) goes upwards in (x, z), its inner one downwards.
     """
     loop = np.concatenate([outer, inner])[::-1]
     frame = (
@@ -369,6 +375,7 @@ def _front(
     height: float,
     thick: float,
 ) -> Paint:
+    """Paint the front cover with a title and decoration."""
     accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:
@@ -404,9 +411,9 @@ def _front(
         lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
         color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
         if title != "picture":
-            away = np.hypot(x, y + 0.16 * height)
-            seal = step(0.14 * width - away, 0.0, 0.12) - step(
-                0.1 * width - away, 0.0, 0.12
+            center_distance = np.hypot(x, y + 0.16 * height)
+            seal = step(0.14 * width - center_distance, 0.0, 0.12) - step(
+                0.1 * width - center_distance, 0.0, 0.12
             )
             color = mix(color, gold, seal * top)
         return color
@@ -414,7 +421,8 @@ def _front(
     return paint
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ---- stop sign
+# ----------------------------------------------------------------------------------
 # A stop sign as it stands at road works, on a low stand. Units are metres; it is read
 # from +x.
 #
@@ -422,24 +430,59 @@ def _front(
 # tall post the box of all that is there would be another one.
 
 _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
-    "S": [[(0.58, 0.82), (0.48, 0.97), (0.12, 0.97), (0.02, 0.84), (0.02, 0.66), (0.12, 0.54),
-           (0.48, 0.46), (0.58, 0.34), (0.58, 0.16), (0.48, 0.03), (0.12, 0.03), (0.02, 0.18)]],
+    "S": [
+        [
+            (0.58, 0.82),
+            (0.48, 0.97),
+            (0.12, 0.97),
+            (0.02, 0.84),
+            (0.02, 0.66),
+            (0.12, 0.54),
+            (0.48, 0.46),
+            (0.58, 0.34),
+            (0.58, 0.16),
+            (0.48, 0.03),
+            (0.12, 0.03),
+            (0.02, 0.18),
+        ]
+    ],
     "T": [[(0.0, 0.97), (0.6, 0.97)], [(0.3, 0.97), (0.3, 0.0)]],
-    "O": [[(0.02, 0.2), (0.02, 0.8), (0.14, 0.97), (0.46, 0.97), (0.58, 0.8), (0.58, 0.2), (0.46, 0.03), (0.14, 0.03),
-           (0.02, 0.2)]],
-    "P": [[(0.04, 0.0), (0.04, 0.97), (0.46, 0.97), (0.58, 0.85), (0.58, 0.58), (0.46, 0.46), (0.04, 0.46)]],
-}  # fmt: skip
+    "O": [
+        [
+            (0.02, 0.2),
+            (0.02, 0.8),
+            (0.14, 0.97),
+            (0.46, 0.97),
+            (0.58, 0.8),
+            (0.58, 0.2),
+            (0.46, 0.03),
+            (0.14, 0.03),
+            (0.02, 0.2),
+        ]
+    ],
+    "P": [
+        [
+            (0.04, 0.0),
+            (0.04, 0.97),
+            (0.46, 0.97),
+            (0.58, 0.85),
+            (0.58, 0.58),
+            (0.46, 0.46),
+            (0.04, 0.46),
+        ]
+    ],
+}
 FINISHES = {
-    "face": assets.Material(roughness=0.35, clearcoat=0.4), "metal": assets.Material(roughness=0.5, metallic=0.6),
-    "post": assets.Material(roughness=0.45, metallic=0.7), "rubber": assets.Material(roughness=0.85),
-}  # fmt: skip
+    "face": assets.Material(roughness=0.35, clearcoat=0.4),
+    "metal": assets.Material(roughness=0.5, metallic=0.6),
+    "post": assets.Material(roughness=0.45, metallic=0.7),
+    "rubber": assets.Material(roughness=0.85),
+}
 
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """The word in white on red, with a white rim. Octagon of a circumradius, painted
-    before it is raised.
-    """
+    """Paint the word in white on red, with a white rim, on an octagon before it is raised."""
     inner = radius * np.cos(np.pi / 8)
     turns = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     y = t.xyz[:, 1]
@@ -460,6 +503,7 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 
 @family(metres=1.0, texels=192)
 def stop_sign(draw: Draw) -> Instance:
+    """Make a stop sign on a post."""
     radius = draw(0.45, 0.4, 0.5)
     height = draw(0.74, 0.66, 0.84)
     red = draw.colour("b3121d", "a8161f", "c0202a", wild=0.0)

@@ -45,8 +45,9 @@ def _claw(
     return patches
 
 
-def _along_y(*places: float) -> Array:
-    return np.array([(0.0, place, 0.0) for place in places])
+def _along_y(*positions: float) -> Array:
+    """Return points (K, 3) on the y axis."""
+    return np.array([(0.0, y, 0.0) for y in positions])
 
 
 def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
@@ -72,8 +73,9 @@ def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
 
 @family(metres=0.01)
 def hammer(draw: Draw) -> Instance:
-    """The handle runs along -x from the head at the origin; the head lies along y, its
-    striking face at -y.
+    """Make a hammer whose handle runs along -x, and whose head lies along y.
+
+    The head is at the origin, and its striking face at -y.
     """
     half = draw(1.35, 1.15, 1.7)
     length = draw(27.0, 20.0, 31.0)
@@ -202,9 +204,7 @@ def hammer(draw: Draw) -> Instance:
 def _weights(
     draw: Draw, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
-    """One weight on the +x end of the bar, from x = at outwards, built along z and laid
-    down afterwards.
-    """
+    """Create the weight on the +x end of the bar, built along z and rotated afterwards."""
     if style == "hex":
         path = [
             (0, 0, at),
@@ -256,6 +256,7 @@ def _weights(
 
 @family(metres=0.01)
 def dumbbell(draw: Draw) -> Instance:
+    """Make a dumbbell with weights of random shape."""
     style = draw.pick("hex", "plates", "hex", "round", "globe")
     radius = draw(4.6, 3.6, 6.2)
     grip = draw(5.6, 5.0, 7.0)

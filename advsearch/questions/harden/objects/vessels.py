@@ -1,6 +1,4 @@
-"""Open containers turned about an axis: mug, bowl, bottle, vase, wine glass. Units are
-centimetres.
-"""
+"""Open containers of revolution: mug, bowl, bottle, vase, wine glass; in centimeters."""
 
 from __future__ import annotations
 
@@ -46,9 +44,15 @@ def handle(
     profile: Array,
     inset: float,
 ) -> list[Patch]:
-    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that
-    reaches so far out between the heights of its roots, inset in the wall: "round",
-    "ear" (widest at the top), "square" or "loop" (small).
+    """Create a handle in the x-z plane, on the +x side of a wall.
+
+    Args:
+        draw: samples its thickness.
+        style: "round", "ear" (widest at the top), "square" or "loop" (small).
+        low, high: heights of its roots.
+        reach: its extent from the wall.
+        profile: of the wall (K, 2).
+        inset: depth of the roots inside the wall.
     """
     at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
@@ -70,10 +74,14 @@ def handle(
         }[style]
         span = high - low
         knots = [
-            (at_high, high), (edge + 0.45 * reach, high + 0.04 * span), (edge + tops[0] * reach, high - 0.16 * span),
-            (edge + tops[1] * reach, (low + high) / 2), (edge + tops[2] * reach, low + 0.18 * span),
-            (edge + 0.3 * reach, low + 0.03 * span), (at_low, low),
-        ]  # fmt: skip
+            (at_high, high),
+            (edge + 0.45 * reach, high + 0.04 * span),
+            (edge + tops[0] * reach, high - 0.16 * span),
+            (edge + tops[1] * reach, (low + high) / 2),
+            (edge + tops[2] * reach, low + 0.18 * span),
+            (edge + 0.3 * reach, low + 0.03 * span),
+            (at_low, low),
+        ]
         curve = shapes.spline(knots, 26)
     thick = draw(0.42, 0.32, 0.6)
     broad = draw(0.62, 0.4, 0.95)
@@ -141,6 +149,7 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
 
 @family(metres=0.01)
 def mug(draw: Draw) -> Instance:
+    """Make a mug with a handle."""
     height = draw(9.4, 7.6, 12.0)
     top = draw(4.15, 3.6, 5.0)
     foot = top * draw(0.93, 0.72, 1.02)
@@ -159,13 +168,25 @@ def mug(draw: Draw) -> Instance:
 
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
-    grip_low = height * (
-        draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3)
-    )
+    if style == "loop":
+        grip_low = height * draw(0.3, 0.34, 0.42)
+    else:
+        grip_low = height * draw(0.2, 0.16, 0.3)
     grip = handle(
         draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall
     )
 
+    paints = _mug_paints(draw, height)
+    patches = shapes.placed(
+        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
+    )
+    return Instance(
+        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
+    )
+
+
+def _mug_paints(draw: Draw, height: float) -> dict[str, Paint]:
+    """Sample the paints of a mug."""
     offset = draw.offset()
     clay = draw.colour(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
@@ -179,26 +200,24 @@ def mug(draw: Draw) -> Instance:
     outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
     inner = outer
     if not draw.chance(0.15):
-        inner = (
-            solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
-            if draw.chance(0.5, True)
-            else glaze
-        )
-    raw = solid("a98663")
-    paints = {
-        "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw) if draw.chance(0.4, True) else outer,
-        "inside": inner, "base": raw, "handle": draw.pick(glaze, outer, accent),
-    }  # fmt: skip
-    patches = shapes.placed(
-        [*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK
-    )
-    return Instance(
-        patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
-    )
+        inner = glaze
+        if draw.chance(0.5, True):
+            inner = solid(draw.colour("efe6d4", "f3f1ec", wild=0.3))
+    raw_clay = solid("a98663")
+    outside = outer
+    if draw.chance(0.4, True):
+        outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
+    return {
+        "outside": outside,
+        "inside": inner,
+        "base": raw_clay,
+        "handle": draw.pick(glaze, outer, accent),
+    }
 
 
 @family(metres=0.01)
 def bowl(draw: Draw) -> Instance:
+    """Make a bowl."""
     radius = 8.0
     height = radius * draw(0.86, 0.6, 1.0)
     foot = radius * draw(0.42, 0.34, 0.55)
@@ -206,9 +225,12 @@ def bowl(draw: Draw) -> Instance:
     full = draw(0.86, 0.72, 0.97)  # how far out the wall already is at half height
     flare = draw(0.0, -0.03, 0.1) * radius
     knots = [
-        (foot * 1.04, ring), (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
-        (radius * full, 0.55 * height), (radius * (0.5 + 0.5 * full), 0.8 * height), (radius + flare, height),
-    ]  # fmt: skip
+        (foot * 1.04, ring),
+        (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
+        (radius * full, 0.55 * height),
+        (radius * (0.5 + 0.5 * full), 0.8 * height),
+        (radius + flare, height),
+    ]
     body = shapes.vessel(
         np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
         draw(0.45, 0.32, 0.65),
@@ -240,6 +262,7 @@ def bowl(draw: Draw) -> Instance:
 
 @family(metres=0.01)
 def bottle(draw: Draw) -> Instance:
+    """Make a bottle with a cap and perhaps a label."""
     height = draw(30.0, 24.0, 32.0)
     radius = draw(3.75, 3.0, 4.8)
     neck = draw(1.35, 1.0, 1.7)
@@ -248,10 +271,16 @@ def bottle(draw: Draw) -> Instance:
     slope = draw(0.35, 0.1, 0.8)  # 0: square shoulder, 1: sloping
     taper = draw(1.0, 0.93, 1.03)
     corners = [
-        (radius * 0.82, 0.0), (radius * taper, 0.02 * height), (radius, shoulder),
-        (neck + (radius - neck) * (0.55 - 0.35 * slope), shoulder + rise * (0.6 - 0.25 * slope)),
-        (neck * 1.03, shoulder + rise), (neck * 0.95, height - 1.6),
-    ]  # fmt: skip
+        (radius * 0.82, 0.0),
+        (radius * taper, 0.02 * height),
+        (radius, shoulder),
+        (
+            neck + (radius - neck) * (0.55 - 0.35 * slope),
+            shoulder + rise * (0.6 - 0.25 * slope),
+        ),
+        (neck * 1.03, shoulder + rise),
+        (neck * 0.95, height - 1.6),
+    ]
     curve = shapes.rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
     wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
     ring = [
@@ -285,9 +314,11 @@ def bottle(draw: Draw) -> Instance:
             speckled(solid(foil), shade(foil, 1.3), 0.5, offset),
         )
     paints = {
-        "outside": outer, "inside": solid(shade(glass, 0.6)), "base": solid(glass),
+        "outside": outer,
+        "inside": solid(shade(glass, 0.6)),
+        "base": solid(glass),
         "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
-    }  # fmt: skip
+    }
     return Instance(
         shapes.placed(patches, BACK),
         paints,
@@ -297,6 +328,7 @@ def bottle(draw: Draw) -> Instance:
 
 
 def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
+    """Create the cap of a bottle."""
     low = height - draw(1.5, 0.9, 2.2)
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
@@ -314,8 +346,9 @@ def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
 def _labelled(
     draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float
 ) -> Paint:
-    """A paper label opposite the texture's seam, with a frame, a title bar, lines of
-    text and a round seal.
+    """Paint a paper label opposite the texture's seam.
+
+    It has a frame, a title bar, lines of text and a round seal.
     """
     at = 180.0
     half = draw(95.0, 60.0, 180.0)
@@ -349,14 +382,15 @@ def _labelled(
             (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - at + 180.0) % 360.0 - 180.0
         )
         radius = float(np.hypot(xyz[:, 0], xyz[:, 1]).max())
-        away = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
-        return step(0.09 * span - away, 0.0, 0.08)
+        center_distance = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
+        return step(0.09 * span - center_distance, 0.0, 0.08)
 
     return over(label, seal, solid("b08d3c"))
 
 
 @family(metres=0.01)
 def vase(draw: Draw) -> Instance:
+    """Make a vase, perhaps with handles."""
     height = 24.0
     foot = draw(3.6, 2.6, 4.4)
     belly = draw(7.2, 5.2, 8.6)
@@ -365,9 +399,14 @@ def vase(draw: Draw) -> Instance:
     neck_at = height * draw(0.84, 0.78, 0.88)
     lip = neck + draw(1.5, 0.5, 2.6)
     knots = [
-        (foot, 0.0), (foot * 0.97, 0.5), (0.45 * foot + 0.55 * belly, 0.48 * belly_at), (belly, belly_at),
-        (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at), (neck, neck_at), (lip, height),
-    ]  # fmt: skip
+        (foot, 0.0),
+        (foot * 0.97, 0.5),
+        (0.45 * foot + 0.55 * belly, 0.48 * belly_at),
+        (belly, belly_at),
+        (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at),
+        (neck, neck_at),
+        (lip, height),
+    ]
     profile = shapes.spline(knots, 34)
     patches = shapes.vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
     if draw.chance(0.25):
@@ -397,9 +436,7 @@ def vase(draw: Draw) -> Instance:
 
 
 def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint:
-    """Blue brushwork on white for the canonical vase; glazes, bands and drips for the
-    others.
-    """
+    """Paint blue brushwork on the canonical vase; glazes, bands and drips on others."""
     ink = draw.colour("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
         return _ceramic(draw, height, glaze, clouded(ink, 1.3, 3.0, offset))
@@ -434,6 +471,7 @@ def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint
 
 @family(metres=0.01)
 def wine_glass(draw: Draw) -> Instance:
+    """Make a wine glass, perhaps with wine."""
     foot = draw(3.5, 2.9, 4.2)
     stem = draw(0.42, 0.32, 0.6)
     stem_top = draw(9.5, 6.0, 12.0)
@@ -456,9 +494,12 @@ def wine_glass(draw: Draw) -> Instance:
         (stem * 1.1, 0.92 * stem_top),
     ]
     cup = [
-        (0.5 * bowl, stem_top + 0.07 * deep), (0.86 * bowl, stem_top + 0.2 * deep), (bowl, stem_top + wide_at * deep),
-        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep), (mouth, stem_top + deep),
-    ]  # fmt: skip
+        (0.5 * bowl, stem_top + 0.07 * deep),
+        (0.86 * bowl, stem_top + 0.2 * deep),
+        (bowl, stem_top + wide_at * deep),
+        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep),
+        (mouth, stem_top + deep),
+    ]
     outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
     normal = np.gradient(outer, axis=0)
     normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(
@@ -473,34 +514,40 @@ def wine_glass(draw: Draw) -> Instance:
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     profile = [
-        ("foot", shapes.dense(under, 1.5)), ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
-        ("bowl", np.concatenate([outer, lip, inner[:1]])), ("inside", inner),
+        ("foot", shapes.dense(under, 1.5)),
+        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
+        ("bowl", np.concatenate([outer, lip, inner[:1]])),
+        ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
-    ]  # fmt: skip
+    ]
     body = shapes.lathe(profile, 52)
-    height = stem_top + deep
+    paints = _glass_paints(draw, stem_top, deep)
+    return Instance(
+        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
+    )
+
+
+def _glass_paints(draw: Draw, stem_top: float, depth: float) -> dict[str, Paint]:
+    """Sample the paints of a glass with a stem of a height and a bowl of a depth."""
+    height = stem_top + depth
     tint = draw.colour(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
     )
     drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
-    level = stem_top + deep * draw(0.48, 0.3, 0.62)
+    level = stem_top + depth * draw(0.48, 0.3, 0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
     outside = inside = plain
     if draw.chance(0.5, True):
         wine = clouded(drink, 0.8, 3.0, draw.offset())
-        outside = over(plain, between(stem_top + 0.06 * deep, level, soft=0.1), wine)
+        outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
     outside = natural(draw, height, outside, 0.3)
     if draw.chance(0.2, True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
         )
-    foot_paint = (
-        draw.pick(plain, outside, plain)
-        if draw.chance(0.7, True)
-        else anything(draw, height)
-    )
-    paints = {"foot": foot_paint, "bowl": outside, "inside": inside}
-    return Instance(
-        shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12)
-    )
+    if draw.chance(0.7, True):
+        foot_paint = draw.pick(plain, outside, plain)
+    else:
+        foot_paint = anything(draw, height)
+    return {"foot": foot_paint, "bowl": outside, "inside": inside}
