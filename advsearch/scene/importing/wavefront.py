@@ -113,7 +113,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     colors = _colors(lines, tables["v"], notes)
     if colors is not None:
         colors = colors[position.at]
-    has_uvs = (uv.at >= 0).all(axis=1)
+    has_uvs = np.asarray((uv.at >= 0).all(axis=1))
     square = _find_squares(reader, names, material, uv)
 
     parts = []
