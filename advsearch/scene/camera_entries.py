@@ -221,7 +221,7 @@ def _float(value: object) -> float:
 
 def _flat(value: object) -> list[Any]:
     """Return the values of a list of lists, of a list, or of a single value."""
-    values = []
+    values: list[Any] = []
     for row in value if isinstance(value, list) else [value]:
         values += row if isinstance(row, list) else [row]
     return values

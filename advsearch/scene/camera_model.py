@@ -101,12 +101,8 @@ class CameraModel:
         """
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            longitude = torch.atan2(x, z)
-            latitude = torch.atan2(y, torch.hypot(x, z))
-            column = 0.5 + longitude / (2.0 * torch.pi)
-            row = 0.5 + latitude / torch.pi
             # All but NaN are visible.
-            return torch.stack([column, row], dim=-1), x == x
+            return _project_to_panorama(x, y, z), x == x
         if self.kind == FISHEYE:
             distance = torch.hypot(x, y)
             angle = torch.atan2(distance, z)
@@ -139,16 +135,8 @@ class CameraModel:
         """
         u, v = places.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            longitude = (u - 0.5) * (2.0 * torch.pi)
-            latitude = (v - 0.5) * torch.pi
-            level = latitude.cos()
-            directions = torch.stack(
-                [level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1
-            )
-            return directions, torch.ones_like(u)
-        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
-        y = (v - cy) / fy
-        distorted = torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
+            return _panorama_directions(u, v), torch.ones_like(u)
+        distorted = self._to_distorted(u, v)
         radius = distorted.norm(dim=-1)
         direction_2d = distorted / radius.clamp_min(1e-300)[..., None]
         bound = min(self._last, FAR)
@@ -170,6 +158,12 @@ class CameraModel:
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
         )
         return directions, _inside(max_radius - radius, converged)
+
+    def _to_distorted(self, u: Tensor, v: Tensor) -> Tensor:
+        """Return distorted points (N, 2) at image coordinates (N,): invert `LINEAR`."""
+        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
+        y = (v - cy) / fy
+        return torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
 
     def table(self, places: Tensor) -> Tensor:
         """Return rays of image coordinates (N, 2) in the axes of Mitsuba's cameras.
@@ -457,6 +451,25 @@ def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
         FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, reach=90.0),
         EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, panorama, EQUIRECTANGULAR),
     }
+
+
+def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Return image coordinates (N, 2) of points in an equirectangular image."""
+    longitude = torch.atan2(x, z)
+    latitude = torch.atan2(y, torch.hypot(x, z))
+    column = 0.5 + longitude / (2.0 * torch.pi)
+    row = 0.5 + latitude / torch.pi
+    return torch.stack([column, row], dim=-1)
+
+
+def _panorama_directions(u: Tensor, v: Tensor) -> Tensor:
+    """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
+    longitude = (u - 0.5) * (2.0 * torch.pi)
+    latitude = (v - 0.5) * torch.pi
+    level = latitude.cos()
+    return torch.stack(
+        [level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1
+    )
 
 
 def _evaluated(polynomial: Polynomial, x: Tensor) -> Tensor:

@@ -94,8 +94,8 @@ def advice(path: Path) -> str | None:
     ..."``.
     """
     suffix = path.suffix.lower()
-    for kind, (operator, suffixes) in BLENDER_READS.items():
-        if suffix in suffixes:
+    for kind, (operator, blender_suffixes) in BLENDER_READS.items():
+        if suffix in blender_suffixes:
             return f"{kind}: {_blender_advice(path, operator)}"
     if suffix == ".bin":
         gltf_file = ""

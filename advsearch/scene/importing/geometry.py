@@ -232,13 +232,13 @@ def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
 
 def _wound(soup: Soup, notes: Notes) -> Soup:
     """Return the soup with consistent and outward winding, and note the changes."""
-    is_turned, shell, is_one_sided = _agreement(soup)
+    is_turned, shell, has_moebius_strip = _agreement(soup)
     if is_turned.any():
         notes.say(
             f"{int(is_turned.sum())} faces wound against their neighbours were turned "
             "over"
         )
-    if is_one_sided:
+    if has_moebius_strip:
         notes.say(
             "has a one-sided surface (a Moebius strip), so some faces show their backs"
         )

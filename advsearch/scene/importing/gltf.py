@@ -303,7 +303,7 @@ def _check_tree(path: Path, header: Header) -> None:
         for mesh in header.meshes
     ]
     primitives = [len(mesh.primitives) for mesh in header.meshes]
-    drawn_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
+    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
     children: set[int] = set()
     for node in header.nodes:
         for child in node.children:
@@ -312,12 +312,12 @@ def _check_tree(path: Path, header: Header) -> None:
                     path, "nodes with one parent each", f"two for node {child}"
                 )
             children.add(child)
-    n_drawn_triangles = sum(triangles[mesh] for mesh in drawn_meshes)
-    check_faces(path, max(n_drawn_triangles, sum(triangles)))
-    n_drawn = sum(primitives[mesh] for mesh in drawn_meshes)
+    n_instanced_triangles = sum(triangles[mesh] for mesh in instanced_meshes)
+    check_faces(path, max(n_instanced_triangles, sum(triangles)))
+    n_instanced = sum(primitives[mesh] for mesh in instanced_meshes)
     check_most(
         path,
-        max(n_drawn, sum(primitives), len(header.nodes)),
+        max(n_instanced, sum(primitives), len(header.nodes)),
         LARGEST_TREE,
         "glTF of at most {} nodes and pieces",
     )

@@ -499,8 +499,7 @@ class GltfSurfaces:
         Returns:
             The images, and scale and shift of texture coordinates.
         """
-        low, high = bounds
-        reaches_out = low < -BEYOND or high > 1.0 + BEYOND
+        reaches_out = bounds[0] < -BEYOND or bounds[1] > 1.0 + BEYOND
         edges_differ = any(_edges_differ(image, axis) for image in images)
         wrap = wraps[0]
         if reaches_out and len(set(wraps)) > 1:
@@ -520,7 +519,23 @@ class GltfSurfaces:
         )
         if not is_padded or not (reaches_out or edges_differ):
             return images, 1.0, 0.0
+        has_border = wrap == gltf_entries.BORDER and reaches_out
+        return self._pad_images(images, axis, bounds, normals_index, has_border)
 
+    def _pad_images(
+        self,
+        images: list[Floats],
+        axis: int,
+        bounds: tuple[float, float],
+        normals_index: int | None,
+        has_border: bool,
+    ) -> tuple[list[Floats], float, float]:
+        """Pad images along an axis as far as texture coordinates reach.
+
+        Arguments and result are those of `_fit_axis`; `has_border` is whether pads are
+        black (flat in a normal map), and otherwise repeat the edge.
+        """
+        low, high = bounds
         sizes = [image.shape[axis] for image in images]
         # A pad is an integer number of texels in every image.
         unit_size = int(np.gcd.reduce(sizes))
@@ -530,7 +545,6 @@ class GltfSurfaces:
         if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
             self.notes.say(EDGES)
             return images, 1.0, 0.0
-        has_border = wrap == gltf_entries.BORDER and reaches_out
         padded = []
         for index, image in enumerate(images):
             border = None

@@ -312,13 +312,20 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
                 f"splats, a model that {SPLATS}"
             )
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
+    return _make_parts(reader, points, _texture_names(comments))
+
+
+def _make_parts(
+    reader: _Properties, points: Doubles, texture_names: Sequence[str]
+) -> list[ImportedPart]:
+    """Return the faces of a file as parts, given its points (N, 3) and textures."""
+    notes = reader.notes
     corners, corner_counts = reader.polygons(len(points))
     triangles, polygon = cut_up(points[corners], corner_counts, notes)
     position = Looked(points, corners[triangles])
     normals = reader.columns("vertex", (("nx", "ny", "nz"),))
     normal = None if normals is None else Looked(normals, position.at)
     uvs = reader.mapped(corners, corner_counts, triangles)
-    texture_names = _texture_names(comments)
     texture = reader.texture_numbers(texture_names, corners, corner_counts)[polygon]
     colors = reader.colors(position.at, polygon)
     # Index -1, of faces without texture, is the last surface.

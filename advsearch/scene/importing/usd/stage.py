@@ -404,11 +404,11 @@ class Conversion:
         reading.check_faces(self.source, self.triangles, "more")
         triangles, face, _ = reading.triangulated(points[corners], counts)
         holes = _array(_first(mesh, "HoleIndices"), np.int64)
-        is_kept = ~np.isin(face, holes)
-        triangles = triangles[is_kept]
+        is_solid = ~np.isin(face, holes)
+        triangles = triangles[is_solid]
         if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
             triangles = triangles[:, ::-1]
-        return triangles, face[is_kept]
+        return triangles, face[is_solid]
 
     def _normals(
         self, mesh: Any, primvars: Any, points: Array, triangles: Array
