@@ -463,7 +463,8 @@ def _channel(picture: Floats, use: MapUse) -> Floats:
     if channel is None and has_alpha and picture[:, :, 3].min() < 1.0:
         channel = 3
     if channel is None or (channel == 3 and not has_alpha):
-        return picture[:, :, :3].mean(axis=2)
+        mean: Floats = picture[:, :, :3].mean(axis=2)
+        return mean
     return picture[:, :, channel]
 
 

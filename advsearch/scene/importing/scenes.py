@@ -110,9 +110,9 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     object_nodes = header.below([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = {
-        index: header.lights[light]
+        index: header.lights[light_index]
         for index in node_poses
-        if (light := header.nodes[index].lamp) is not None
+        if (light_index := header.nodes[index].lamp) is not None
     }
     n_others = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_others + len(lights))
