@@ -1,9 +1,8 @@
-"""Camera files of other tools, as the entries that OpenCV's have, and the names of
-those that are not read.
+"""Translation of camera files of other tools to the entries of OpenCV's files.
 
-Read, as the mapping is exact: ORB-SLAM and stella_vslam, KITTI's calibration,
-RealSense, OpenSfM and OpenDroneMap, and Metashape's `<calibration>`. Principal points
-come out from the centre of the first pixel, as OpenCV counts them.
+The mapping is exact for ORB-SLAM and stella_vslam, KITTI's calibration, RealSense,
+OpenSfM and OpenDroneMap, and Metashape's `<calibration>`. Principal points are measured
+from the center of the first pixel, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ OTHER_PROJECTIONS: Mapping[str, str] = {
     "cylindrical": "a cylinder",
     "equisolid_fisheye": "an equisolid fisheye",
 }
-"""What models are that no reader has, by the names that tools give them."""
+"""Descriptions of models that are not supported, by the names that tools give them."""
 
 OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
     (
@@ -84,9 +83,7 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
         "export the registration as COLMAP's text, and give cameras.txt",
     ),
 )
-"""Texts that are no camera files of ours: how they begin, what they are, and what to
-do.
-"""
+"""Formats that are not read: a pattern of how they begin, a description, and advice."""
 
 METASHAPE_FILE = "calibration"
 METASHAPE_PROJECT = ("document", "chunk", "sensors", "sensor")
@@ -130,27 +127,23 @@ METASHAPE_KINDS = {
 
 
 def describe_projection(name: str) -> str:
-    """Return what a model is, and what to do, to follow its name in an error; empty
-    where it is not known.
-    """
+    """Describe an unsupported model, to follow its name in an error; "" if unknown."""
     known = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
     return "" if known is None else f", {known}, another projection; {FIT_FISHEYE}"
 
 
 def check_text_format(path: str, text: str) -> None:
-    """Raise FileFormatError for a text in a known format that is not read: what it is,
-    and what to do.
-    """
+    """Raise FileFormatError for a text in a known format that is not read."""
     start = text.lstrip()[:2000]
-    for pattern, what, how in OTHER_FORMATS:
+    for pattern, description, advice in OTHER_FORMATS:
         if re.match(pattern, start):
-            raise FileFormatError(f"{path}: expected a camera file, got {what}; {how}")
+            raise FileFormatError(
+                f"{path}: expected a camera file, got {description}; {advice}"
+            )
 
 
 def check_xml_root(path: str, tag: str) -> None:
-    """Raise FileFormatError for the root of an XML file that has no camera by
-    itself.
-    """
+    """Raise FileFormatError for an XML file of Metashape that is no single camera."""
     if tag in METASHAPE_PROJECT:
         raise FileFormatError(
             f"{path}: expected one camera, got Metashape's <{tag}>, with sensors and "
@@ -163,11 +156,19 @@ def check_xml_root(path: str, tag: str) -> None:
 def translate_entries(
     path: str, which: str, data: Mapping[str, Any]
 ) -> dict[str, Any] | None:
-    """Return the entries of one camera as OpenCV's files name them, or None where the
-    file is of no other tool here.
+    """Translate the entries of one camera to those of OpenCV's files.
 
-    Raises FileFormatError: a projection that is none of ours, several cameras of which
-    none is named, or numbers that are missing.
+    Args:
+        path: the file.
+        which: the name of the camera, "" if none is named.
+        data: all entries of the file.
+
+    Returns:
+        The entries, or None if the file is not of a tool that is translated here.
+
+    Raises:
+        FileFormatError: it has another projection, several cameras of which none is
+            named, or lacks numbers.
     """
     orbslam_cameras = [match[1] for name in data if (match := ORBSLAM.fullmatch(name))]
     if orbslam_cameras:
@@ -231,10 +232,10 @@ def _translate_orbslam(
 
 
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entries with the matrices of KITTI's cameras, by the cameras' names.
+    """Return the names of the matrices of KITTI's cameras, by the cameras' names.
 
-    Its numbers have blanks between them, and so are text; a list is the P1 of a stereo
-    pair of OpenCV's.
+    Its numbers are separated by blanks, and so are text; a list is the P1 of a stereo
+    pair of OpenCV.
     """
     cameras = dict[str, str]()
     for name, value in data.items():
@@ -351,9 +352,10 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Agisoft Metashape's manual, appendix "Camera models": offsets are from the middle
-    of the picture, p1 and p2 stand the other way round than OpenCV's, and k4 is the
-    fourth of a polynomial.
+    """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
+
+    Offsets are from the center of the image, p1 and p2 are swapped against OpenCV, and
+    k4 is the fourth coefficient of a polynomial.
     """
     stated = str(data.get("projection", "frame"))
     value = {
@@ -362,8 +364,8 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     }
     width, height = (number(path, side, data.get(side)) for side in ("width", "height"))
     entries = {
-        name: given
-        for name, given in data.items()
+        name: entry
+        for name, entry in data.items()
         if name not in (*value, "projection", "width", "height")
     }
     kind = METASHAPE_KINDS.get(stated, stated)

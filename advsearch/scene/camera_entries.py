@@ -1,6 +1,6 @@
-"""The entries of a camera file by name, and the model that their numbers make.
+"""The entries of a camera file by name, and the camera model of their numbers.
 
-What nobody asked for is named, or refused where it makes another picture.
+An entry that is not read is noted, or rejected if it changes the image.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from advsearch.scene.camera_model import (
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.unread import TrackedKeys, join_names
 
-MOST_PIXELS = 1 << 16  # largest side of a picture
-# of coefficients, and of focal lengths in sides of the picture
+MOST_PIXELS = 1 << 16  # limit of the sides of an image
+# Limits of coefficients, and of focal lengths in sides of the image.
 LARGEST_COEFFICIENT = 1e4
 LARGEST_FOCAL = 1e3
 BENDS = re.compile(
@@ -31,37 +31,36 @@ BENDS = re.compile(
     r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
-"""Entries, by their plain names, that make another picture: in none of the models that
-are read, they are refused.
-"""
-# pictures made of its own ones
+"""Plain names of entries that change the image, and are rejected unless they are read."""
+# Plain names of entries about rectified images.
 OF_RECTIFIED = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
 QUIET = re.compile(
-    # who made it, when, and how well
+    # Who made it, when, and how accurately.
     r"camera(name|id|info|label|serial.*|index)?|camname|name|label|sensor(type|name|id)?|serial(number)?|comment|version"
     r"|header|stamp|frameid|seq|rostopic|topic|ratehz|fps|framerate|calibration(time|date|flags)|date|time|flags(value)?"
     r"|(nr?|numberof)?(of)?frames(count)?|nrof(frames|images)|nimages|(avg|mean)?reprojectionerrors?|rms(error)?|error"
     r"|avgreprojectionerror|perviewreprojectionerrors?|imagepoints|gridpoints|objectpoints|imagelist"
     r"|board.*|square(size)?|pattern.*|marker.*|aspectratio|fixaspectratio|fixprincipalpoint.*|zerotangent.*"
-    # where the camera is
+    # The pose of the camera.
     r"|t(bs|cam.*|imu.*|cn.*|bc.*|ic.*|bodycam.*)|extrinsic.*|[rt]vecs?|camoverlaps|timeshift.*"
 )
-"""Entries, by their plain names, that make no other picture and need no word."""
+"""Plain names of entries that do not change the image and need no note."""
 MATRIX_KEYS = frozenset(("rows", "cols", "dt", "data", "sizes", "type_id"))
 
 
 def plain(name: str) -> str:
-    """A name in small letters, without what formats put between its words."""
+    """Return a name in lower case, without separators between its words."""
     return re.sub(r"[-_\s.]", "", name).lower()
 
 
 class Entries:
-    """The entries of a camera in the file of a path, by plain names.
+    """The entries of a camera file by plain names, with a record of which are read.
 
-        entries.get("cameramatrix", "k")   # the first that is there; None where none is
-        entries.told()                     # what is said of those that nobody got
+        entries.get("cameramatrix", "k")   # the first that has a value, or None
+        entries.told()                     # the entries that were not read
 
-    Raises FileFormatError: two of them have one name but for case and underscores.
+    Raises:
+        FileFormatError: two entries have the same plain name.
     """
 
     def __init__(self, path: str, given: Mapping[str, Any]) -> None:
@@ -72,28 +71,38 @@ class Entries:
             raise FileFormatError(
                 f"{path}: has {shown(first)} and {shown(other)}; leave one of them out"
             )
+        # Keys of matrices that are not read.
         self._odd: list[str] = []
 
     def get(self, *names: str) -> Any:
-        """Return the first of these entries that has a value."""
+        """Return the first of some entries that has a value, or None."""
         return self._keys.get(*names)
 
     def there(self, name: str, names: Sequence[str] = ()) -> Any:
-        """Return an entry, or the first of several names for it. Raises
-        FileFormatError: there is none.
+        """Return an entry that is required, or the first of several names for it.
+
+        Raises:
+            FileFormatError: there is none.
         """
         value = self.get(*(names or (plain(name),)))
         if value is None:
             spelled = [self._keys.spelled(key) for key, _ in self._keys.items()]
-            has = join_names(spelled, 8) or "nothing"
-            raise FileFormatError(f"{self.path}: expected {name}, got {has}; add it")
+            got = join_names(spelled, 8) or "nothing"
+            raise FileFormatError(f"{self.path}: expected {name}, got {got}; add it")
         return value
 
     def number(
         self, name: str, otherwise: float | None = None, names: Sequence[str] = ()
     ) -> float:
-        """Return a finite number, or what holds otherwise. Raises FileFormatError: it
-        is none, or has to be there.
+        """Return a finite number, or a default if there is no such entry.
+
+        Args:
+            name: the entry.
+            otherwise: the default; None if the entry is required.
+            names: plain names for the entry, if there are several.
+
+        Raises:
+            FileFormatError: it is no number, or is required and missing.
         """
         if otherwise is not None and self.get(*(names or (plain(name),))) is None:
             return otherwise
@@ -102,27 +111,38 @@ class Entries:
     def numbers(
         self, shown_as: str, given: object, counts: Sequence[int]
     ) -> list[float]:
-        """Return a list of numbers, flat, in rows or in the `data` of a matrix, of a
-        length among some counts.
+        """Return a list of numbers: flat, in rows, or in the `data` of a matrix.
+
+        Args:
+            shown_as: name of the entry, for messages.
+            given: its value.
+            counts: the lengths that it may have.
+
+        Raises:
+            FileFormatError: it has another length, or other values.
         """
         if isinstance(given, Mapping):
             self._odd += [
                 f"{shown_as}.{key}" for key in given if key not in MATRIX_KEYS
             ]
             given = given.get("data")
-        flat = _flat(given)
-        if len(flat) not in counts:
-            wanted = " or ".join(map(str, counts))
+        values = _flat(given)
+        if len(values) not in counts:
+            expected = " or ".join(map(str, counts))
             raise FileFormatError(
                 f"{self.path}: {shown_as}: expected a list of "
-                f"{wanted} numbers, got {len(flat)}"
+                f"{expected} numbers, got {len(values)}"
             )
-        return [number(self.path, shown_as, value) for value in flat]
+        return [number(self.path, shown_as, value) for value in values]
 
     def told(self, within: str = "") -> list[str]:
-        """Return the entries that nobody asked for, as they are spelled, with a dot
-        after the entry that they are within. Raises FileFormatError: one of them
-        changes the picture.
+        """Return the entries that were not read and need a note, as the file spells them.
+
+        Args:
+            within: prefix for the entry that they are within, with a dot.
+
+        Raises:
+            FileFormatError: one of them changes the image.
         """
         unread = [within + key for key in self._odd]
         for spelled in self._keys.unread(
@@ -130,16 +150,19 @@ class Entries:
         ):
             name = plain(spelled)
             value = self._keys.peek(name)
-            is_coefficient = name in COEFFICIENTS and not isinstance(
-                value, (list, Mapping)
-            )
-            # of a stereo pair
-            of_another = (
+            is_matrix = isinstance(value, (list, Mapping))
+            is_coefficient = name in COEFFICIENTS and not is_matrix
+            is_of_second_camera = (
                 name.endswith("2")
                 and f"{name[:-1]}1" in self._keys
                 and not is_coefficient
             )
-            if not BENDS.fullmatch(name) or OF_RECTIFIED.fullmatch(name) or of_another:
+            changes_image = (
+                BENDS.fullmatch(name)
+                and not OF_RECTIFIED.fullmatch(name)
+                and not is_of_second_camera
+            )
+            if not changes_image:
                 unread.append(within + spelled)
             elif not nothing(value):
                 raise FileFormatError(
@@ -154,27 +177,30 @@ class Entries:
 def select_camera(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
     """Return the camera of a name out of those of a file, or the only one.
 
-    Raises FileFormatError: there is none of that name, or there are several and none is
-    named.
+    Raises:
+        FileFormatError: there is none of that name, or there are several and none is
+            named.
     """
     names = list(map(str, cameras))
-    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    listing = ", ".join(names[:8])
+    if len(names) > 8:
+        listing += ", ..."
     first = f"{path}#{names[0]}"
     if which and which not in names:
         raise FileFormatError(
-            f"{path}: expected one of its cameras {listed}, got "
+            f"{path}: expected one of its cameras {listing}, got "
             f"{which[:40]!r}; write {first}"
         )
     if not which and len(names) > 1:
-        what = f"has {len(names)} cameras, {listed}"
         raise FileFormatError(
-            f"{path}: {what}: say which one takes the picture, as in {first}"
+            f"{path}: has {len(names)} cameras, {listing}: say which one takes the "
+            f"picture, as in {first}"
         )
     return cameras[which or names[0]]
 
 
 def nothing(value: object) -> bool:
-    """Whether a value changes nothing: zeros, no words, or nothing at all."""
+    """Return whether a value changes nothing: it is zero, empty or none."""
     if isinstance(value, Mapping):
         value = value.get("data", list(value.values()))
     return all(
@@ -183,26 +209,30 @@ def nothing(value: object) -> bool:
     )
 
 
-def _float(given: object) -> float:
+def _float(value: object) -> float:
+    """Return a value as a number, NaN if it is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return math.nan
     try:
-        return (
-            float(given)
-            if isinstance(given, (int, float, str)) and not isinstance(given, bool)
-            else math.nan
-        )
+        return float(value)
     except (ValueError, OverflowError):
         return math.nan
 
 
-def _flat(given: object) -> list[Any]:
-    rows = given if isinstance(given, list) else [given]
-    return [
-        value for row in rows for value in (row if isinstance(row, list) else [row])
-    ]
+def _flat(value: object) -> list[Any]:
+    """Return the values of a list of lists, of a list, or of a single value."""
+    values: list[Any] = []
+    for row in value if isinstance(value, list) else [value]:
+        values += row if isinstance(row, list) else [row]
+    return values
 
 
 def number(path: str, name: str, given: object) -> float:
-    """Return a finite number. Raises FileFormatError: it is none."""
+    """Return an entry as a finite number.
+
+    Raises:
+        FileFormatError: it is none.
+    """
     value = _float(given)
     if not math.isfinite(value):
         raise FileFormatError(
@@ -215,15 +245,19 @@ def number(path: str, name: str, given: object) -> float:
 def with_told(
     model: CameraModel, left: Sequence[str], rectified: Sequence[str] = ()
 ) -> CameraModel:
-    """The model with notes that name what was not read: of the camera, and about
-    rectified pictures.
+    """Return a model with notes on the entries that were not read.
+
+    Args:
+        model: the model.
+        left: entries of the camera.
+        rectified: entries about rectified images.
     """
     unread = [f"{join_names(left)}."] if left else []
     if rectified:
-        whose = "which are made of the camera's own ones; these are its own."
-        unread.append(f"{' and '.join(rectified)}, about rectified pictures, {whose}")
+        reason = "which are made of the camera's own ones; these are its own."
+        unread.append(f"{' and '.join(rectified)}, about rectified pictures, {reason}")
     return replace(
-        model, told=tuple(f"{model.name}: not read: {what}" for what in unread)
+        model, told=tuple(f"{model.name}: not read: {names}" for names in unread)
     )
 
 
@@ -234,33 +268,57 @@ def made(
     found: Mapping[str, float],
     first: float = 0.0,
 ) -> CameraModel:
-    """The model of numbers in pixels, whose origin lies at `first` to the right of and
-    below the picture's corner. Raises FileFormatError: numbers that no camera has.
+    """Make a camera model of numbers in pixels.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        kind: the kind of model.
+        size: height and width of the image.
+        found: numbers by their names in `NUMBERS`; 0 by default.
+        first: coordinate that the file's principal point needs added to count from the
+            corner of the image.
+
+    Raises:
+        FileFormatError: no camera has such numbers.
     """
     path = spec.partition("#")[0]
     height, width = size
     if not all(side == int(side) and 1 <= side <= MOST_PIXELS for side in size):
-        wanted = f"a width and a height from 1 to {MOST_PIXELS} pixels"
-        raise FileFormatError(f"{path}: expected {wanted}, got {width:g} x {height:g}")
+        raise FileFormatError(
+            f"{path}: expected a width and a height from 1 to {MOST_PIXELS} pixels, got "
+            f"{width:g} x {height:g}"
+        )
     if kind == EQUIRECTANGULAR:
         found = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
         first = 0.0
     value = {name: found.get(name, 0.0) for name in NUMBERS}
-    value["cx"], value["cy"] = value["cx"] + first, value["cy"] + first
+    value["cx"] = value["cx"] + first
+    value["cy"] = value["cy"] + first
+    _check_numbers(path, value, width, height)
+    unit = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
+    numbers = tuple(number / unit.get(name, 1.0) for name, number in value.items())
+    return CameraModel(kind, numbers, spec, (int(height), int(width)))
 
-    def check(name: str, fits: bool, wanted: str, hint: str = "") -> None:
-        if not fits:
+
+def _check_numbers(
+    path: str, value: Mapping[str, float], width: float, height: float
+) -> None:
+    """Raise FileFormatError if numbers in pixels are those of no camera."""
+
+    def check(name: str, is_valid: bool, expected: str, hint: str = "") -> None:
+        if not is_valid:
             raise FileFormatError(
-                f"{path}: {name}: expected {wanted}, got {value[name]:g}{hint}"
+                f"{path}: {name}: expected {expected}, got {value[name]:g}{hint}"
             )
 
     for name, side in (("fx", width), ("fy", height)):
         low = side / LARGEST_FOCAL
         high = side * LARGEST_FOCAL
-        wanted = (
-            f"a focal length from {low:g} to {high:g} pixels for a side of {side:g}"
+        check(
+            name,
+            low <= value[name] <= high,
+            f"a focal length from {low:g} to {high:g} pixels for a side of {side:g}",
         )
-        check(name, low <= value[name] <= high, wanted)
     for name, side in (("cx", width), ("cy", height)):
         check(
             name,
@@ -268,36 +326,32 @@ def made(
             f"a principal point inside the picture, up to {side:g}",
         )
     check("skew", abs(value["skew"]) <= value["fx"], f"less than fx, {value['fx']:g}")
-    wanted = f"a coefficient from -{LARGEST_COEFFICIENT:g} to {LARGEST_COEFFICIENT:g}"
     for name in COEFFICIENTS:
         check(
             name,
             abs(value[name]) <= LARGEST_COEFFICIENT,
-            wanted,
+            f"a coefficient from -{LARGEST_COEFFICIENT:g} to {LARGEST_COEFFICIENT:g}",
             "; is it in the order of OpenCV?",
         )
-    sides = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
-    numbers = tuple(number / sides.get(name, 1.0) for name, number in value.items())
-    return CameraModel(kind, numbers, spec, (int(height), int(width)))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Cameras that are mounted: ``--camera dashcam``, ``--camera robot``. They keep their
-# height and do not roll.
+# ---- Mounted cameras: ``--camera dashcam``, ``--camera robot`` ----
+#
+# They keep their height and do not roll.
 
 
 @dataclass(frozen=True)
 class CameraPreset:
-    """How a mounted camera stands, and what the control `camera` searches of it."""
+    """The pose of a mounted camera, and what the control `camera` searches of it."""
 
     height: float  # of the lens above the floor or the road, metres
     fov: float  # field of view along the larger side of the picture, degrees
-    # from the object's middle, metres; further where the object would not fit
+    # From the object's center, metres; further if the object would not fit.
     distance: float
-    # azimuth 0 is in the object's lane, looking along it: behind what drives there
+    # Whether azimuth 0 is in the object's lane, behind what drives there.
     in_lane: bool
     aside: float  # how far to either side a search goes, degrees; 180 for all around
-    # the other ranges that are searched by default; what has none stays
+    # Other ranges that are searched by default; what has none stays.
     search: Mapping[str, tuple[float, float]]
 
 
@@ -314,14 +368,15 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # colour picture of that has 69 x 42 degrees, and its depth reaches to 3 m
         # (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
-            height=1.2, fov=69.0, distance=1.0, in_lane=False, aside=180.0, search={"distance": (0.5, 3.0)},
+            height=1.2, fov=69.0, distance=1.0, in_lane=False, aside=180.0,
+            search={"distance": (0.5, 3.0)},
         ),
     }
 )  # fmt: skip
 """The mounted cameras by name."""
 TABLE = 0.75
 TABLE_SIDE = 1.2
-"""Height and side in metres of a table, on which the objects of a bundled room stand
-that are no larger than `ON_TABLES`.
+"""Height and side in metres of a table of a bundled room, on which objects stand that are
+no larger than `ON_TABLES`.
 """
 ON_TABLES = 0.5  # metres of the longest side

@@ -1,11 +1,11 @@
-"""Camera files of OpenCV, Kalibr (EuRoC), ROS (`camera_info`), camodocal (VINS), COLMAP
-and nerfstudio.
+"""Readers of camera files.
 
-Those of further tools are translated by `camera_dialects` before.
+Formats are those of OpenCV, Kalibr (EuRoC), ROS (`camera_info`), camodocal (VINS),
+COLMAP and nerfstudio; `camera_dialects` translates those of further tools.
 
-The centre of the first pixel is (0.5, 0.5) in the last two and (0, 0) in the others;
-what comes out is measured from the picture's corner. An entry that no reader asks for
-is named in a note, or refused where it makes another picture.
+The center of the first pixel is (0.5, 0.5) in COLMAP and nerfstudio, and (0, 0) in the
+others; models are measured from the image's corner. An entry that is not read is noted,
+or rejected if it changes the image.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ from advsearch.scene.importing.files import CAMERAS, shown
 from advsearch.trust.stored_files import parse_json, parsed, present_text
 from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
-LARGEST_JSON = 1 << 25  # bytes of a JSON file, which may hold the pose of every picture
-MOST_BINNED = 64  # pixels along a side that a sensor makes into one, at most
-# as in ROS too
+# Limit of the bytes of a JSON file, which may have the pose of every image.
+LARGEST_JSON = 1 << 25
+MOST_BINNED = 64  # limit of the pixels along a side that a sensor bins into one
+# Coefficients in the order of OpenCV and ROS.
 IN_OPENCV = (
     "k1",
     "k2",
@@ -66,7 +67,7 @@ IN_OPENCV = (
     "tauX",
     "tauY",
 )
-LENGTHS = (0, 4, 5, 8, 12, 14)  # how many of them there may be
+LENGTHS = (0, 4, 5, 8, 12, 14)  # how many coefficients there may be
 COLMAP: Mapping[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": (BROWN_CONRADY, "f cx cy"),
     "PINHOLE": (BROWN_CONRADY, "fx fy cx cy"),
@@ -81,8 +82,9 @@ COLMAP: Mapping[str, tuple[str, str]] = {
     "RADIAL_FISHEYE": (FISHEYE, "f cx cy k1 k2"),
     "EQUIRECTANGULAR": (EQUIRECTANGULAR, "w h"),
 }
-"""COLMAP's models that are one of ours, with their parameters. FOV, EUCM, the division
-models and those with a thin prism on a fisheye are not.
+"""Kind and parameters of COLMAP's models.
+
+FOV, EUCM, the division models and fisheyes with a thin prism are not supported.
 """
 _OF_BROWN = (
     "plumb_bob rational_polynomial thin_prism radtan radial_tangential "
@@ -93,7 +95,7 @@ OF_DISTORTION = {
     **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt"), FISHEYE),
     EQUIRECTANGULAR: EQUIRECTANGULAR,
 }
-"""The distortion models of ROS, Kalibr and EuRoC that are one of ours."""
+"""Kinds of the distortion models of ROS, Kalibr and EuRoC."""
 MATRIX = (
     *("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1"),
     *("intrinsics", "cameraintrinsics"),  # of ARKit
@@ -125,12 +127,12 @@ KANNALA = {
     "k4": "k3",
     "k5": "k4",
 }
-"""What camodocal calls the numbers of a fisheye, and OpenCV."""
-ALIKE = 0.01  # by what share a focal length may differ from what an angle says
+"""OpenCV's names of camodocal's parameters of a fisheye."""
+ALIKE = 0.01  # relative difference allowed between a focal length and an angle
 OF_A_FRAME = frozenset(
     ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *IN_OPENCV)
 )
-"""What nerfstudio says of a camera, of all frames or of one."""
+"""Entries of nerfstudio about a camera, of all frames or of one."""
 OF_A_SCENE = frozenset(
     "frames aabb_scale scale offset applied_transform applied_scale ply_file_path "
     "orientation_override "
@@ -139,31 +141,36 @@ OF_A_SCENE = frozenset(
     "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path "
     "semantic_path time rotation".split()
 )
-"""Entries of a transforms.json, and of its frames, that say nothing of the lens; angles
-count where lengths lack.
+"""Entries of a transforms.json, and of its frames, that are not about the lens; angles are
+used if focal lengths are missing.
 """
 
 
 def read_camera(spec: str) -> CameraModel:
-    """Read a camera's model from a file; of several cameras in it that which is named,
-    as in ``camchain.yaml#cam1`` and ``cameras.txt#3``. Raises FileFormatError: the file
-    is missing, is none of these kinds, has a model that is not one of ours, numbers
-    that no camera has, or an entry that makes another picture and is not read.
+    """Read a camera's model from a file.
+
+    Args:
+        spec: the file; of several cameras in it, that which is named, as in
+            ``camchain.yaml#cam1`` and ``cameras.txt#3``.
+
+    Raises:
+        FileFormatError: the file is missing, is of no known kind, has a model that is
+            not one of ours, numbers that no camera has, or an entry that changes the
+            image and is not read.
     """
     path, _, which = spec.partition("#")
-    ending = Path(path).suffix.lower()
-    if ending in CAMERAS and Path(path).is_file():
+    suffix = Path(path).suffix.lower()
+    if suffix in CAMERAS and Path(path).is_file():
         raise FileFormatError(
-            f"{path}: expected a camera as text, got {CAMERAS[ending]}"
+            f"{path}: expected a camera as text, got {CAMERAS[suffix]}"
         )
-    if ending in MESHES:
+    if suffix in MESHES:
         raise FileFormatError(
             f"{path}: expected a camera file, got a mesh; it is an "
             "object's, not a camera's"
         )
-    text = present_text(
-        path, "a camera file", LARGEST_JSON if ending == ".json" else LARGEST
-    )
+    limit = LARGEST_JSON if suffix == ".json" else LARGEST
+    text = present_text(path, "a camera file", limit)
     lines = [
         line
         for line in text.splitlines()
@@ -184,59 +191,44 @@ def read_camera(spec: str) -> CameraModel:
         if isinstance(entry, dict) and "intrinsics" in entry
     }
     if cameras:
-        rest = Entries(
-            path, {name: entry for name, entry in data.items() if name not in cameras}
-        )
-        return _of_kalibr(
-            spec, Entries(path, select_camera(path, which, cameras)), rest.told()
-        )
+        rest = {name: entry for name, entry in data.items() if name not in cameras}
+        unread = Entries(path, rest)
+        camera = Entries(path, select_camera(path, which, cameras))
+        return _of_kalibr(spec, camera, unread.told())
     if which:
-        wanted = f"expected several cameras, as {which!r} is asked for"
-        raise FileFormatError(f"{path}: {wanted}, got one; leave #{which} out")
+        raise FileFormatError(
+            f"{path}: expected several cameras, as {which!r} is asked for, got one; "
+            f"leave #{which} out"
+        )
     if "intrinsics" in data and "camera_model" in data:
         return _of_kalibr(spec, Entries(path, data))
+    return _of_opencv(spec, Entries(path, _without_groups(data)))
+
+
+def _without_groups(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return entries with those of camodocal's groups on the top level."""
     groups = {
         name: group for name in GROUPS if isinstance(group := data.get(name), dict)
     }
-    flat = {name: value for name, value in data.items() if name not in groups}
+    entries = {name: value for name, value in data.items() if name not in groups}
     for group in groups.values():
         names = KANNALA if "mu" in group else {}
-        flat |= {names.get(str(key), str(key)): value for key, value in group.items()}
-    return _of_opencv(spec, Entries(path, flat))
+        entries |= {
+            names.get(str(key), str(key)): value for key, value in group.items()
+        }
+    return entries
 
 
 def _data(path: str, text: str) -> dict[str, Any]:
+    """Parse a camera file that is XML, JSON or YAML."""
     if text.lstrip().startswith("<"):
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise FileFormatError(
-                f"{path}: declares a document type or entities, "
-                "which no camera needs; remove it"
-            )
-        root = parsed(path, text, "XML", ElementTree.fromstring)
-        check_xml_root(path, root.tag)
-        if root.tag not in ("opencv_storage", METASHAPE_FILE):
-            raise FileFormatError(
-                f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
-                f"<{root.tag[:40]}>; docs/cameras.md has "
-                "the formats that are read"
-            )
-        entries = dict[str, Any]()
-        for element in root:
-            inner = {entry.tag: (entry.text or "").strip() for entry in element}
-            matrix = element.findtext("data")
-            entries[element.tag] = (
-                (inner or (element.text or "").strip())
-                if matrix is None
-                else matrix.split()
-            )
-        return entries
+        return _parse_xml(path, text)
     if path.lower().endswith(".json"):
         data = parsed(path, text, "JSON", parse_json)
     else:
-        # OpenCV's has a directive and tags of its own
-        text = re.sub(
-            r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text)
-        )
+        # OpenCV's YAML has a directive and tags that are not standard.
+        text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+        text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
         data = parsed(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
@@ -249,16 +241,44 @@ def _data(path: str, text: str) -> dict[str, Any]:
     return data
 
 
-# ---- the formats
-# ----------------------------------------------------------------------------------------------------
+def _parse_xml(path: str, text: str) -> dict[str, Any]:
+    """Parse a camera of OpenCV or Metashape in XML."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise FileFormatError(
+            f"{path}: declares a document type or entities, "
+            "which no camera needs; remove it"
+        )
+    root = parsed(path, text, "XML", ElementTree.fromstring)
+    check_xml_root(path, root.tag)
+    if root.tag not in ("opencv_storage", METASHAPE_FILE):
+        raise FileFormatError(
+            f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
+            f"<{root.tag[:40]}>; docs/cameras.md has "
+            "the formats that are read"
+        )
+    entries = dict[str, Any]()
+    for element in root:
+        inner = {entry.tag: (entry.text or "").strip() for entry in element}
+        matrix = element.findtext("data")
+        if matrix is not None:
+            entries[element.tag] = matrix.split()
+        else:
+            entries[element.tag] = inner or (element.text or "").strip()
+    return entries
+
+
+# ---- Formats ----
 
 
 def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> CameraModel:
+    """Return the model of a camera of COLMAP's cameras.txt."""
     rows = {words[0]: words for line in lines if (words := line.split())}
     if len(rows) < len(lines):
-        twice = "expected each camera once, got one with the same number twice"
-        raise FileFormatError(f"{path}: {twice}; correct the file")
-    _, name, *rest = select_camera(path, which, rows)
+        raise FileFormatError(
+            f"{path}: expected each camera once, got one with the same number twice; "
+            "correct the file"
+        )
+    _, name, *values = select_camera(path, which, rows)
     if name not in COLMAP:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP)}, got "
@@ -266,49 +286,41 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
             "; fit one of these to it (colmap model_converter does not), or undistort "
             "the pictures"
         )
-    kind, names = COLMAP[name]
-    wanted = ["width", "height", *names.split()]
-    if len(rest) != len(wanted):
+    kind, parameters = COLMAP[name]
+    keys = ["width", "height", *parameters.split()]
+    if len(values) != len(keys):
         raise FileFormatError(
-            f"{path}: {name}: expected {' '.join(wanted)}, got "
-            f"{len(rest)} numbers; correct the line"
+            f"{path}: {name}: expected {' '.join(keys)}, got "
+            f"{len(values)} numbers; correct the line"
         )
     numbers = {
-        key: number(path, key, value) for key, value in zip(wanted, rest, strict=True)
+        key: number(path, key, value) for key, value in zip(keys, values, strict=True)
     }
     size = (numbers.pop("height"), numbers.pop("width"))
     if "f" in numbers:
-        numbers["fx"] = numbers["fy"] = numbers.pop("f")
+        focal_length = numbers.pop("f")
+        numbers["fy"] = focal_length
+        numbers["fx"] = focal_length
     return made(spec, kind, size, numbers)
 
 
 def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraModel:
+    """Return the model of a transforms.json, or of one of its frames."""
     path = spec.partition("#")[0]
     frames = data.get("frames") or []
-    frames = (
-        [frame for frame in frames if isinstance(frame, dict)]
-        if isinstance(frames, list)
-        else []
-    )
-    lenses = [
-        {key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames
-    ] or [{}]
-    lens = lenses[0]
-    if which or any(other != lens for other in lenses):
-        lens = select_camera(
-            path, which, dict(zip(map(str, range(len(lenses))), lenses, strict=True))
-        )
-    others = {
-        key: value
-        for frame in frames
-        for key, value in frame.items()
-        if key not in OF_A_FRAME | OF_A_SCENE
-    }
-    entries = Entries(
-        path,
-        {key: value for key, value in data.items() if key not in OF_A_SCENE} | lens,
-    )
-    width, height = (entries.number(side) for side in ("w", "h"))
+    if not isinstance(frames, list):
+        frames = []
+    frames = [frame for frame in frames if isinstance(frame, dict)]
+    lens = _select_lens(path, which, frames)
+    frame_rest = {}
+    for frame in frames:
+        for key, value in frame.items():
+            if key not in OF_A_FRAME | OF_A_SCENE:
+                frame_rest[key] = value
+    scene_entries = {key: value for key, value in data.items() if key not in OF_A_SCENE}
+    entries = Entries(path, scene_entries | lens)
+    width = entries.number("w")
+    height = entries.number("h")
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
     if name not in (*COLMAP, "PERSPECTIVE"):
         raise FileFormatError(
@@ -317,97 +329,87 @@ def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraMode
             "projection; fit one of these to it"
         )
     kind = COLMAP[name][0] if name in COLMAP else BROWN_CONRADY
-    kind = FISHEYE if entries.get("isfisheye") else kind
-    angles = [data.get(f"camera_angle_{axis}") for axis in "xy"]
-    lengths = [
-        0.0
-        if angle is None
-        else side / 2.0 / max(math.tan(number(path, "camera_angle", angle) / 2.0), 1e-9)
-        for angle, side in zip(angles, (width, height), strict=True)
-    ]
-    fx = entries.number("fl_x", lengths[0] or None)
-    if lengths[0] and abs(fx - lengths[0]) > ALIKE * fx:
-        wanted = f"expected {lengths[0]:g}, as camera_angle_x says"
-        raise FileFormatError(f"{path}: fl_x: {wanted}, got {fx:g}; leave one out")
-    numbers = {"fx": fx, "fy": entries.number("fl_y", lengths[1] or fx)}
-    numbers |= {
-        axis: entries.number(axis, side / 2.0)
-        for axis, side in (("cx", width), ("cy", height))
-    }
-    numbers |= _coefficients(
-        entries, COEFFICIENTS[:4] if kind == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
-    )
+    if entries.get("isfisheye"):
+        kind = FISHEYE
+    x_focal = _focal_of_angle(path, data.get("camera_angle_x"), width)
+    y_focal = _focal_of_angle(path, data.get("camera_angle_y"), height)
+    fx = entries.number("fl_x", x_focal or None)
+    if x_focal and abs(fx - x_focal) > ALIKE * fx:
+        raise FileFormatError(
+            f"{path}: fl_x: expected {x_focal:g}, as camera_angle_x says, got {fx:g}; "
+            "leave one out"
+        )
+    numbers = {"fx": fx, "fy": entries.number("fl_y", y_focal or fx)}
+    numbers["cx"] = entries.number("cx", width / 2.0)
+    numbers["cy"] = entries.number("cy", height / 2.0)
+    names: Sequence[str] = ("k1", "k2", "k3", "p1", "p2")
+    if kind == FISHEYE:
+        names = COEFFICIENTS[:4]
+    numbers |= _coefficients(entries, names)
     model = made(spec, kind, (height, width), numbers)
-    return with_told(model, [*entries.told(), *Entries(path, others).told("frames.")])
+    unread = [*entries.told(), *Entries(path, frame_rest).told("frames.")]
+    return with_told(model, unread)
 
 
-def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> CameraModel:
+def _select_lens(
+    path: str, which: str, frames: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the entries about the lens of a frame, or those that all frames share."""
+    lenses = [
+        {key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames
+    ] or [{}]
+    first: dict[str, Any] = lenses[0]
+    if not which and all(lens == first for lens in lenses):
+        return first
+    by_index = {str(index): lens for index, lens in enumerate(lenses)}
+    selected: dict[str, Any] = select_camera(path, which, by_index)
+    return selected
+
+
+def _focal_of_angle(path: str, angle: object, side: float) -> float:
+    """Return the focal length in pixels of a field of view in radians; 0 for None."""
+    if angle is None:
+        return 0.0
+    half_angle = number(path, "camera_angle", angle) / 2.0
+    return side / 2.0 / max(math.tan(half_angle), 1e-9)
+
+
+def _of_kalibr(spec: str, entries: Entries, unread: Sequence[str] = ()) -> CameraModel:
+    """Return the model of a camera of Kalibr; `unread` are other entries of its file."""
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
     if model != "pinhole":
+        advice = (
+            describe_projection(model)
+            or ", which is not read; calibrate as pinhole-equi or pinhole-radtan"
+        )
         raise FileFormatError(
             f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}"
-            f"{describe_projection(model) or ', which is not read; calibrate as pinhole-equi or pinhole-radtan'}"
+            f"{advice}"
         )
     kind = _kind(path, entries.get("distortionmodel"))
-    focal = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
+    intrinsics = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
     width, height = entries.numbers("resolution", entries.there("resolution"), (2,))
     numbers = _distortion(entries, names, (0, 4))
-    numbers |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
-    return with_told(
-        made(spec, kind, (height, width), numbers, 0.5), [*beside, *entries.told()]
-    )
+    numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
+    camera = made(spec, kind, (height, width), numbers, 0.5)
+    return with_told(camera, [*unread, *entries.told()])
 
 
 def _of_opencv(spec: str, entries: Entries) -> CameraModel:
+    """Return the model of a camera of OpenCV or ROS."""
     path = entries.path
-    keys = ("distortionmodel", "cameramodel", "modeltype")
-    kinds = {
-        _kind(path, model) for key in keys if (model := entries.get(key)) is not None
-    }
-    kind = (
-        FISHEYE
-        if not nothing(entries.get("fisheyemodel"))
-        else next(iter(kinds), BROWN_CONRADY)
-    )
-    if len(kinds) > 1:
-        raise FileFormatError(
-            f"{path}: expected one model, got a camera_model beside "
-            "another distortion_model"
-        )
+    kind = _opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
         return with_told(made(spec, kind, _size(entries), {}), entries.told())
-    given = entries.get(*MATRIX)
-    if given is None and entries.get("fx") is not None:  # its numbers one by one
-        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    matrix = _camera_matrix(path, entries)
+    height, width = _size(entries)
+    unread = _check_roi(entries, (height, width))
+    if kind == FISHEYE:
+        numbers = _distortion(entries, COEFFICIENTS[:4], (0, 4))
     else:
-        matrix = entries.numbers(
-            "camera_matrix", entries.there("camera_matrix", MATRIX), (9,)
-        )
-    if not any(matrix):
-        raise FileFormatError(
-            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "as ROS says of one that is not "
-            "calibrated; calibrate it, and give the file that this writes"
-        )
-    if not any(matrix[place] for place in (1, 2, 5)) and any(matrix[6:8]):
-        # by columns: Open3D, ARKit
-        matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
-    if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
-        raise FileFormatError(
-            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, "
-            "cy, 0, 0, 1, got other numbers"
-        )
-    size = _size(entries)
-    fisheye = kind == FISHEYE
-    unread = _check_roi(entries, size)
-    numbers = _distortion(
-        entries,
-        COEFFICIENTS[:4] if fisheye else IN_OPENCV,
-        (0, 4) if fisheye else LENGTHS,
-    )
+        numbers = _distortion(entries, IN_OPENCV, LENGTHS)
     if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate "
@@ -420,38 +422,78 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
         "fy": matrix[4],
         "cy": matrix[5],
     }
-    (height, width) = size
-    (down, across) = _binning(entries)
-    model = made(
-        spec, kind, (height - height % down, width - width % across), numbers, 0.5
-    )
-    model = replace(model, size=(int(height // down), int(width // across)))
+    y_binning, x_binning = _binning(entries)
+    binned_size = (height - height % y_binning, width - width % x_binning)
+    model = made(spec, kind, binned_size, numbers, 0.5)
+    model = replace(model, size=(int(height // y_binning), int(width // x_binning)))
     rectified = _rectified(entries, matrix)
     return with_told(model, unread + entries.told(), rectified)
+
+
+def _opencv_kind(path: str, entries: Entries) -> str:
+    """Return the kind of model that a camera of OpenCV or ROS states."""
+    keys = ("distortionmodel", "cameramodel", "modeltype")
+    kinds = {
+        _kind(path, model) for key in keys if (model := entries.get(key)) is not None
+    }
+    is_fisheye = not nothing(entries.get("fisheyemodel"))
+    if len(kinds) > 1:
+        raise FileFormatError(
+            f"{path}: expected one model, got a camera_model beside "
+            "another distortion_model"
+        )
+    return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
+
+
+def _camera_matrix(path: str, entries: Entries) -> list[float]:
+    """Return the camera matrix, nine numbers row by row."""
+    if entries.get(*MATRIX) is None and entries.get("fx") is not None:
+        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    else:
+        matrix = entries.numbers(
+            "camera_matrix", entries.there("camera_matrix", MATRIX), (9,)
+        )
+    if not any(matrix):
+        raise FileFormatError(
+            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
+            "as ROS says of one that is not "
+            "calibrated; calibrate it, and give the file that this writes"
+        )
+    is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
+    if is_by_columns:  # as Open3D and ARKit write it
+        matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
+    if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
+        raise FileFormatError(
+            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, "
+            "cy, 0, 0, 1, got other numbers"
+        )
+    return matrix
 
 
 def _distortion(
     entries: Entries, names: Sequence[str], counts: Sequence[int]
 ) -> dict[str, float]:
-    listed = entries.get(*DISTORTION)
-    if nothing(listed) and not isinstance(listed, Mapping):
+    """Return the distortion coefficients, from a list or from single entries.
+
+    Args:
+        entries: those of the camera.
+        names: the coefficients in the order of the list.
+        counts: the lengths that the list may have.
+    """
+    listing = entries.get(*DISTORTION)
+    if nothing(listing) and not isinstance(listing, Mapping):
         coefficients = _coefficients(entries, names)
     else:
-        coefficients = dict(
-            zip(
-                names,
-                entries.numbers("distortion_coefficients", listed, counts),
-                strict=False,
-            )
-        )
+        values = entries.numbers("distortion_coefficients", listing, counts)
+        coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
-    if (
-        isinstance(model, str)
-        and model.strip().lower() == "none"
-        and any(coefficients.values())
-    ):
-        what = "expected no distortion, as its distortion_model is none"
-        raise FileFormatError(f"{entries.path}: {what}, got coefficients")
+    is_none = isinstance(model, str) and model.strip().lower() == "none"
+    if is_none and any(coefficients.values()):
+        raise FileFormatError(
+            f"{entries.path}: expected no distortion, as its distortion_model is none, "
+            "got coefficients"
+        )
     return coefficients
 
 
@@ -460,35 +502,36 @@ def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
 
 
 def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
-    x, skew, cx, y, cy = (matrix[place] for place in (0, 1, 2, 4, 5))
-    other = []
-    for name, short, expected in (
+    """Return the names of matrices of rectified images that differ from the camera's."""
+    fx, skew, cx, _, fy, cy = matrix[:6]
+    differing = []
+    for name, short_name, expected in (
         ("rectification_matrix", "r", [1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
-        ("projection_matrix", "p", [x, skew, cx, 0, 0, y, cy, 0, 0, 0, 1, 0]),
+        ("projection_matrix", "p", [fx, skew, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
     ):
-        given = entries.get(plain(name), short)
-        numbers = (
-            expected
-            if nothing(given)
-            else entries.numbers(name, given, (len(expected),))
-        )
+        value = entries.get(plain(name), short_name)
+        if nothing(value):
+            continue
+        numbers = entries.numbers(name, value, (len(expected),))
         if any(
             abs(a - b) > 1e-6 * max(1.0, abs(b))
             for a, b in zip(numbers, expected, strict=True)
         ):
-            other.append(name)
-    return other
+            differing.append(name)
+    return differing
 
 
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
-    given = entries.get("roi")
-    roi = Entries(
-        entries.path,
-        {str(key): given[key] for key in given} if isinstance(given, Mapping) else {},
-    )
-    x, y, height, width = _coefficients(
-        roi, ("x_offset", "y_offset", "height", "width")
-    ).values()
+    """Check that a region of interest of ROS is the full image.
+
+    Returns the entries of the region that were not read.
+    """
+    value = entries.get("roi")
+    if not isinstance(value, Mapping):
+        value = {}
+    roi = Entries(entries.path, {str(key): value[key] for key in value})
+    numbers = _coefficients(roi, ("x_offset", "y_offset", "height", "width"))
+    x, y, height, width = numbers.values()
     roi.get("dorectify")
     if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
         raise FileFormatError(
@@ -498,36 +541,41 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     return roi.told("roi.")
 
 
-def _kind(path: str, named: object) -> str:
-    name = re.sub(r"[-\s]", "_", str(named or "").strip().lower())
+def _kind(path: str, model: object) -> str:
+    """Return the kind of a distortion model by the name that a tool gives it."""
+    name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
     if name == "pinhole":
         return BROWN_CONRADY
     if name not in OF_DISTORTION:
+        advice = describe_projection(name) or "; calibrate with one of these"
         raise FileFormatError(
             f"{path}: expected one of the distortion models "
-            f"{', '.join(filter(None, OF_DISTORTION))}, got {name[:40]!r}"
-            f"{describe_projection(name) or '; calibrate with one of these'}"
+            f"{', '.join(filter(None, OF_DISTORTION))}, got {name[:40]!r}{advice}"
         )
     return OF_DISTORTION[name]
 
 
 def _size(entries: Entries) -> tuple[float, float]:
-    if (given := entries.get(*SIZE)) is not None:
-        width, height = entries.numbers("image_size", given, (2,))
+    """Return the height and width of the image in pixels."""
+    size = entries.get(*SIZE)
+    if size is not None:
+        width, height = entries.numbers("image_size", size, (2,))
         return height, width
     width = entries.number("image_width", names=WIDTH)
     return entries.number("image_height", names=HEIGHT), width
 
 
 def _binning(entries: Entries) -> tuple[float, float]:
-    # pixels that ROS says are made into one; its calibration is for those before
-    down, across = (
-        entries.number(name, 1.0) or 1.0 for name in ("binning_y", "binning_x")
-    )
-    for name, pixels in (("binning_y", down), ("binning_x", across)):
+    """Return how many pixels ROS bins into one, along y and x.
+
+    The calibration is that of the pixels before.
+    """
+    y_binning = entries.number("binning_y", 1.0) or 1.0
+    x_binning = entries.number("binning_x", 1.0) or 1.0
+    for name, pixels in (("binning_y", y_binning), ("binning_x", x_binning)):
         if pixels != int(pixels) or not 1 <= pixels <= MOST_BINNED:
-            wanted = f"a whole number up to {MOST_BINNED}"
             raise FileFormatError(
-                f"{entries.path}: {name}: expected {wanted}, got {pixels:g}"
+                f"{entries.path}: {name}: expected a whole number up to {MOST_BINNED}, "
+                f"got {pixels:g}"
             )
-    return down, across
+    return y_binning, x_binning

@@ -1,11 +1,12 @@
-"""A camera's model: where in the picture a point is seen, and along which ray a place
-in the picture looks.
+"""Camera models: projection of points to the image, and rays of image coordinates.
 
     Brown-Conrady:   (x, y) = (X, Y) / Z,  r^2 = x^2 + y^2
-                     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
-                     r^6)
-                          + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4,                 y' likewise
-    fisheye:         (x', y') = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (X, Y) / |(X, Y)|
+                     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6)
+                            / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+                          + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4
+                     y' likewise
+    fisheye:         (x', y') = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6
+                                       + k4 theta^8) (X, Y) / |(X, Y)|
     both:            column = fx x' + skew y' + cx,    row = fy y' + cy
     equirectangular: longitude over the width, latitude over the height
 
@@ -14,9 +15,9 @@ Brown 1971 (Close-range camera calibration) and Kannala and Brandt 2006 (A gener
 camera model and calibration method for conventional, wide-angle, and fish-eye lenses,
 equation 6). theta is the angle to the axis.
 
-Points are in the camera's coordinates: x to the right, y down, z ahead. Places in the
-picture are shares of its width and height from the top left corner, and so are the
-focal lengths: a picture of another size is the same one, scaled.
+Points are in the camera's coordinates: x to the right, y down, z ahead. Image
+coordinates are fractions of its width and height from the top left corner, and so are
+the focal lengths: an image of another size is the same one, scaled.
 """
 
 from __future__ import annotations
@@ -38,18 +39,18 @@ FISHEYE = "fisheye"
 EQUIRECTANGULAR = "equirectangular"
 LINEAR = ("fx", "fy", "cx", "cy", "skew")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-NUMBERS = (*LINEAR, *COEFFICIENTS)  # what the numbers of a model are, in their order
+NUMBERS = (*LINEAR, *COEFFICIENTS)  # names of the numbers of a model, in order
 OF_KIND: Mapping[str, tuple[str, ...]] = {
     BROWN_CONRADY: COEFFICIENTS,
     FISHEYE: COEFFICIENTS[:4],
     EQUIRECTANGULAR: (),
 }
 """The coefficients that each kind of model has."""
-# steps after which an inversion has converged or never does; nearly all take five
+# Limit of the steps of an inversion; nearly all converge in five.
 STEPS = 60
 TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
 WIDEST = math.tan(math.radians(80.0))  # tangent of the widest half angle that is framed
-FAR = 1e6  # tangents are not looked for beyond this one
+FAR = 1e6  # limit of the tangents of rays
 Field = Callable[[Tensor], Tensor]
 
 
@@ -58,13 +59,13 @@ class CameraModel:
     """Intrinsics and distortion of a camera."""
 
     kind: str  # `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`
-    # (17,) in the order of `NUMBERS`: fx, cx and skew in picture widths, fy and cy in
-    # picture heights, the coefficients
+    # (17,) in the order of `NUMBERS`: fx, cx and skew in image widths, fy and cy in
+    # image heights, the coefficients.
     numbers: tuple[float, ...]
-    # how it was asked for: a file, or a bundled one; empty where `camera.fov` says its
-    # focal length
+    # The user's name for it: a file, or a bundled model; empty if `camera.fov` sets its
+    # focal length.
     name: str = ""
-    # (height, width) in pixels that it was calibrated for; None for any
+    # (height, width) in pixels that it was calibrated for; None for any.
     size: tuple[int, int] | None = None
     reach: float = 180.0  # largest angle to the axis that it sees, degrees
     told: tuple[str, ...] = ()  # sentences about how its file was read
@@ -77,8 +78,9 @@ class CameraModel:
         return replace(self, numbers=tuple(numbers.double().tolist()))
 
     def check_given(self, given: Iterable[str]) -> None:
-        """Refuse, by an InputError, a field of view among given settings: it has focal
-        lengths of its own.
+        """Raise InputError if settings of a scene contain a field of view.
+
+        The camera has its own focal lengths.
         """
         if "camera.fov" in given:
             raise InputError(
@@ -87,149 +89,176 @@ class CameraModel:
                 "own; leave one of the two out"
             )
 
-    # ---- both ways
-    # --------------------------------------------------------------------------------------------------
+    # ---- Projection and rays ----
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where points (N, 3) are seen, (N, 2) in picture widths and heights,
-        and which are, (N,) bool. One may be seen outside of the picture. What is behind
-        a lens, or beyond the angle at which it folds, is not.
+        """Project points (N, 3) to the image.
+
+        Returns:
+            Coordinates (N, 2) float64 in image widths and heights, which may be outside
+            of the image; and which points are visible, (N,) bool: those behind a lens,
+            or beyond the angle at which it folds, are not.
         """
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            longitude = torch.atan2(x, z)
-            latitude = torch.atan2(y, torch.hypot(x, z))
-            return torch.stack(
-                [0.5 + longitude / (2.0 * torch.pi), 0.5 + latitude / torch.pi], dim=-1
-            ), x == x
+            # All but NaN are visible.
+            return _project_to_panorama(x, y, z), x == x
         if self.kind == FISHEYE:
-            aside = torch.hypot(x, y)
-            angle = torch.atan2(aside, z)
-            scale = self._radial(angle) / aside.clamp_min(1e-300)
-            seen = angle <= self._last
-            bent = torch.stack([x * scale, y * scale], dim=-1)
+            distance = torch.hypot(x, y)
+            angle = torch.atan2(distance, z)
+            scale = self._radial(angle) / distance.clamp_min(1e-300)
+            is_visible = angle <= self._last
+            distorted = torch.stack([x * scale, y * scale], dim=-1)
         else:
             depth = torch.where(z > 0.0, z, torch.ones_like(z))
-            flat = torch.stack([x / depth, y / depth], dim=-1)
-            radius = flat.norm(dim=-1)
-            seen = (z > 0.0) & (radius <= self._last)
-            bent = self._bent(flat)
+            undistorted = torch.stack([x / depth, y / depth], dim=-1)
+            radius = undistorted.norm(dim=-1)
+            is_visible = (z > 0.0) & (radius <= self._last)
+            distorted = self._bent(undistorted)
         (fx, fy, cx, cy, skew) = self.numbers[: len(LINEAR)]
-        (x, y) = bent.unbind(dim=-1)
-        return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1), seen
+        (x, y) = distorted.unbind(dim=-1)
+        column = fx * x + skew * y + cx
+        row = fy * y + cy
+        return torch.stack([column, row], dim=-1), is_visible
 
     def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the directions (N, 3) float64 in which places (N, 2) in the picture
-        look, of a fisheye and a panorama unit vectors, else with z = 1; and how far
-        inside the view they are, (N,) float64, over 0 where something is seen: it
-        changes its sign along the edge of that. Found by Newton's method, kept within
-        bounds by halving, and checked: a place whose inversion has not converged to the
-        branch that the axis lies on is outside.
+        """Return the rays of image coordinates (N, 2).
+
+        They are found by Newton's method, kept within bounds by bisection, and checked:
+        coordinates whose inversion has not converged to the branch that the axis is on
+        are outside of the view.
+
+        Returns:
+            Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
+            with z = 1; and a margin (N,) float64, positive inside the view, which
+            changes its sign along the edge of it.
         """
         u, v = places.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            longitude = (u - 0.5) * (2.0 * torch.pi)
-            latitude = (v - 0.5) * torch.pi
-            level = latitude.cos()
-            directions = torch.stack(
-                [level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1
-            )
-            return directions, torch.ones_like(u)
-        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
-        y = (v - cy) / fy
-        bent = torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
-        radius = bent.norm(dim=-1)
-        axis = bent / radius.clamp_min(1e-300)[..., None]
-        high = min(self._last, FAR)
-        most = float(self._radial(torch.tensor([high], dtype=torch.float64)))
+            return _panorama_directions(u, v), torch.ones_like(u)
+        distorted = self._to_distorted(u, v)
+        radius = distorted.norm(dim=-1)
+        direction_2d = distorted / radius.clamp_min(1e-300)[..., None]
+        bound = min(self._last, FAR)
+        max_radius = float(self._radial(torch.tensor([bound], dtype=torch.float64)))
         if self.kind == FISHEYE:
-            # past its circle too, for its edge
+            # Beyond its circle too, for the edge of the view.
             angle, converged = self._inverted(radius, min(self.fold, math.pi))
             directions = torch.cat(
-                [axis * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
+                [direction_2d * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
             )
-            return directions, _inside(most - radius, converged)
-        start, converged = self._inverted(radius, high)
-        flat = axis * start[..., None]
-        if any(self.numbers[NUMBERS.index("p1") :]):
-            flat, converged = self._newton(flat, bent, high)
-            radius = (bent - self._decentred(flat)).norm(dim=-1)
-        directions = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
-        return directions, _inside(most - radius, converged)
+            return directions, _inside(max_radius - radius, converged)
+        start, converged = self._inverted(radius, bound)
+        undistorted = direction_2d * start[..., None]
+        has_decentering = any(self.numbers[NUMBERS.index("p1") :])
+        if has_decentering:
+            undistorted, converged = self._newton(undistorted, distorted, bound)
+            radius = (distorted - self._decentred(undistorted)).norm(dim=-1)
+        directions = torch.cat(
+            [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
+        )
+        return directions, _inside(max_radius - radius, converged)
+
+    def _to_distorted(self, u: Tensor, v: Tensor) -> Tensor:
+        """Return distorted points (N, 2) at image coordinates (N,): invert `LINEAR`."""
+        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
+        y = (v - cy) / fy
+        return torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
 
     def table(self, places: Tensor) -> Tensor:
-        """Return what `rays` says of places (N, 2), for the axes of Mitsuba's cameras:
-        (N, 4) float32, to the left, up and ahead, and over 0 where something is seen.
+        """Return rays of image coordinates (N, 2) in the axes of Mitsuba's cameras.
+
+        The result is (N, 4) float32: directions to the left, up and ahead, and the
+        margin of `rays`, positive inside the view.
         """
-        directions, inside = self.rays(places)
+        directions, margin = self.rays(places)
         return torch.cat(
-            [directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=-1
+            [directions * torch.tensor([-1.0, -1.0, 1.0]), margin[:, None]], dim=-1
         ).float()
 
     def _inverted(self, wanted: Tensor, high: float) -> tuple[Tensor, Tensor]:
-        """Solve radial(found) = wanted within [0, high], where it grows; and which of
-        them are solved.
+        """Solve radial(x) = wanted for x within [0, high], where radial grows.
+
+        Newton's method, with bisection if a step leaves the bracket.
+
+        Args:
+            wanted: (N,) distorted radii.
+            high: upper bound of the solutions.
+
+        Returns:
+            The solutions (N,), and which of them have converged.
         """
         bound = min(1.0, high)
         while bound < high and float(
             self._radial(torch.tensor(bound, dtype=torch.float64))
         ) < float(wanted.max()):
             bound = min(2.0 * bound, high)
-        low = torch.zeros_like(wanted)
-        most = torch.full_like(wanted, bound)
-        radius = torch.minimum(wanted, most)
+        lower = torch.zeros_like(wanted)
+        upper = torch.full_like(wanted, bound)
+        radius = torch.minimum(wanted, upper)
         for _ in range(STEPS):
-            there, (slope,) = _with_slopes(
-                lambda at: self._radial(at)[..., None], radius
+            values, (slope,) = _with_slopes(
+                lambda radii: self._radial(radii)[..., None], radius
             )
-            error = there[..., 0] - wanted
-            if bool(((error.abs() <= TOLERANCE) | (most - low <= TOLERANCE)).all()):
+            error = values[..., 0] - wanted
+            is_solved = (error.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
+            if bool(is_solved.all()):
                 break
-            most = torch.where(error > 0.0, radius, most)
-            low = torch.where(error > 0.0, low, radius)
+            upper = torch.where(error > 0.0, radius, upper)
+            lower = torch.where(error > 0.0, lower, radius)
             step = radius - error / slope
-            radius = torch.where((step > low) & (step < most), step, (low + most) / 2.0)
+            is_within = (step > lower) & (step < upper)
+            radius = torch.where(is_within, step, (lower + upper) / 2.0)
         error = (self._radial(radius) - wanted).abs()
         return radius, error <= 1e3 * TOLERANCE * (1.0 + wanted)
 
-    def _newton(self, flat: Tensor, bent: Tensor, high: float) -> tuple[Tensor, Tensor]:
-        """Solve bent(found) = bent in two dimensions from (N, 2); and which are solved,
-        before the lens folds.
+    def _newton(
+        self, undistorted: Tensor, distorted: Tensor, high: float
+    ) -> tuple[Tensor, Tensor]:
+        """Solve distort(x) = distorted by Newton's method in two dimensions.
+
+        Args:
+            undistorted: (N, 2) where it starts.
+            distorted: (N, 2).
+            high: largest radius of a solution.
+
+        Returns:
+            The solutions (N, 2); and which have converged before the lens folds.
         """
-        converged = torch.zeros_like(flat[..., 0], dtype=torch.bool)
+        converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
         for _ in range(STEPS // 3):
-            there, rows = _with_slopes(self._bent, flat)
-            error, ((a, b), (c, d)) = there - bent, (row.unbind(dim=-1) for row in rows)
+            values, rows = _with_slopes(self._bent, undistorted)
+            error = values - distorted
+            (a, b), (c, d) = (row.unbind(dim=-1) for row in rows)
             determinant = a * d - b * c
-            inside = (determinant > 0.0) & (flat.norm(dim=-1) < high)
-            converged = inside & (
-                error.norm(dim=-1) <= TOLERANCE * (1.0 + bent.norm(dim=-1))
+            is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < high)
+            converged = is_inside & (
+                error.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
             )
             if bool(converged.all()):
                 break
-            safe = torch.where(
+            safe_determinant = torch.where(
                 determinant.abs() > 1e-12,
                 determinant,
                 torch.full_like(determinant, 1e-12),
             )
             x, y = error.unbind(dim=-1)
-            moved = (
-                flat
-                - torch.stack([d * x - b * y, a * y - c * x], dim=-1) / safe[..., None]
+            step = torch.stack([d * x - b * y, a * y - c * x], dim=-1)
+            updated = undistorted - step / safe_determinant[..., None]
+            radius = updated.norm(dim=-1, keepdim=True)
+            updated = torch.where(
+                torch.isfinite(radius),
+                updated * (high / radius.clamp_min(high)),
+                undistorted,
             )
-            radius = moved.norm(dim=-1, keepdim=True)
-            moved = torch.where(
-                torch.isfinite(radius), moved * (high / radius.clamp_min(high)), flat
-            )
-            flat = torch.where(converged[..., None], flat, moved)
-        return flat, converged
+            undistorted = torch.where(converged[..., None], undistorted, updated)
+        return undistorted, converged
 
-    # ---- distortion
-    # -------------------------------------------------------------------------------------------------
+    # ---- Distortion ----
 
     @cached_property
     def _polynomials(self) -> tuple[Polynomial, Polynomial]:
-        """Numerator and denominator of radial(r) / r in r^2."""
+        """Numerator and denominator of radial(r) / r, as polynomials in r^2."""
         k = self.numbers[len(LINEAR) :]
         if self.kind == FISHEYE:
             return Polynomial([1.0, *k[:4]]), Polynomial([1.0])
@@ -237,165 +266,168 @@ class CameraModel:
 
     @cached_property
     def fold(self) -> float:
-        """Angle to the axis, radians, at which the radial distortion turns back;
-        infinite if it never does. Beyond it two directions are seen in one place, so
-        that no picture tells them apart.
+        """Angle to the axis, radians, at which the radial distortion turns back.
+
+        It is infinite if it never does. Beyond it two directions have one image point,
+        so that no image tells them apart.
         """
-        over, under = self._polynomials
-        square = Polynomial([0.0, 2.0])
-        slope = (over + square * over.deriv()) * under - square * (over * under.deriv())
-        roots = np.concatenate([slope.roots(), under.roots()])
-        turns = roots.real[
-            (np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)
-        ]
-        if not turns.size:
+        numerator, denominator = self._polynomials
+        double_square = Polynomial([0.0, 2.0])  # 2 r^2
+        slope = (
+            numerator + double_square * numerator.deriv()
+        ) * denominator - double_square * (numerator * denominator.deriv())
+        roots = np.concatenate([slope.roots(), denominator.roots()])
+        is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
+        positive_roots = roots.real[is_real & (roots.real > 0.0)]
+        if not positive_roots.size:
             return math.inf
-        last = math.sqrt(float(turns.min()))
-        return last if self.kind == FISHEYE else math.atan(last)
+        radius = math.sqrt(float(positive_roots.min()))
+        return radius if self.kind == FISHEYE else math.atan(radius)
 
     @cached_property
     def _last(self) -> float:
-        """The last angle that a fisheye sees, or the last tangent that another lens
-        does.
-        """
+        """The largest visible angle of a fisheye, or tangent of another lens."""
         if self.kind == FISHEYE:
             return min(self.fold, math.radians(self.reach), math.pi)
-        return (
-            math.tan(self.fold) * (1.0 - 1e-9)
-            if self.fold < math.pi / 2.0
-            else math.inf
-        )
+        if self.fold < math.pi / 2.0:
+            return math.tan(self.fold) * (1.0 - 1e-9)
+        return math.inf
 
     def _scale(self, square: Tensor) -> Tensor:
-        """radial(r) / r at r^2."""
-        over, under = self._polynomials
-        top = _evaluated(over, square)
-        return top if len(under) == 1 else top / _evaluated(under, square)
+        """Return radial(r) / r at r^2."""
+        numerator, denominator = self._polynomials
+        value = _evaluated(numerator, square)
+        if len(denominator) == 1:
+            return value
+        return value / _evaluated(denominator, square)
 
     def _radial(self, radius: Tensor) -> Tensor:
+        """Return the radial distortion of radii."""
         return radius * self._scale(radius * radius)
 
-    def _bent(self, flat: Tensor) -> Tensor:
-        return flat * self._scale(flat.square().sum(dim=-1))[
-            ..., None
-        ] + self._decentred(flat)
+    def _bent(self, undistorted: Tensor) -> Tensor:
+        """Return distorted points of undistorted ones (N, 2)."""
+        scale = self._scale(undistorted.square().sum(dim=-1))
+        return undistorted * scale[..., None] + self._decentred(undistorted)
 
-    def _decentred(self, flat: Tensor) -> Tensor:
-        """The part of the distortion that is not radial: of a lens off its centre, and
-        of a thin prism.
-        """
+    def _decentred(self, undistorted: Tensor) -> Tensor:
+        """Return the tangential and thin prism distortion of points (N, 2)."""
         (p1, p2, s1, s2, s3, s4) = self.numbers[NUMBERS.index("p1") :]
-        (x, y) = flat.unbind(dim=-1)
+        (x, y) = undistorted.unbind(dim=-1)
         square = x * x + y * y
-        aside = (
+        x_shift = (
             2.0 * p1 * x * y + p2 * (square + 2.0 * x * x) + square * (s1 + s2 * square)
         )
-        below = (
+        y_shift = (
             p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y + square * (s3 + s4 * square)
         )
-        return torch.stack([aside, below], dim=-1)
+        return torch.stack([x_shift, y_shift], dim=-1)
 
-    # ---- what follows from it
-    # ---------------------------------------------------------------------------------------
+    # ---- Derived properties ----
 
     @cached_property
     def tangents(self) -> tuple[float, float]:
-        """Half the sides of a rectangle around the axis, as tangents, that is in the
-        picture as a whole.
+        """Half the sides, as tangents, of a rectangle around the axis inside the image.
+
+        The rectangle is completely visible.
         """
-        # at first where the picture ends to the nearer side, along its row and its
-        # column through the axis
-        middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
-        edges = []
-        for axis in (0, 1):
-            line = middle.repeat(512, 1)
-            tangents = []
-            for border in (0.0, 1.0):
-                line[:, axis] = torch.linspace(
-                    float(middle[0, axis]), border, 512, dtype=torch.float64
-                )
-                directions, inside = self.rays(line)
-                seen = (inside > 0.0) & (directions[:, 2] > 0.1)
-                aside = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
-                tangents.append(
-                    float(torch.where(seen, aside, torch.zeros_like(aside)).max())
-                )
-            edges.append(max(1e-3, min(WIDEST, *tangents)))
-        along = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
-        end = torch.ones_like(along)
+        edges = self._edge_tangents()
+        grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
+        edge = torch.ones_like(grid)
         rim = torch.stack(
             [
-                torch.cat([along, along, end, -end]),
-                torch.cat([end, -end, along, along]),
+                torch.cat([grid, grid, edge, -edge]),
+                torch.cat([edge, -edge, grid, grid]),
             ],
             dim=-1,
         )
         rim = rim * torch.tensor(edges, dtype=torch.float64)
-        for share in torch.linspace(1.0, 0.02, 50).tolist():
-            points = torch.cat([share * rim, torch.ones_like(rim[:, :1])], dim=-1)
-            places, seen = self.project(points)
-            if bool(
-                (
-                    seen
-                    & (places >= -1e-6).all(dim=-1)
-                    & (places <= 1.0 + 1e-6).all(dim=-1)
-                ).all()
-            ):
+        for fraction in torch.linspace(1.0, 0.02, 50).tolist():
+            points = torch.cat([fraction * rim, torch.ones_like(rim[:, :1])], dim=-1)
+            coordinates, is_visible = self.project(points)
+            is_in_image = (coordinates >= -1e-6).all(dim=-1) & (
+                coordinates <= 1.0 + 1e-6
+            ).all(dim=-1)
+            if bool((is_visible & is_in_image).all()):
                 break
-        return share * edges[0], share * edges[1]
+        return fraction * edges[0], fraction * edges[1]
+
+    def _edge_tangents(self) -> list[float]:
+        """Return the tangents at which the image ends along x and along y.
+
+        Along the row and the column through the axis, the nearer of both edges counts.
+        """
+        center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
+        edges = []
+        for axis in (0, 1):
+            line = center.repeat(512, 1)
+            tangents = []
+            for border in (0.0, 1.0):
+                line[:, axis] = torch.linspace(
+                    float(center[0, axis]), border, 512, dtype=torch.float64
+                )
+                directions, margin = self.rays(line)
+                is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
+                tangent = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+                tangents.append(
+                    float(
+                        torch.where(
+                            is_visible, tangent, torch.zeros_like(tangent)
+                        ).max()
+                    )
+                )
+            edges.append(max(1e-3, min(WIDEST, *tangents)))
+        return edges
 
     @cached_property
     def black(self) -> float:
-        """Share of the picture in which nothing is seen."""
+        """Fraction of the image in which nothing is visible."""
         step = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
-        places = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(
-            -1, 2
-        )
-        return float((self.rays(places)[1] <= 0.0).double().mean())
+        grid = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1)
+        _, margin = self.rays(grid.reshape(-1, 2))
+        return float((margin <= 0.0).double().mean())
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of it, in sentences."""
+        """What a user should know about the camera, in sentences."""
         if self.black == 0.0:
             return self.told
         name = self.name or "the lens"
-        share = f"{100.0 * self.black:.2g} % of the picture"
-        black = f"{name}: {share} lies outside the lens's circle and is black."
+        black_part = f"{100.0 * self.black:.2g} % of the picture"
+        sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
         if self.fold < math.radians(self.reach):
-            folds = (
+            sentence = (
                 f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees "
-                "from its axis"
+                f"from its axis, and {black_part}, which only directions beyond that "
+                "would fill, is black."
             )
-            black = (
-                f"{folds}, and {share}, which only directions beyond that would "
-                "fill, is black."
-            )
-        return (*self.told, black)
+        return (*self.told, sentence)
 
     def scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
-        """Return what is to be said of a picture of another size (height, width) than
-        the model is for.
-        """
+        """Return a note if an image has another size (height, width) than the model."""
         if self.size is None or self.size == resolution:
             return ()
-        (tall, wide) = self.size
+        (model_height, model_width) = self.size
         (height, width) = resolution
-        shape = wide * height / (tall * width)
-        squeezed = (
-            f", which makes things {shape:.3g} times as high for their width"
-            if abs(shape - 1.0) > 0.005
-            else ""
-        )
+        stretch = model_width * height / (model_height * width)
+        stretched = ""
+        if abs(stretch - 1.0) > 0.005:
+            stretched = (
+                f", which makes things {stretch:.3g} times as high for their width"
+            )
         return (
-            f"{self.name} is for {wide} x {tall} pixels (width x height): its focal "
-            "lengths and its principal point "
-            f"are scaled to {width} x {height}{squeezed}.",
+            f"{self.name} is for {model_width} x {model_height} pixels (width x "
+            "height): its focal lengths and its principal point "
+            f"are scaled to {width} x {height}{stretched}.",
         )
 
 
 def pinhole(fov: float, aspect: float) -> CameraModel:
-    """Return the model of a camera without distortion, by field of view (degrees,
-    larger side) and aspect.
+    """Return the model of a camera without distortion.
+
+    Args:
+        fov: field of view of the larger side, degrees.
+        aspect: width divided by height.
     """
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
     linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
@@ -403,49 +435,69 @@ def pinhole(fov: float, aspect: float) -> CameraModel:
 
 
 def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
-    """Return the models that need no file, by name, for a picture of a shape."""
-    half = 1.0 / math.pi
-    none = [0.0] * len(COEFFICIENTS)
-    ideal = (
-        half * min(1.0, 1.0 / aspect),
-        half * min(1.0, aspect),
+    """Return the models that need no file, by name, for an aspect ratio (w / h)."""
+    focal = 1.0 / math.pi
+    no_distortion = [0.0] * len(COEFFICIENTS)
+    fisheye = (
+        focal * min(1.0, 1.0 / aspect),
+        focal * min(1.0, aspect),
         0.5,
         0.5,
         0.0,
-        *none,
+        *no_distortion,
     )
-    panorama = CameraModel(
-        EQUIRECTANGULAR, (1.0, 1.0, 0.5, 0.5, 0.0, *none), EQUIRECTANGULAR
-    )
+    panorama = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
     return {
-        FISHEYE: CameraModel(FISHEYE, ideal, FISHEYE, reach=90.0),
-        EQUIRECTANGULAR: panorama,
+        FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, reach=90.0),
+        EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, panorama, EQUIRECTANGULAR),
     }
 
 
-def _evaluated(of: Polynomial, at: Tensor) -> Tensor:
-    value = torch.full_like(at, float(of.coef[-1]))
-    for coefficient in of.coef[-2::-1]:
-        value = value * at + float(coefficient)
+def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Return image coordinates (N, 2) of points in an equirectangular image."""
+    longitude = torch.atan2(x, z)
+    latitude = torch.atan2(y, torch.hypot(x, z))
+    column = 0.5 + longitude / (2.0 * torch.pi)
+    row = 0.5 + latitude / torch.pi
+    return torch.stack([column, row], dim=-1)
+
+
+def _panorama_directions(u: Tensor, v: Tensor) -> Tensor:
+    """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
+    longitude = (u - 0.5) * (2.0 * torch.pi)
+    latitude = (v - 0.5) * torch.pi
+    level = latitude.cos()
+    return torch.stack(
+        [level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1
+    )
+
+
+def _evaluated(polynomial: Polynomial, x: Tensor) -> Tensor:
+    """Evaluate a polynomial by Horner's method."""
+    value = torch.full_like(x, float(polynomial.coef[-1]))
+    for coefficient in polynomial.coef[-2::-1]:
+        value = value * x + float(coefficient)
     return value
 
 
 def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Values (N, k) of a function of each of N places alone, and the derivatives of
-    each of the k by the place.
+    """Evaluate a function that maps each of N points separately, and differentiate it.
+
+    Returns:
+        The values (N, k), and the derivatives of each of the k by the points.
     """
     with torch.enable_grad():
-        places = at.detach().requires_grad_()
-        values = function(places)
+        points = at.detach().requires_grad_()
+        values = function(points)
         slopes = [
-            torch.autograd.grad(each.sum(), places, retain_graph=True)[0]
-            for each in values.unbind(dim=-1)
+            torch.autograd.grad(component.sum(), points, retain_graph=True)[0]
+            for component in values.unbind(dim=-1)
         ]
     return values.detach(), slopes
 
 
 def _inside(margin: Tensor, converged: Tensor) -> Tensor:
-    """The margin, at most 1, below zero where an inversion has not converged."""
+    """Return margins clipped to 1, below zero if an inversion has not converged."""
     return torch.where(
         converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)
     ).clamp(-1.0, 1.0)

@@ -1,5 +1,4 @@
-"""Meshes as binary glTF 2.0 (.glb): one node a mesh, its texture inside as a PNG or
-JPEG file of 8 bits.
+"""Writer of binary glTF 2.0 (.glb): one node for each mesh, textures as PNG or JPEG.
 
 Up is +y, and the front, our +x, is +z, as the format says of an asset (glTF 2.0,
 section 3.4).
@@ -25,24 +24,26 @@ from advsearch.pictures import png_of
 from advsearch.scene.assets import Doubles, Floats, Shape
 from advsearch.scene.color import linear_to_srgb
 
-# ---- The buffer of a binary glTF file, and the file around it
-# -------------------------------------------------------
+# ---- The buffer of a binary glTF file, and the file around it ----
 
-FLOAT = 5126  # types of numbers in glTF: float32, uint32 and uint16
+# Component types: float32, uint32 and uint16.
+FLOAT = 5126
 WHOLE = 5125
 SHORT = 5123
-CORNERS = 34962  # what a part of the buffer is for
+# Targets of buffer views: vertex attributes, and indices.
+CORNERS = 34962
 INDICES = 34963
 
 
 def mime_type(picture: bytes) -> str:
-    """Return the kind of a PNG or JPEG file, as glTF calls it."""
+    """Return the MIME type of a PNG or JPEG file."""
     return "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
 
 
 class GlbBuffer:
-    """The bytes of a file and where in them what is; bytes that are there already are
-    not added again.
+    """The binary buffer of a glTF file, with its views and accessors.
+
+    Bytes that are already in it are not added again.
     """
 
     def __init__(self) -> None:
@@ -52,10 +53,11 @@ class GlbBuffer:
         self.accessors: list[dict[str, Any]] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
-        """Append some bytes, whole words, and return the number of the view."""
-        if (data, target) in self._known:
-            return self._known[data, target]
-        self._known[data, target] = len(self.views)
+        """Append bytes, padded to four, and return the index of their view."""
+        key = (data, target)
+        if key in self._known:
+            return self._known[key]
+        self._known[key] = len(self.views)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         self.views.append(view if target is None else {**view, "target": target})
         self.data += data + bytes(-len(data) % 4)
@@ -64,31 +66,33 @@ class GlbBuffer:
     def accessor(
         self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False
     ) -> int:
-        """Append an array and return the number of its accessor."""
-        number = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}.get(
-            values.dtype, FLOAT
-        )
-        view = self.view(
-            np.ascontiguousarray(values).tobytes(),
-            CORNERS if number == FLOAT else INDICES,
-        )
+        """Append an array and return the index of its accessor.
+
+        Args:
+            values: (N,) or (N, width), float32, uint32 or uint16.
+            kind: glTF's type of a row, such as "VEC3".
+            bounds: whether minimum and maximum are written too.
+        """
+        integer_types = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
+        component_type = integer_types.get(values.dtype, FLOAT)
+        target = CORNERS if component_type == FLOAT else INDICES
+        view = self.view(np.ascontiguousarray(values).tobytes(), target)
         entry: dict[str, Any] = {
             "bufferView": view,
-            "componentType": number,
+            "componentType": component_type,
             "count": len(values),
             "type": kind,
         }
         if bounds:
-            entry |= {
-                "min": values.min(axis=0).tolist(),
-                "max": values.max(axis=0).tolist(),
-            }
+            entry["min"] = values.min(axis=0).tolist()
+            entry["max"] = values.max(axis=0).tolist()
         self.accessors.append(entry)
         return len(self.accessors) - 1
 
     def file(self, header: dict[str, Any]) -> bytes:
-        """Return the whole file with a header that says all but what is in the
-        buffer.
+        """Return the complete file.
+
+        The entries of the buffer are added to the header.
         """
         header |= {
             "accessors": self.accessors,
@@ -97,27 +101,28 @@ class GlbBuffer:
         }
         text = json.dumps(header).encode()
         text += b" " * (-len(text) % 4)
-        rest = bytes(self.data)
-        head = struct.pack(
-            "<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A
-        )
-        return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
+        binary = bytes(self.data)
+        size = 28 + len(text) + len(binary)
+        file_header = struct.pack("<4sIIII", b"glTF", 2, size, len(text), 0x4E4F534A)
+        chunk_header = struct.pack("<II", len(binary), 0x004E4942)
+        return file_header + text + chunk_header + binary
 
 
 Levels = npt.NDArray[np.uint8]
-# of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it
+# Square root of the alpha of Mitsuba's clearcoat, 0.1.
 COAT_ROUGHNESS = 0.316
 PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
-# longest side of a texture in a file for the web, and the quality of its JPEG
+# Limit of the sides of a texture in a file for the web, and the quality of its JPEG.
 WEB_SIDE = 1024
 WEB_QUALITY = 90
-# its place counts
+# Entry of a camera, of which only the pose of its node counts.
 CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
-    made = GlbBuffer()
-    return made.file(_described(made, meshes, png_of))
+    """Return meshes as a binary glTF file with PNG textures."""
+    buffer = GlbBuffer()
+    return buffer.file(_described(buffer, meshes, png_of))
 
 
 def web_glb(
@@ -126,40 +131,55 @@ def web_glb(
     camera: Doubles,
     note: str = "",
 ) -> bytes:
-    """Return a small file with two scenes, the adversarial one and "clean": what is the
-    same in both is there once; with the camera of pose (4, 4), which looks along its
-    own +z, and a note for readers in `asset.extras`.
+    """Return a small file with two scenes, "adversarial" and "clean".
+
+    What is the same in both is stored once.
+
+    Args:
+        adversarial: meshes of the first scene.
+        clean: meshes of the second scene.
+        camera: (4, 4) pose of a camera, which looks along its +z.
+        note: text for readers, in `asset.extras`.
     """
-    made = GlbBuffer()
-    count = len(adversarial)
-    header = _described(made, [*adversarial, *clean], _jpeg)
-    ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
+    buffer = GlbBuffer()
+    header = _described(buffer, [*adversarial, *clean], _jpeg)
+    # Rows: its axes, then its position.
+    our_rows = camera[:3].T.astype(np.float32)
     columns = np.eye(4)
-    # glTF's look along their -z
-    columns[:, :3] = _y_up(ours * np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))
+    # glTF's cameras look along their -z.
+    signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
+    columns[:, :3] = _y_up(our_rows * signs)
     header["cameras"] = [CAMERA]
     header["nodes"].append(
         {"name": "camera", "camera": 0, "matrix": columns.ravel().tolist()}
     )
-    first = list(range(count))
-    last = len(header["nodes"]) - 1
+    n_adversarial = len(adversarial)
+    camera_node = len(header["nodes"]) - 1
     header["scenes"] = [
-        {"name": "adversarial", "nodes": [*first, last]},
-        {"name": "clean", "nodes": list(range(count, last))},
+        {"name": "adversarial", "nodes": [*range(n_adversarial), camera_node]},
+        {"name": "clean", "nodes": list(range(n_adversarial, camera_node))},
     ]
-    header["asset"] |= {"extras": {"note": note}} if note else {}
-    return made.file(header)
+    if note:
+        header["asset"]["extras"] = {"note": note}
+    return buffer.file(header)
 
 
 def _described(
     made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Levels], bytes]
 ) -> dict[str, Any]:
+    """Return the header of a file of meshes, whose data is added to a buffer.
+
+    Args:
+        made: the buffer.
+        meshes: one node each.
+        picture: encodes an image (H, W, 3).
+    """
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [
-            {"name": shape.name, "mesh": number} for number, shape in enumerate(meshes)
+            {"name": shape.name, "mesh": index} for index, shape in enumerate(meshes)
         ],
         "meshes": [],
         "materials": [],
@@ -169,56 +189,70 @@ def _described(
         ],
         "images": [],
     }
-    for number, shape in enumerate(meshes):
-        mesh = shape.mesh
-        lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
-        normals = np.where(
-            lengths > 0.0, mesh.normals / np.maximum(lengths, 1e-12), np.eye(3)[2]
-        ).astype(np.float32)
-        corners = {
-            "POSITION": made.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
-            "NORMAL": made.accessor(_y_up(normals), "VEC3"),
-            "TEXCOORD_0": made.accessor(
-                np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"
-            ),
-        }
-        whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
-        indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
-        primitive = {"attributes": corners, "indices": indices, "material": number}
+    for index, shape in enumerate(meshes):
+        primitive = {**_add_geometry(made, shape), "material": index}
         header["meshes"].append({"name": shape.name, "primitives": [primitive]})
-        levels = _levels(shape.base_color)
-        encoded = (
-            picture(levels)
-            if shape.opacity is None
-            else _cut_out_png(levels, _levels(shape.opacity))
-        )
-        material = _material(shape, _texture(header, made, encoded))
-        if shape.normal_map is not None:
-            material["normalTexture"] = _texture(
-                header, made, picture(_levels(shape.normal_map))
-            )
-        if shape.emission is not None:
-            most = float(shape.emission.max())
-            material["emissiveFactor"] = [1.0, 1.0, 1.0]
-            share = linear_to_srgb(shape.emission / np.float32(most))
-            material["emissiveTexture"] = _texture(
-                header, made, picture(_levels(share))
-            )
-            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {
-                "emissiveStrength": most
-            }
-        header["materials"].append(material)
-    used = sorted(
-        {
-            name
-            for material in header["materials"]
-            for name in material.get("extensions", ())
-        }
-    )
-    return {**header, "extensionsUsed": used} if used else header
+        header["materials"].append(_add_material(header, made, shape, picture))
+    used = {
+        name
+        for material in header["materials"]
+        for name in material.get("extensions", ())
+    }
+    if used:
+        header["extensionsUsed"] = sorted(used)
+    return header
+
+
+def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
+    """Add the mesh of a shape to a buffer, and return its primitive."""
+    mesh = shape.mesh
+    lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
+    # The format requires unit normals.
+    normals = np.where(
+        lengths > 0.0, mesh.normals / np.maximum(lengths, 1e-12), np.eye(3)[2]
+    ).astype(np.float32)
+    uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
+    attributes = {
+        "POSITION": buffer.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
+        "NORMAL": buffer.accessor(_y_up(normals), "VEC3"),
+        "TEXCOORD_0": buffer.accessor(uvs, "VEC2"),
+    }
+    is_large = len(mesh.vertices) > np.iinfo(np.uint16).max
+    index_type = np.uint32 if is_large else np.uint16
+    indices = buffer.accessor(mesh.faces.reshape(-1).astype(index_type), "SCALAR")
+    return {"attributes": attributes, "indices": indices}
+
+
+def _add_material(
+    header: dict[str, Any],
+    buffer: GlbBuffer,
+    shape: Shape,
+    encode_image: Callable[[Levels], bytes],
+) -> dict[str, Any]:
+    """Add the images of a shape, and return its material."""
+    color = _levels(shape.base_color)
+    if shape.opacity is None:
+        encoded = encode_image(color)
+    else:
+        encoded = _cut_out_png(color, _levels(shape.opacity))
+    material = _material(shape, _texture(header, buffer, encoded))
+    if shape.normal_map is not None:
+        normals = encode_image(_levels(shape.normal_map))
+        material["normalTexture"] = _texture(header, buffer, normals)
+    if shape.emission is not None:
+        # A texture is at most 1, so the strength is an extension.
+        strength = float(shape.emission.max())
+        material["emissiveFactor"] = [1.0, 1.0, 1.0]
+        relative = linear_to_srgb(shape.emission / np.float32(strength))
+        emission = encode_image(_levels(relative))
+        material["emissiveTexture"] = _texture(header, buffer, emission)
+        extensions = material.setdefault("extensions", {})
+        extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
+    return material
 
 
 def _texture(header: dict[str, Any], made: GlbBuffer, picture: bytes) -> dict[str, int]:
+    """Add an image file as a texture, and return the reference to it."""
     header["images"].append(
         {"mimeType": mime_type(picture), "bufferView": made.view(picture)}
     )
@@ -227,41 +261,47 @@ def _texture(header: dict[str, Any], made: GlbBuffer, picture: bytes) -> dict[st
 
 
 def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
+    """Return the material of a shape with a texture of its base color."""
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}
     if shape.opacity is not None:
-        material["alphaMode"] = (
-            "MASK" if set(np.unique(shape.opacity)) <= {0.0, 1.0} else "BLEND"
-        )
-    numbers = {"roughnessFactor": surface.roughness, "metallicFactor": surface.metallic}
-    material["pbrMetallicRoughness"] = {"baseColorTexture": texture, **numbers}
+        is_binary = set(np.unique(shape.opacity)) <= {0.0, 1.0}
+        material["alphaMode"] = "MASK" if is_binary else "BLEND"
+    material["pbrMetallicRoughness"] = {
+        "baseColorTexture": texture,
+        "roughnessFactor": surface.roughness,
+        "metallicFactor": surface.metallic,
+    }
     extensions: dict[str, Any] = {}
     if surface.specular != PLAIN:
         extensions["KHR_materials_specular"] = {
             "specularFactor": min(1.0, surface.specular / PLAIN)
         }
     if surface.clearcoat > 0.0:
-        coat = {
+        extensions["KHR_materials_clearcoat"] = {
             "clearcoatFactor": surface.clearcoat,
             "clearcoatRoughnessFactor": COAT_ROUGHNESS,
         }
-        extensions["KHR_materials_clearcoat"] = coat
-    return {**material, "extensions": extensions} if extensions else material
+    if extensions:
+        material["extensions"] = extensions
+    return material
 
 
 def _y_up(vectors: Floats) -> Floats:
-    """Turn (N, 3) from z up and +x ahead to y up and +z ahead."""
+    """Rotate vectors (N, 3) from z up and +x ahead to y up and +z ahead."""
     return np.stack([vectors[:, 1], vectors[:, 2], vectors[:, 0]], axis=1).astype(
         np.float32
     )
 
 
 def _levels(color: Floats) -> Levels:
+    """Quantize values in [0, 1] to 8 bits."""
     levels: Levels = np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
     return levels
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
+    """Encode colors (H, W, 3) with an opacity, resized to their size, as PNG."""
     picture = Image.fromarray(color)
     picture.putalpha(
         Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR)
@@ -270,6 +310,7 @@ def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
 
 
 def _jpeg(color: Levels) -> bytes:
+    """Encode colors (H, W, 3) as JPEG, reduced to the size for the web."""
     file = io.BytesIO()
     picture = Image.fromarray(color)
     picture.thumbnail((WEB_SIDE, WEB_SIDE))

@@ -1,25 +1,27 @@
-"""People: a dressed body with phenotype and joints, evaluated in torch, so that
-gradients reach every number.
+"""People: dressed bodies with phenotype and joints, differentiable in torch.
 
-    points = mean + sum_r c_r(gender, age, weight, height) b_r          a few shapes (MakeHuman's, CC0)
-    posed  = sum_j w_j (A_j Z_j (p - h_j) + t_j)                        linear blend skinning, joint j at h_j
+A few shapes (MakeHuman's, CC0) are mixed, then posed by linear blend skinning, with
+joint j at h_j:
+
+    points = mean + sum_r c_r(gender, age, weight, height) b_r
+    posed  = sum_j w_j (A_j Z_j (p - h_j) + t_j)
 
 Z_j brings the arms of MakeHuman's rest pose down and the legs together: there all
-angles are 0. A_j are the joints' turns about the body's own axes (x ahead, y to its
-left, z up), from the pelvis outwards. The lowest point stands on the ground.
+angles are 0. A_j are the joints' turns about the body's axes (x ahead, y to its left,
+z up), from the pelvis outwards. The lowest point stands on the ground.
 `scenes/person.py` makes the data.
 
-Walking adds a gait's mean angles over its cycle, as measured of adults (Winter 1991,
-"The Biomechanics and Motor Control of Human Gait", chapter 2), rounded, by a Fourier
-series. Whoever has other proportions would hover with the foot that they stand on, or
-drag the other through the ground. So a walker's legs are made a little longer or
-shorter, between hip and ankle, until each foot in stance touches the ground.
+Walking adds the mean angles of a gait over its cycle, as measured of adults (Winter
+1991, "The Biomechanics and Motor Control of Human Gait", chapter 2), rounded, by a
+Fourier series. A body with other proportions would hover with its standing foot, or drag
+the other through the ground. So the legs are stretched or shortened a little, between
+hip and ankle, until each foot in stance touches the ground.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from importlib import resources
 from types import MappingProxyType
@@ -95,13 +97,13 @@ LIMBS = (
     ("knee", 0.0, 130.0, "calf, bent"),
     ("ankle", -35.0, 20.0, "foot, its toes up"),
 )
-"""Joints that are there twice, with their limits in degrees."""
+"""Joints on both sides, with their limits in degrees."""
 _JOINTS = tuple(
     _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
-# everything that a person can be asked for
+# All parameters of a person.
 PARAMETERS = (*PHENOTYPE, *WALK, *SPINE, *_JOINTS)
 GAIT = {
     "hip": (21, 15, 7, -3, -12, -19, -15, 1, 16, 22),
@@ -110,9 +112,10 @@ GAIT = {
     "shoulder": (-20, -17, -8, 4, 14, 18, 15, 6, -6, -16),
     "elbow": (8, 10, 15, 22, 27, 30, 27, 22, 15, 10),
 }
-"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same
-side. The hip's are those of the thigh against the vertical: 9 degrees less than against
-the pelvis, which is tilted ahead.
+"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same side.
+
+The hip's are those of the thigh against the vertical: 9 degrees less than against the
+pelvis, which is tilted ahead.
 """
 STANCE = 216.0
 LIFTED = 252.0
@@ -120,18 +123,23 @@ LOWERED = 324.0
 """Degrees of a cycle at which the toes of a foot leave the ground, from which it
 swings, and from which it comes down; at 360 its heel strikes.
 """
-# from which on both feet are put onto the ground; below, in proportion
+# Stride from which both feet are put onto the ground; below, in proportion.
 FULL_CONTACT_STRIDE = 0.1
 STRAIGHT = {
     "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
     "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
 }  # fmt: skip
-"""Where a bone points with all angles 0, on the left side, and the joint at its end."""
+"""For each bone the joint at its end, and its direction with all angles 0 on the left."""
 
 
 class Person:
-    """A dressed body, as `scenes/person.py` has sewn it: a `MeshRig`, whose largest
-    extent at its defaults is `size` metres, of the arrays of body.npz.
+    """A dressed person as a `MeshRig`.
+
+    Its largest extent at its defaults is `size` metres.
+
+    Args:
+        data: the arrays of body.npz, which `scenes/person.py` makes.
+        defaults: default values that replace those of `PARAMETERS`.
     """
 
     parameters = PARAMETERS
@@ -147,13 +155,11 @@ class Person:
         self.defaults = usual | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
-        self._held = {
+        weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
+        self._tensors = {
             "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
             "basis": torch.from_numpy(data["basis"].astype(np.float32)),
-            "weights": torch.from_numpy(
-                data["weights"]
-                / data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
-            ),
+            "weights": torch.from_numpy(data["weights"] / weight_sums),
             "index": torch.from_numpy(data["index"].astype(np.int64)),
         } | {
             name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")
@@ -161,27 +167,38 @@ class Person:
         is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
         is_left = data["mean"][shoe_points, 1] > 0
-        self._held["shoe_l"] = torch.from_numpy(shoe_points[is_left])
-        self._held["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
+        self._tensors["shoe_l"] = torch.from_numpy(shoe_points[is_left])
+        self._tensors["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
         self.standing = self.posed({})
         self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
+        """Return how far vertices move from the standing person, (V, 3) in its size.
+
+        Arguments are those of `posed`; there are no clips.
+        """
         posed = self.posed(values)
         return (posed - self.standing.to(posed.device)) / self.size
 
     def posed(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the vertices (V, 3) in metres, the pelvis above the origin and the
-        lowest on z = 0, of numbers without dimensions by the names of `PARAMETERS`; its
-        own default where one is missing.
+        """Return the vertices (V, 3) in metres.
+
+        The pelvis is above the origin, and the lowest vertex on z = 0.
+
+        Args:
+            values: scalar tensors by the names of `PARAMETERS`; this person's default
+                if one is missing.
         """
         number = self._numbers(values)
         device = number["height"].device
-        mixed, factor = self._phenotype(number)
-        shares = torch.einsum("gawh,gawhr->r", mixed, self._on("shares", device))
-        points = self._on("mean", device) + torch.einsum(
-            "r,rpc->pc", shares, self._on("basis", device)
+        mixture, scale = self._phenotype(number)
+        coefficients = torch.einsum(
+            "gawh,gawhr->r", mixture, self._on("shares", device)
         )
+        points = self._on("mean", device) + torch.einsum(
+            "r,rpc->pc", coefficients, self._on("basis", device)
+        )
+        # The joints are the last points.
         joints = points[-len(self._bones) :]
         points = points[: -len(self._bones)]
         turns, shifts = self._skeleton(joints, walked(number))
@@ -192,33 +209,27 @@ class Person:
             posed = self._with_legs_corrected(posed, turns, shifts, joints, raised)
         pelvis = shifts[0] + turns[0] @ joints[0]
         floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
-        return (factor * (posed - floor)).index_select(0, self._on("index", device))
+        return (scale * (posed - floor)).index_select(0, self._on("index", device))
 
     def _leg_corrections(
         self, points: Tensor, joints: Tensor, number: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return by how much each foot has to rise, by its side, so that a foot in
-        stance is on the ground.
+        """Return how much each foot has to rise, "l" and "r", to touch the ground.
 
-        They are those of the walk alone: what else is asked of the joints is left as it
-        is.
+        These are the corrections of the walk alone, without other joint angles.
         """
-        walk_alone = {
-            **number,
-            **{
-                one.name: torch.zeros_like(number["walk"]) for one in (*SPINE, *_JOINTS)
-            },
-        }
-        turns, shifts = self._skeleton(joints, walked(walk_alone))
+        zero = torch.zeros_like(number["walk"])
+        without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
+        angles = walked({**number, **without_joints})
+        turns, shifts = self._skeleton(joints, angles)
         weights = self._on("weights", points.device)
         lowest = dict[str, Tensor]()
         contact = dict[str, Tensor]()
-        for side, begin in (("l", 0.0), ("r", 180.0)):
+        for side, phase_shift in (("l", 0.0), ("r", 180.0)):
             shoe = self._on(f"shoe_{side}", points.device)
-            lowest[side] = skinned(points[shoe], weights[shoe], turns, shifts)[
-                :, 2
-            ].amin()
-            contact[side] = contact_of(number["walk"] + begin)
+            shoe_points = skinned(points[shoe], weights[shoe], turns, shifts)
+            lowest[side] = shoe_points[:, 2].amin()
+            contact[side] = contact_of(number["walk"] + phase_shift)
         ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
             contact["l"] + contact["r"]
         )
@@ -237,9 +248,7 @@ class Person:
         joints: Tensor,
         raised: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) whose feet have risen, and what is between hip and
-        ankle in proportion.
-        """
+        """Return posed points (P, 3) with feet risen, and legs stretched in proportion."""
         weights = self._on("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
         for side, foot_rise in raised.items():
@@ -252,13 +261,13 @@ class Person:
             below_hip = (
                 (hip_height - posed[:, 2]) / (hip_height - ankle_height)
             ).clamp(0.0, 1.0)
-            of_foot = sum(weights[:, index] for index in self._foot_bones(foot))
-            rise = rise + foot_rise * (
-                of_foot + (weights[:, thigh] + weights[:, calf]) * below_hip
-            )
+            foot_weight = sum(weights[:, index] for index in self._foot_bones(foot))
+            leg_weight = (weights[:, thigh] + weights[:, calf]) * below_hip
+            rise = rise + foot_rise * (foot_weight + leg_weight)
         return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
 
     def _foot_bones(self, foot: int) -> list[int]:
+        """Return the bone of a foot and its children."""
         return [
             foot,
             *(index for index, parent in enumerate(self._parents) if parent == foot),
@@ -267,84 +276,92 @@ class Person:
     def measured(
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
-        mixed, factor = self._phenotype(self._numbers(values))
-        return {
-            "mass": {
-                "value": float(
-                    (mixed * self._on("mass", mixed.device)).sum() * factor**3
-                ),
-                "unit": "kg",
-            }
-        }
+        """Return the mass of the person."""
+        mixture, scale = self._phenotype(self._numbers(values))
+        mass = (mixture * self._on("mass", mixture.device)).sum() * scale**3
+        return {"mass": {"value": float(mass), "unit": "kg"}}
 
     def _numbers(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        some = next(iter(values.values()), torch.zeros(()))
+        """Return the values of all parameters, defaults included."""
+        reference = next(iter(values.values()), torch.zeros(()))
         return {
-            name: values.get(name, some.new_tensor(default))
+            name: values.get(name, reference.new_tensor(default))
             for name, default in self.defaults.items()
         }
 
     def _on(self, name: str, device: torch.device) -> Tensor:
-        return self._held[name].to(device)
+        """Return one of the tensors on a device."""
+        return self._tensors[name].to(device)
 
     def _phenotype(self, number: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """How much of each extreme (G, A, W, H) there is, and the factor that is left
-        to the height asked for.
+        """Return the mixture of extreme bodies, and the scale that it still needs.
+
+        Returns:
+            (G, A, W, H) weights of the extremes of gender, age, weight and height,
+            which sum to 1; and the factor to the requested height.
         """
         gender = torch.stack([1.0 - number["gender"], number["gender"]])
         age = hats(number["age"], number["age"].new_tensor(AGES))
         weight = hats(number["weight"], number["weight"].new_tensor([0.0, 0.5, 1.0]))
-        mixed = torch.einsum("g,a,w->gaw", gender, age, weight)
-        statures = torch.einsum("gaw,gawh->h", mixed, self._on("stature", mixed.device))
-        asked = number["height"]
-        height = hats(
-            torch.minimum(torch.maximum(asked, statures[0]), statures[2]), statures
+        mixture = torch.einsum("g,a,w->gaw", gender, age, weight)
+        statures = torch.einsum(
+            "gaw,gawh->h", mixture, self._on("stature", mixture.device)
         )
-        return mixed[..., None] * height, asked / (height * statures).sum()
+        requested = number["height"]
+        clamped = torch.minimum(torch.maximum(requested, statures[0]), statures[2])
+        height = hats(clamped, statures)
+        return mixture[..., None] * height, requested / (height * statures).sum()
 
     def _skeleton(
         self, joints: Tensor, angle: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Turn (J, 3, 3) and shift (J, 3) of each bone: p goes to `turn @ p +
-        shift`.
+        """Return the turn (J, 3, 3) and shift (J, 3) of each bone.
+
+        A point p moves to `turn @ p + shift`.
         """
+        straight = self._straight_turns(joints)
+        joint_turns = turned(angle)
+        identity = torch.eye(3, device=joints.device, dtype=joints.dtype)
+        global_turns = list[Tensor]()
+        turns = list[Tensor]()
+        positions = list[Tensor]()
+        for index, (bone, parent) in enumerate(
+            zip(self._bones, self._parents, strict=True)
+        ):
+            turn = joint_turns.get(bone, identity)
+            global_turns.append(turn if parent < 0 else global_turns[parent] @ turn)
+            turns.append(global_turns[-1] @ straight.get(bone, identity))
+            if parent < 0:
+                positions.append(joints[index])
+            else:
+                bone_vector = joints[index] - joints[parent]
+                positions.append(positions[parent] + turns[parent] @ bone_vector)
+        stacked = torch.stack(turns)
+        return stacked, torch.stack(positions) - torch.einsum(
+            "jik,jk->ji", stacked, joints
+        )
+
+    def _straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
+        """Return the turns (3, 3) of limbs from the rest pose to all angles 0."""
         straight = dict[str, Tensor]()
-        own = turned(angle)
-        # each bone that has a direction where all angles are 0
         for side, sign in (("l", 1.0), ("r", -1.0)):
             for bone, (end, (x, y, z)) in STRAIGHT.items():
-                begin, stop = (
+                start_point, end_point = (
                     joints[self._bones.index(f"{name}_{side}")] for name in (bone, end)
                 )
                 straight[f"{bone}_{side}"] = least_turn(
-                    stop - begin, joints.new_tensor([x, sign * y, z])
+                    end_point - start_point, joints.new_tensor([x, sign * y, z])
                 )
             straight[f"hand_{side}"] = (
                 about("z", joints.new_tensor(sign * 60.0))
                 @ straight[f"lowerarm_{side}"]
             )
-        same = torch.eye(3, device=joints.device, dtype=joints.dtype)
-        carried = list[Tensor]()
-        turns = list[Tensor]()
-        places = list[Tensor]()
-        for number, (bone, parent) in enumerate(
-            zip(self._bones, self._parents, strict=True)
-        ):
-            turn = own.get(bone, same)
-            carried.append(turn if parent < 0 else carried[parent] @ turn)
-            turns.append(carried[-1] @ straight.get(bone, same))
-            reach = joints[number] - joints[parent]
-            places.append(
-                joints[number] if parent < 0 else places[parent] + turns[parent] @ reach
-            )
-        stacked = torch.stack(turns)
-        return stacked, torch.stack(places) - torch.einsum(
-            "jik,jk->ji", stacked, joints
-        )
+        return straight
 
 
 @lru_cache(maxsize=1)
 def body_data() -> Mapping[str, np.ndarray]:
+    """Load the arrays of body.npz."""
     content = (
         resources.files("advsearch.bundled") / "data/objects/person/body.npz"
     ).read_bytes()
@@ -353,15 +370,16 @@ def body_data() -> Mapping[str, np.ndarray]:
 
 
 def hats(value: Tensor, at: Tensor) -> Tensor:
-    """Return how much of each of some rising places (n,) a number has, by linear
-    interpolation between them; its sum is 1 from the first place to the last.
+    """Return the weights (n,) of linear interpolation between rising nodes (n,).
+
+    They sum to 1 from the first node to the last.
     """
-    share = (value - at[:-1]) / (at[1:] - at[:-1])
-    # at a place the derivative is that of one side, not the sum of both
-    within = (share >= 0.0) & (share < 1.0)
-    share = torch.where(within, share, (share >= 1.0).to(share.dtype))
-    return torch.cat([torch.ones_like(share[:1]), share]) - torch.cat(
-        [share, torch.zeros_like(share[:1])]
+    fraction = (value - at[:-1]) / (at[1:] - at[:-1])
+    # At a node the derivative is that of one side, not the sum of both.
+    is_within = (fraction >= 0.0) & (fraction < 1.0)
+    fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
+    return torch.cat([torch.ones_like(fraction[:1]), fraction]) - torch.cat(
+        [fraction, torch.zeros_like(fraction[:1])]
     )
 
 
@@ -370,32 +388,39 @@ def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
     angle = dict(number)
     phase = torch.deg2rad(number["walk"])
     stride = number["stride"]
-    for side, begin in (("left", 0.0), ("right", np.pi)):
+    for side, phase_shift in (("left", 0.0), ("right", np.pi)):
         for joint, tenths in GAIT.items():
-            waves = np.fft.rfft(tenths)[:5] / len(tenths)
-            swing = phase.new_tensor(float(waves[0].real))
-            for order, wave in enumerate(waves[1:], 1):
-                at = order * (phase + begin)
-                swing = swing + 2.0 * (
-                    float(wave.real) * torch.cos(at) - float(wave.imag) * torch.sin(at)
-                )
+            swing = _gait_angle(tenths, phase, phase_shift)
             angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
     angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
-    joints = (
-        parameter
+    limits = {
+        parameter.name: (parameter.low, parameter.high)
         for parameter in PARAMETERS
         if parameter.unit == "degrees" and not parameter.periodic
-    )
-    limits = {joint.name: (joint.low, joint.high) for joint in joints}
+    }
     return {
         name: value.clamp(*limits[name]) if name in limits else value
         for name, value in angle.items()
     }
 
 
+def _gait_angle(tenths: Sequence[int], phase: Tensor, phase_shift: float) -> Tensor:
+    """Return an angle of the gait at a phase, by a Fourier series of its samples."""
+    waves = np.fft.rfft(tenths)[:5] / len(tenths)
+    swing = phase.new_tensor(float(waves[0].real))
+    for order, wave in enumerate(waves[1:], 1):
+        argument = order * (phase + phase_shift)
+        swing = swing + 2.0 * (
+            float(wave.real) * torch.cos(argument)
+            - float(wave.imag) * torch.sin(argument)
+        )
+    return swing
+
+
 def contact_of(phase: Tensor) -> Tensor:
-    """Return how much a foot is held to the ground, 0 to 1, at degrees of its cycle
-    from its heel strike.
+    """Return how much a foot is held to the ground, 0 to 1.
+
+    The phase is in degrees of the foot's cycle from its heel strike.
     """
     degrees = torch.remainder(phase, 360.0)
     lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
@@ -404,20 +429,26 @@ def contact_of(phase: Tensor) -> Tensor:
 
 
 def skinned(points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
-    """Return points (P, 3), moved with bones (J) in the proportions of their weights
-    (P, J): linear blend skinning.
+    """Return points moved with bones: linear blend skinning.
+
+    Args:
+        points: (P, 3).
+        weights: (P, J).
+        turns: (J, 3, 3) of the bones.
+        shifts: (J, 3).
     """
-    moved = torch.einsum(
+    blended = torch.einsum(
         "pj,jk->pk", weights, torch.cat([turns.reshape(-1, 9), shifts], dim=1)
     )
     return (
-        torch.einsum("pik,pk->pi", moved[:, :9].reshape(-1, 3, 3), points)
-        + moved[:, 9:]
+        torch.einsum("pik,pk->pi", blended[:, :9].reshape(-1, 3, 3), points)
+        + blended[:, 9:]
     )
 
 
 def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return each bone's own turn (3, 3) of joint angles in degrees."""
+    """Return each bone's turn (3, 3) against its parent, of joint angles in degrees."""
+    # The back bends in three equal parts, neck and head share the nod.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )
@@ -430,37 +461,40 @@ def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         "neck_01": nod,
         "head": nod,
     }
-    for name, left in (("left", 1.0), ("right", -1.0)):
-        limb = {joint: angle[f"{name}_{joint}"] for joint, *_ in LIMBS}
-        end = name[0]
-        raised = about("x", left * limb["shoulder_out"]) @ about("y", -limb["shoulder"])
-        turns[f"upperarm_{end}"] = raised @ about("z", -left * limb["shoulder_turn"])
-        turns[f"lowerarm_{end}"] = about("y", -limb["elbow"])
-        turns[f"thigh_{end}"] = about("x", left * limb["hip_out"]) @ about(
+    for side_name, sign in (("left", 1.0), ("right", -1.0)):
+        limb = {joint: angle[f"{side_name}_{joint}"] for joint, *_ in LIMBS}
+        suffix = side_name[0]
+        raised = about("x", sign * limb["shoulder_out"]) @ about("y", -limb["shoulder"])
+        shoulder_turn = about("z", -sign * limb["shoulder_turn"])
+        turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
+        turns[f"lowerarm_{suffix}"] = about("y", -limb["elbow"])
+        turns[f"thigh_{suffix}"] = about("x", sign * limb["hip_out"]) @ about(
             "y", -limb["hip"]
         )
-        turns[f"calf_{end}"] = about("y", limb["knee"])
-        turns[f"foot_{end}"] = about("y", -limb["ankle"])
+        turns[f"calf_{suffix}"] = about("y", limb["knee"])
+        turns[f"foot_{suffix}"] = about("y", -limb["ankle"])
     return turns
 
 
 def about(axis: str, degrees: Tensor) -> Tensor:
-    """Return the turn (3, 3) about an axis of the body, right-handed."""
+    """Return the right-handed rotation (3, 3) about an axis of the body."""
     c = torch.cos(torch.deg2rad(degrees))
     s = torch.sin(torch.deg2rad(degrees))
-    zero = torch.zeros_like(c)
-    one = torch.ones_like(c)
+    zeros = torch.zeros_like(c)
+    ones = torch.ones_like(c)
     rows = {
-        "x": (one, zero, zero, zero, c, -s, zero, s, c),
-        "y": (c, zero, s, zero, one, zero, -s, zero, c),
-        "z": (c, -s, zero, s, c, zero, zero, zero, one),
+        "x": (ones, zeros, zeros, zeros, c, -s, zeros, s, c),
+        "y": (c, zeros, s, zeros, ones, zeros, -s, zeros, c),
+        "z": (c, -s, zeros, s, c, zeros, zeros, zeros, ones),
     }
     return torch.stack(rows[axis]).reshape(3, 3)
 
 
 def least_turn(begin: Tensor, end: Tensor) -> Tensor:
-    """Return the smallest turn (3, 3) from one direction to another, that is not
-    opposite: `I + V + V^2 / (1 + c)`.
+    """Return the smallest rotation (3, 3) from one direction to another.
+
+    It is `I + V + V^2 / (1 + c)`, with V the cross product matrix of the unit vectors
+    and c their dot product. They must not be opposite.
     """
     a = begin / begin.norm()
     b = end / end.norm()

@@ -1,13 +1,15 @@
-"""The rig of a glTF file: skins, morph targets and clips, evaluated in torch as the
-format says (glTF 2.0, Khronos).
+"""The rig of a glTF file: skins, morph targets and clips, differentiable in torch.
 
-    world_n = world_parent T R S                               nodes, section 3.5
-    moved   = sum_j w_j world_j inverse_bind_j (p + sum_t m_t d_t)   skins and morph targets, sections 3.7.3 and 3.7.2.2
+As glTF 2.0 (Khronos) defines nodes (section 3.5), skins and morph targets (sections
+3.7.3 and 3.7.2.2):
+
+    world_n = world_parent T R S
+    moved   = sum_j w_j world_j inverse_bind_j (p + sum_t m_t d_t)
 
 A clip sets T, R, S or m at a time by steps, by linear interpolation (of rotations on
-the sphere) or by cubic Hermite splines (section 3.11 and appendix C). A joint's own
-turns come on top: about the axes of the object as it stands at rest (z up), first x,
-then y, then z, carried along by the joints above it.
+the sphere) or by cubic Hermite splines (section 3.11 and appendix C). Turns of joints
+are applied in addition: about the axes of the object as it stands at rest (z up), first
+x, then y, then z, carried along by the joints above it.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from advsearch.scene.settings import Parameter
 from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn, with_above
 
 AXES = ("x", "y", "z")
-PERSON = PARAMETERS  # everything that a person can be asked for
+PERSON = PARAMETERS  # all parameters of a person
 WEIGHT = "weight"
 _moving = partial(Parameter.moving, Parameter.GEOMETRIC)
 TIME = _moving(
@@ -39,104 +41,109 @@ TIME = _moving(
     "Of the clip of a rigged file: 0 is its beginning, 1 its end.",
     (0.0, 1.0),
 )
-# cosine of the angle between rotations beyond which arc and chord are the same
+# Cosine of the angle between rotations beyond which arc and chord are the same.
 NEARLY_ONE = 1.0 - 1e-9
 
 
 def part_of_a_rig(name: str) -> Parameter | None:
-    """Return the parameter that `JOINT.x` (or y, z) or `TARGET.weight` means; None for
-    another form.
-    """
-    whose, dot, what = name.rpartition(".")
-    if not (whose and dot and what in (*AXES, WEIGHT)):
+    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or None."""
+    owner, dot, component = name.rpartition(".")
+    if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
-    if what == WEIGHT:
+    if component == WEIGHT:
         return _moving(
-            name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {whose} there is."
+            name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {owner} there is."
         )
     return _moving(
-        name, "degrees", -360.0, 360.0, 0.0, f"Turn of the joint {whose} about {what}."
+        name,
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        f"Turn of the joint {owner} about {component}.",
     )
 
 
 class SkeletonRig:
-    """What moves the mesh of a glTF file, which is made of some parts: each of its
-    `vertices` (V,) is the number of one among those of all parts one after the other,
-    and (3, 3) `to_mesh` leads from the file's axes and unit to its.
+    """Moves the mesh of a glTF file.
+
+    Args:
+        parts: the parts of the file that the mesh is made of.
+        vertices: (V,) for each vertex of the mesh its index in the concatenated
+            vertices of all parts.
+        to_mesh: (3, 3) from the file's axes and unit to those of the mesh.
     """
 
     def __init__(
         self, parts: Sequence[Movable], vertices: Ints, to_mesh: Doubles
     ) -> None:
-        self.skeleton, parents = parts[0].skeleton, parts[0].skeleton.parents
+        self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
         self._upright = torch.from_numpy(to_mesh / np.cbrt(np.linalg.det(to_mesh)))
-        # the parts one after the other, and what the mesh has of them
-        widest = max(part.joints.shape[1] for part in parts)
-        counts = [len(part.vertices) for part in parts]
-        starts = np.cumsum([0, *counts])
-        slots = np.cumsum([0, *(len(part.nodes) for part in parts)])
+        # The arrays of all parts are concatenated, then rows are selected for the mesh.
+        max_joints = max(part.joints.shape[1] for part in parts)
+        node_starts = np.cumsum([0, *(len(part.nodes) for part in parts)])
 
-        def wide(values: np.ndarray) -> np.ndarray:
-            return np.pad(values, ((0, 0), (0, widest - values.shape[1])))
+        def pad_joints(values: np.ndarray) -> np.ndarray:
+            """Pad arrays (V, n) of joints or weights to a common n."""
+            return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
-        self._points = torch.from_numpy(
-            np.concatenate([part.vertices for part in parts])[vertices]
-        )
+        points = np.concatenate([part.vertices for part in parts])
         joints = np.concatenate(
-            [wide(part.joints + slot) for part, slot in zip(parts, slots, strict=False)]
+            [
+                pad_joints(part.joints + start)
+                for part, start in zip(parts, node_starts, strict=False)
+            ]
         )
+        weights = np.concatenate([pad_joints(part.weights) for part in parts])
+        self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
-        self._weights = torch.from_numpy(
-            np.concatenate([wide(part.weights) for part in parts])[vertices]
-        )
+        self._weights = torch.from_numpy(weights[vertices])
         self._nodes = torch.from_numpy(np.concatenate([part.nodes for part in parts]))
         self._inverse = torch.from_numpy(
             np.concatenate([part.inverse for part in parts])
         )
+        # Name, node, index, weight at rest, vertices and offsets of each morph target.
         self._targets: list[tuple[str, int, int, float, Tensor, Tensor]] = []
+        self._add_targets(parts, vertices)
+        self._levels = _node_levels(self.skeleton.parents)
+        self._back = torch.argsort(torch.cat([nodes for nodes, _ in self._levels]))
+        self._local_matrices = torch.from_numpy(self.skeleton.places)
+        # The rotation nearest to each node's matrix in the scene, without its scale and
+        # shear.
+        world = self._world(self._local_matrices)[:, :3, :3].numpy()
+        left, _, right = np.linalg.svd(world)
+        self._axes = torch.from_numpy(left @ right)
+        self._rest = self.posed({})
+
+    def _add_targets(self, parts: Sequence[Movable], vertices: Ints) -> None:
+        """Store the morph targets of parts, for the vertices of the mesh."""
+        counts = [len(part.vertices) for part in parts]
+        starts = np.cumsum([0, *counts])
         for part, start, count in zip(parts, starts, counts, strict=False):
-            mine = np.flatnonzero((vertices >= start) & (vertices < start + count))
-            for number, target in enumerate(part.targets):
-                place = np.full(count, -1)
-                place[target.rows] = np.arange(len(target.rows))
-                rows = place[vertices[mine] - start]
-                hit = rows >= 0
-                moves = torch.from_numpy(target.moves[rows[hit]])
-                rest = float(part.rest[number])
+            is_of_part = (vertices >= start) & (vertices < start + count)
+            mesh_rows = np.flatnonzero(is_of_part)
+            for index, target in enumerate(part.targets):
+                row_of_vertex = np.full(count, -1)
+                row_of_vertex[target.rows] = np.arange(len(target.rows))
+                target_rows = row_of_vertex[vertices[mesh_rows] - start]
+                is_moved = target_rows >= 0
                 self._targets.append(
                     (
                         target.name,
                         part.node,
-                        number,
-                        rest,
-                        torch.from_numpy(mine[hit]),
-                        moves,
+                        index,
+                        float(part.rest[index]),
+                        torch.from_numpy(mesh_rows[is_moved]),
+                        torch.from_numpy(target.moves[target_rows[is_moved]]),
                     )
                 )
-        # the nodes by their depth, so that all of one depth are placed at once
-        level = np.flatnonzero(parents < 0)
-        self._levels = list[tuple[Tensor, Tensor]]()
-        row = np.zeros(len(parents), np.int64)
-        while len(level):
-            self._levels.append(
-                (torch.from_numpy(level), torch.from_numpy(row[parents[level]]))
-            )
-            row[level] = np.arange(len(level))
-            level = np.flatnonzero(np.isin(parents, level))
-        self._back = torch.argsort(torch.cat([nodes for nodes, _ in self._levels]))
-        self._places = torch.from_numpy(self.skeleton.places)
-        # the nearest rotation to each node's place in the scene: what scale and shear
-        # leave of its axes
-        left, _, right = np.linalg.svd(self._world(self._places)[:, :3, :3].numpy())
-        self._axes = torch.from_numpy(left @ right)
-        self._rest = self.posed({})
 
-    # ---- what can be asked for
-    # ---------------------------------------------------------------------------------------
+    # ---- Parameters ----
 
     @property
     def clips(self) -> tuple[str, ...]:
+        """Names of the animations."""
         return tuple(clip.name for clip in self.skeleton.clips)
 
     @cached_property
@@ -147,105 +154,130 @@ class SkeletonRig:
 
     @property
     def targets(self) -> tuple[str, ...]:
+        """Names of the morph targets, each once."""
         return tuple(dict.fromkeys(name for name, *_ in self._targets))
 
     @property
     def defaults(self) -> Mapping[str, float]:
+        """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
         turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
-        return (
-            time
-            | turns
-            | {
-                f"{name}.{WEIGHT}": rest
-                for name, _, _, rest, _, _ in reversed(self._targets)
-            }
-        )
+        # Of targets with the same name, the first counts.
+        weights = {
+            f"{name}.{WEIGHT}": rest
+            for name, _, _, rest, _, _ in reversed(self._targets)
+        }
+        return time | turns | weights
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        named = (
+        """The time of a clip, turns of joints and weights of morph targets."""
+        parameters = (
             TIME if name == TIME.name else part_of_a_rig(name) for name in self.defaults
         )
-        return tuple(parameter for parameter in named if parameter is not None)
+        return tuple(parameter for parameter in parameters if parameter is not None)
 
     def measured(
         self, values: Mapping[str, Tensor], clip: str | None = None
     ) -> Mapping[str, Value]:
+        """Return the time in a clip, in seconds."""
         if clip is None:
             return {}
-        return {
-            "seconds": {"value": float(self._playing(clip, values)[1]), "unit": "s"}
-        }
+        _, seconds = self._playing(clip, values)
+        return {"seconds": {"value": float(seconds), "unit": "s"}}
 
-    # ---- where the vertices are
-    # --------------------------------------------------------------------------------------
+    # ---- Vertices ----
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex goes from the mesh at rest, (V, 3) float32 in its
-        unit; differentiable. Numbers, by the names of `parameters`, are those of the
-        clip of that name, and else at rest, where one is missing. Raises InputError: a
-        vertex is nowhere, because the file's numbers are too large.
+        """Return how far vertices move from the mesh at rest, (V, 3) float32.
+
+        The result is in the unit of the mesh, and differentiable.
+
+        Args:
+            values: scalar tensors by the names of `parameters`; those that are missing
+                are as in the clip, or at rest.
+            clip: name of an animation.
+
+        Raises:
+            InputError: the file's numbers are so large that vertices are not finite.
         """
         posed = self.posed(values, clip)
-        moved = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(posed.device).T
-        if not bool(torch.isfinite(moved.detach()).all()):
-            what = f"the clip {clip}" if clip else "such turns"
+        offsets = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(
+            posed.device
+        ).T
+        if not bool(torch.isfinite(offsets.detach()).all()):
+            cause = f"the clip {clip}" if clip else "such turns"
             raise InputError(
-                f"{self.skeleton.source}: {what} would put vertices "
+                f"{self.skeleton.source}: {cause} would put vertices "
                 "infinitely far away; take another"
             )
-        return moved.float()
+        return offsets.float()
 
     def posed(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return the vertices (V, 3) in the file's axes and unit, float64; arguments as
-        of `offsets`.
+        """Return the vertices (V, 3) float64 in the file's axes and unit.
+
+        Arguments are those of `offsets`.
         """
-        some = next(iter(values.values()), torch.zeros(()))
+        device = next(iter(values.values()), torch.zeros(())).device
         number = {name: value.double() for name, value in values.items()}
-        here = self._places.to(some.device)
-        weights = dict[int, Tensor]()
+        local_matrices = self._local_matrices.to(device)
+        clip_weights = dict[int, Tensor]()
         if clip is not None:
             playing, seconds = self._playing(clip, number)
-            here, weights = self._played(playing, seconds.to(some.device))
-        here = self._turned(here, number)
-        matrices = (
-            self._world(here)[self._nodes.to(some.device)]
-            @ self._inverse.to(some.device)
+            local_matrices, clip_weights = self._played(playing, seconds.to(device))
+        local_matrices = self._turned(local_matrices, number)
+        joint_matrices = (
+            self._world(local_matrices)[self._nodes.to(device)]
+            @ self._inverse.to(device)
         )[:, :3]
-        points = self._points.to(some.device)
-        shares = self._weights.to(some.device)
-        for name, node, index, rest, rows, shifts in self._targets:
-            weight = number.get(f"{name}.{WEIGHT}")
-            if weight is None:
-                weight = (
-                    weights[node][index]
-                    if node in weights
-                    else torch.tensor(rest, dtype=torch.float64)
-                )
-            if weight.requires_grad or float(weight) != 0.0:
-                points = points.index_add(
-                    0,
-                    rows.to(some.device),
-                    weight.to(some.device) * shifts.to(some.device),
-                )
-        joints = self._joints.to(some.device)
-        moves = sum(
-            shares[:, k, None, None] * matrices[joints[:, k]]
+        points = self._morphed_points(number, clip_weights, device)
+        weights = self._weights.to(device)
+        joints = self._joints.to(device)
+        matrices = sum(
+            weights[:, k, None, None] * joint_matrices[joints[:, k]]
             for k in range(joints.shape[1])
         )
-        assert isinstance(moves, Tensor)
-        return torch.einsum("vij,vj->vi", moves[:, :, :3], points) + moves[:, :, 3]
+        assert isinstance(matrices, Tensor)
+        return (
+            torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
+        )
+
+    def _morphed_points(
+        self,
+        number: Mapping[str, Tensor],
+        clip_weights: Mapping[int, Tensor],
+        device: torch.device,
+    ) -> Tensor:
+        """Return the vertices (V, 3) of the meshes with morph targets applied.
+
+        Args:
+            number: values of parameters, which override those of a clip.
+            clip_weights: weights of a clip, by node.
+            device: of the result.
+        """
+        points = self._points.to(device)
+        for name, node, index, rest, rows, moves in self._targets:
+            weight = number.get(f"{name}.{WEIGHT}")
+            if weight is None and node in clip_weights:
+                weight = clip_weights[node][index]
+            elif weight is None:
+                weight = torch.tensor(rest, dtype=torch.float64)
+            if weight.requires_grad or float(weight) != 0.0:
+                points = points.index_add(
+                    0, rows.to(device), weight.to(device) * moves.to(device)
+                )
+        return points
 
     def _playing(self, name: str, values: Mapping[str, Tensor]) -> tuple[Clip, Tensor]:
+        """Return the clip of a name, and the time in it in seconds."""
         clip = next(clip for clip in self.skeleton.clips if clip.name == name)
-        return clip, clip.begin + (clip.end - clip.begin) * values.get(
-            TIME.name, torch.zeros(())
-        ).double()
+        time = values.get(TIME.name, torch.zeros(())).double()
+        return clip, clip.begin + (clip.end - clip.begin) * time
 
     def _played(self, clip: Clip, seconds: Tensor) -> tuple[Tensor, dict[int, Tensor]]:
-        """Places (N, 4, 4) of all nodes at a time of a clip, and weights of morph
-        targets by node.
+        """Return the local matrices (N, 4, 4) of nodes at a time of a clip.
+
+        The second result are the weights of morph targets, by node.
         """
         skeleton = self.skeleton
         device = seconds.device
@@ -254,110 +286,137 @@ class SkeletonRig:
             "rotation": skeleton.rotations,
             "scale": skeleton.scales,
         }
-        parts = {
+        properties = {
             path: torch.from_numpy(values).to(device) for path, values in rest.items()
         }
         for path in rest:
-            mine = [track for track in clip.tracks if track.path == path]
-            if mine:
-                nodes = torch.tensor([track.node for track in mine], device=device)
-                parts[path] = parts[path].index_copy(
-                    0, nodes, torch.stack([sampled(track, seconds) for track in mine])
-                )
-        turns = rotation(parts["rotation"]) * parts["scale"][:, None, :]
-        last = torch.tensor(
+            tracks = [track for track in clip.tracks if track.path == path]
+            if tracks:
+                nodes = torch.tensor([track.node for track in tracks], device=device)
+                values = torch.stack([sampled(track, seconds) for track in tracks])
+                properties[path] = properties[path].index_copy(0, nodes, values)
+        scaled_turns = rotation(properties["rotation"]) * properties["scale"][:, None]
+        last_row = torch.tensor(
             [0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=device
-        ).expand(len(turns), 1, 4)
-        composed = torch.cat(
-            [torch.cat([turns, parts["translation"][:, :, None]], dim=2), last], dim=1
+        ).expand(len(scaled_turns), 1, 4)
+        upper_rows = torch.cat(
+            [scaled_turns, properties["translation"][:, :, None]], dim=2
         )
-        fixed = torch.from_numpy(skeleton.fixed).to(device)
-        places = torch.where(fixed[:, None, None], self._places.to(device), composed)
-        return places, {
+        composed = torch.cat([upper_rows, last_row], dim=1)
+        is_fixed = torch.from_numpy(skeleton.fixed).to(device)
+        local_matrices = torch.where(
+            is_fixed[:, None, None], self._local_matrices.to(device), composed
+        )
+        weights = {
             track.node: sampled(track, seconds)
             for track in clip.tracks
             if track.path == "weights"
         }
+        return local_matrices, weights
 
-    def _turned(self, places: Tensor, number: Mapping[str, Tensor]) -> Tensor:
-        upright = self._upright.to(places.device)
-        for joint in dict.fromkeys(
+    def _turned(self, local_matrices: Tensor, number: Mapping[str, Tensor]) -> Tensor:
+        """Return local matrices (N, 4, 4) with the turns of joints applied.
+
+        Turns are about the axes of the object as it stands at rest.
+        """
+        device = local_matrices.device
+        upright = self._upright.to(device)
+        joints = dict.fromkeys(
             name.rpartition(".")[0]
             for name in number
             if name.rpartition(".")[2] in AXES
-        ):
+        )
+        for joint in joints:
             node = self.joints[joint]
-            turn = torch.eye(3, dtype=torch.float64, device=places.device)
+            turn = torch.eye(3, dtype=torch.float64, device=device)
             for axis in AXES:
                 if f"{joint}.{axis}" in number:
                     turn = about(axis, number[f"{joint}.{axis}"]) @ turn
+            # From the axes of the object to those of the file, then of the parent.
             turn = upright.T @ turn @ upright
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
-                axes = self._axes[parent].to(places.device)
+                axes = self._axes[parent].to(device)
                 turn = axes.T @ turn @ axes
-            row = torch.cat(
-                [
-                    torch.cat(
-                        [turn @ places[node, :3, :3], places[node, :3, 3:]], dim=1
-                    ),
-                    places[node, 3:],
-                ]
+            matrix = local_matrices[node]
+            upper_rows = torch.cat([turn @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
+            turned_matrix = torch.cat([upper_rows, matrix[3:]])
+            local_matrices = local_matrices.index_copy(
+                0, torch.tensor([node], device=device), turned_matrix[None]
             )
-            places = places.index_copy(
-                0, torch.tensor([node], device=places.device), row[None]
-            )
-        return places
+        return local_matrices
 
-    def _world(self, places: Tensor) -> Tensor:
-        levels = list[Tensor]()
-        for level, parents in self._levels:
-            here = places[level.to(places.device)]
-            levels.append(
-                levels[-1][parents.to(places.device)] @ here if levels else here
-            )
-        return torch.cat(levels)[self._back.to(places.device)]
+    def _world(self, local_matrices: Tensor) -> Tensor:
+        """Return the matrices (N, 4, 4) from nodes to the scene."""
+        device = local_matrices.device
+        world_by_level = list[Tensor]()
+        for nodes, parent_rows in self._levels:
+            matrices = local_matrices[nodes.to(device)]
+            if world_by_level:
+                matrices = world_by_level[-1][parent_rows.to(device)] @ matrices
+            world_by_level.append(matrices)
+        return torch.cat(world_by_level)[self._back.to(device)]
+
+
+def _node_levels(parents: Ints) -> list[tuple[Tensor, Tensor]]:
+    """Group nodes by depth, so that those of one depth are computed at once.
+
+    Args:
+        parents: (N,) the parent of each node, -1 for a root.
+
+    Returns:
+        For each depth the nodes, and the row of each node's parent in the level above.
+    """
+    levels = list[tuple[Tensor, Tensor]]()
+    nodes = np.flatnonzero(parents < 0)
+    row_in_level = np.zeros(len(parents), np.int64)
+    while len(nodes):
+        parent_rows = row_in_level[parents[nodes]]
+        levels.append((torch.from_numpy(nodes), torch.from_numpy(parent_rows)))
+        row_in_level[nodes] = np.arange(len(nodes))
+        nodes = np.flatnonzero(np.isin(parents, nodes))
+    return levels
 
 
 def sampled(track: Track, seconds: Tensor) -> Tensor:
-    """Return the value (W,) of a track at a time; before its first key and after its
-    last it stays (appendix C).
+    """Return the value (W,) of a track at a time (glTF 2.0, appendix C).
+
+    Before its first key and after its last it is constant.
     """
     times = torch.from_numpy(track.times).to(seconds.device)
-    values = torch.from_numpy(track.values).to(seconds.device)
-    middle = values.shape[1] // 2
+    keys = torch.from_numpy(track.values).to(seconds.device)
+    # Of a cubic spline the value is between two tangents.
+    value_index = keys.shape[1] // 2
+    is_rotation = track.path == "rotation"
     after = int(torch.searchsorted(times, seconds.detach(), right=True))
     if track.interpolation == "STEP" or not 0 < after < len(times):
-        held = values[max(0, after - 1), middle]
-        return held / held.norm() if track.path == "rotation" else held
+        value = keys[max(0, after - 1), value_index]
+        return value / value.norm() if is_rotation else value
     before = after - 1
-    span = times[after] - times[after - 1]
-    share = (seconds - times[before]) / span
-    first = values[before, middle]
-    second = values[after, middle]
+    span = times[after] - times[before]
+    fraction = (seconds - times[before]) / span
+    first = keys[before, value_index]
+    second = keys[after, value_index]
     if track.interpolation == "CUBICSPLINE":
-        square = share**2
-        cube = share**3
+        square = fraction**2
+        cube = fraction**3
         spline = (
             (2.0 * cube - 3.0 * square + 1.0) * first
-            + span * (cube - 2.0 * square + share) * values[before, 2]
+            + span * (cube - 2.0 * square + fraction) * keys[before, 2]
             + (3.0 * square - 2.0 * cube) * second
-            + span * (cube - square) * values[after, 0]
+            + span * (cube - square) * keys[after, 0]
         )
-        return (
-            spline / spline.norm().clamp_min(1e-12)
-            if track.path == "rotation"
-            else spline
-        )
-    return (
-        slerp(first, second, share)
-        if track.path == "rotation"
-        else first + share * (second - first)
-    )
+        return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
+    if is_rotation:
+        return slerp(first, second, fraction)
+    return first + fraction * (second - first)
 
 
 def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
-    """Return the rotation (4,) between two, along the shorter arc."""
+    """Interpolate between two rotations (4,) along the shorter arc.
+
+    `share` is 0 at the first and 1 at the second.
+    """
     first = first / first.norm()
     second = second / second.norm()
     cosine = first @ second
@@ -374,7 +433,6 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 
 
 def rotation(quaternions: Tensor) -> Tensor:
-    """Return the turns (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
-    return torch.stack(entries_of_turn(*quaternions.unbind(dim=1)), dim=1).reshape(
-        -1, 3, 3
-    )
+    """Return the rotations (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
+    entries = entries_of_turn(*quaternions.unbind(dim=1))
+    return torch.stack(entries, dim=1).reshape(-1, 3, 3)

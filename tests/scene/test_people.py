@@ -77,10 +77,10 @@ def test_legs_of_a_walker_stay_as_long_as_they_are() -> None:
         raised = list[float]()
         for walk in range(0, 216, 18):
             values = PERSON._numbers(numbers(walk=walk, stride=stride))
-            points = PERSON._held["mean"] + torch.einsum(
+            points = PERSON._tensors["mean"] + torch.einsum(
                 "r,rpc->pc",
-                torch.einsum("gawh,gawhr->r", PERSON._phenotype(values)[0], PERSON._held["shares"]),
-                PERSON._held["basis"],
+                torch.einsum("gawh,gawhr->r", PERSON._phenotype(values)[0], PERSON._tensors["shares"]),
+                PERSON._tensors["basis"],
             )
             bones = len(PERSON._bones)
             rise = PERSON._leg_corrections(points[:-bones], points[-bones:], values)
@@ -137,8 +137,8 @@ def test_a_rigid_part_keeps_its_shape_and_turns_by_the_angle() -> None:
 
 def test_gradients_of_every_number_are_those_of_differences() -> None:
     person = Person(body_data())
-    for name, held in person._held.items():
-        person._held[name] = held.double() if held.is_floating_point() else held
+    for name, held in person._tensors.items():
+        person._tensors[name] = held.double() if held.is_floating_point() else held
     middle = {
         one.name: torch.tensor(0.61 * float(person.defaults[one.name]) + 0.2 * (max(one.low, -90) + min(one.high, 90)))
         for one in PARAMETERS

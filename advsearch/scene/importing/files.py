@@ -1,6 +1,4 @@
-"""What every importer asks of a file before it is parsed: its kind by ending and
-beginning, and its size; and what is said of it.
-"""
+"""Checks of files before they are parsed, and notes and errors about them."""
 
 from __future__ import annotations
 
@@ -22,9 +20,7 @@ from advsearch.files import either
 from advsearch.trust import stored_files
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Files of objects and cameras that are not read: what they are, and the program and
-# command that convert them.
+# ---- Formats of objects and cameras that are not read, and how to convert them ----
 
 BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
@@ -88,47 +84,45 @@ CAMERAS |= {
     ".npy": CAMERAS[".npz"],
     ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
 }
-"""What files of cameras are that are not read, and what to do."""
+"""Advice on formats of cameras that are not read."""
 
 
 def advice(path: Path) -> str | None:
-    """Return what a file is by its ending, and what to do with it; None where that is
-    not known.
+    """Return what a file is by its suffix and how to convert it; None if unknown.
 
-    The rest of a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b
+    It completes a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b
     ..."``.
     """
-    ending = path.suffix.lower()
-    name = path.name
-    for what, (operator, endings) in BLENDER_READS.items():
-        if ending in endings:
-            steps = (
-                "bpy.ops.wm.read_factory_settings(use_empty=True); "
-                f"{operator}(filepath={json.dumps(name)})"
-            )
-            script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
-            return (
-                f"{what}: make glTF of it, with Blender: blender -b --python-expr "
-                f"{shlex.quote(script)}"
-            )
-    if ending == ".bin":
-        beside = (
-            sorted(other.name for other in path.parent.glob("*.gltf"))[:1]
-            if path.parent.is_dir()
-            else []
-        )
-        return (
-            "a buffer, as a .gltf file has beside it: name that "
-            f"file{f', {beside[0]}' if beside else ''}"
-        )
-    names = {kind: shlex.quote(f"{path.stem}.{kind}") for kind in ("obj", "stl", "glb")}
-    said = ((what, said) for what, (said, endings) in SAID.items() if ending in endings)
-    return next(
-        (
-            f"{what}: {how.format(file=shlex.quote(name), **names)}"
-            for what, how in said
-        ),
-        None,
+    suffix = path.suffix.lower()
+    for kind, (operator, blender_suffixes) in BLENDER_READS.items():
+        if suffix in blender_suffixes:
+            return f"{kind}: {_blender_advice(path, operator)}"
+    if suffix == ".bin":
+        gltf_file = ""
+        if path.parent.is_dir():
+            names = sorted(other.name for other in path.parent.glob("*.gltf"))
+            gltf_file = f", {names[0]}" if names else ""
+        return f"a buffer, as a .gltf file has beside it: name that file{gltf_file}"
+    targets = {
+        name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
+    }
+    for kind, (instructions, suffixes) in SAID.items():
+        if suffix in suffixes:
+            text = instructions.format(file=shlex.quote(path.name), **targets)
+            return f"{kind}: {text}"
+    return None
+
+
+def _blender_advice(path: Path, operator: str) -> str:
+    """Return the command by which Blender converts a file to glTF."""
+    target = json.dumps(f"{path.stem}.glb")
+    script = (
+        "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); "
+        f"{operator}(filepath={json.dumps(path.name)}); "
+        f"bpy.ops.export_scene.gltf(filepath={target})"
+    )
+    return (
+        f"make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
     )
 
 
@@ -160,55 +154,22 @@ _KINDS = (
 
 
 def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
-    """Return the content of a file that holds an ``"object"``, an ``"environment"`` or
-    the like, with one of these endings, lower case with dot. Raises FileFormatError:
-    another ending, or a file that is missing, not an ordinary file, unreadable, empty
-    or larger than `LARGEST_FILE`.
+    """Return the content of a file.
+
+    Args:
+        path: the file.
+        what: what it should hold, such as "object" or "environment", for messages.
+        suffixes: those that it may have, lower case with dot.
+
+    Raises:
+        FileFormatError: the file has another suffix, or is missing, not an ordinary
+            file, unreadable, empty or larger than `LARGEST_FILE`.
     """
     try:
-        if path.is_dir():
-            raise FileFormatError(
-                f"{path}: expected a file with an {what}, got a "
-                "directory; name a file inside it"
-            )
-        if path.suffix.lower() not in suffixes:
-            file, _, part = str(path).rpartition("#")
-            if part and Path(file).suffix.lower() in suffixes:
-                raise FileFormatError(
-                    f"{file}: has no parts by name, got "
-                    f"#{shown(part, quoted=False)}; leave it out"
-                )
-            known = (
-                None if what == "environment" else advice(Path(file) if file else path)
-            )
-            if known is not None:
-                raise FileFormatError(f"{path}: {known} (read are {either(suffixes)})")
-            got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
-            raise FileFormatError(
-                f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; "
-                "convert it to one of these"
-            )
+        _check_suffix(path, what, suffixes)
         data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
-        hint = (
-            ""
-            if path.parent.is_dir()
-            else (f" The folder {path.parent} does not exist either.")
-        )
-        with suppress(OSError):
-            beside = {
-                file.name.lower(): file.name
-                for file in path.parent.iterdir()
-                if file.suffix.lower() in suffixes
-            }
-            near = difflib.get_close_matches(
-                path.name.lower(), sorted(beside), n=3, cutoff=0.5
-            )
-            hint = (
-                f" Did you mean {' or '.join(repr(beside[name]) for name in near)}?"
-                if near
-                else ""
-            )
+        hint = _missing_file_hint(path, suffixes)
         raise FileFormatError(
             f"{path}: no such {what} file.{hint} Check the path"
         ) from error
@@ -224,31 +185,79 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
     return data
 
 
+def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
+    """Raise FileFormatError for a directory, or a file with another suffix."""
+    if path.is_dir():
+        raise FileFormatError(
+            f"{path}: expected a file with an {what}, got a "
+            "directory; name a file inside it"
+        )
+    if path.suffix.lower() in suffixes:
+        return
+    file, _, part = str(path).rpartition("#")
+    if part and Path(file).suffix.lower() in suffixes:
+        raise FileFormatError(
+            f"{file}: has no parts by name, got "
+            f"#{shown(part, quoted=False)}; leave it out"
+        )
+    conversion = None
+    if what != "environment":
+        conversion = advice(Path(file) if file else path)
+    if conversion is not None:
+        raise FileFormatError(f"{path}: {conversion} (read are {either(suffixes)})")
+    got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
+    raise FileFormatError(
+        f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; "
+        "convert it to one of these"
+    )
+
+
+def _missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
+    """Return a sentence that helps to find a missing file, with a blank before it."""
+    hint = ""
+    if not path.parent.is_dir():
+        hint = f" The folder {path.parent} does not exist either."
+    with suppress(OSError):
+        candidates = {
+            file.name.lower(): file.name
+            for file in path.parent.iterdir()
+            if file.suffix.lower() in suffixes
+        }
+        matches = difflib.get_close_matches(
+            path.name.lower(), sorted(candidates), n=3, cutoff=0.5
+        )
+        hint = ""
+        if matches:
+            names = " or ".join(repr(candidates[match]) for match in matches)
+            hint = f" Did you mean {names}?"
+    return hint
+
+
 def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
-    """Return the error for a file whose content is not what its name says."""
+    """Return the error for a file whose content is not what its suffix promises."""
     return FileFormatError(
         f"{path}: expected {expected}, got {got}; export or download the file again"
     )
 
 
 def find_kind(data: bytes) -> str | None:
-    """Return the kind of file that `data` begins like, in words that fit after "got";
-    None for an unknown one.
-    """
-    return next((kind for magic, kind in _KINDS if data.startswith(magic)), None)
+    """Return the kind of file that begins with some bytes, to follow "got", or None."""
+    for magic, kind in _KINDS:
+        if data.startswith(magic):
+            return kind
+    return None
 
 
 def looks_like(data: bytes) -> str:
-    """Name the kind of file that `data` begins like, in words that fit after "got"."""
-    if (kind := find_kind(data)) is not None:
+    """Describe the content of a file, to follow "got" in a message."""
+    kind = find_kind(data)
+    if kind is not None:
         return kind
     return "binary data of another kind" if b"\x00" in data else "text of another kind"
 
 
 def text_of(data: bytes) -> str:
-    """Decode text that is UTF-8 or, failing that, Latin-1; a byte order mark is
-    dropped.
-    """
+    """Decode UTF-8 or, failing that, Latin-1; a byte order mark is dropped."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -256,9 +265,7 @@ def text_of(data: bytes) -> str:
 
 
 def numbers_in(data: bytes, kind: type) -> npt.NDArray[np.generic]:
-    """Return the numbers in a text with blanks between them, up to the first word that
-    is none.
-    """
+    """Parse numbers (N,) separated by blanks, up to the first word that is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -268,39 +275,44 @@ def numbers_in(data: bytes, kind: type) -> npt.NDArray[np.generic]:
 
 
 def is_number(word: str) -> bool:
+    """Return whether a word is a number, as files write them."""
     try:
         float(word)
     except ValueError:
         return False
-    return "_" not in word
+    return "_" not in word  # Python's own notation
 
 
 def shown(name: str, *, quoted: bool = True, longest: int = _LONGEST_NAME) -> str:
-    """Return a name out of a file as a message shows it: control characters spelled
-    out, cut to half of what is the longest.
+    """Format a name out of a file for a message.
+
+    Control characters are escaped, and a name that is longer than `longest` is cut to
+    half of that.
     """
-    kept = name if len(name) <= longest else name[: longest // 2]
-    text = repr(kept) if quoted else repr(kept)[1:-1]
-    return text if kept == name else f"{text}... ({len(name):,} characters)"
+    cut = name if len(name) <= longest else name[: longest // 2]
+    text = repr(cut) if quoted else repr(cut)[1:-1]
+    return text if cut == name else f"{text}... ({len(name):,} characters)"
 
 
 def safe_name(path: Path) -> str:
-    """Return the file's name without ending, with everything but letters, digits, '.',
-    '_' and '-' made a '-'.
+    """Return a file's name without suffix and without special characters.
+
+    Everything but letters, digits, '.', '_' and '-' becomes a '-'.
     """
     return re.sub(r"[^A-Za-z0-9._-]", "-", path.stem).strip(".-") or "imported"
 
 
 class Names:
-    """Gives names that are free, and that a setting may have; `taken` are not."""
+    """Makes names unique, and valid in a setting; names in `taken` are not given out."""
 
     def __init__(self, taken: Iterable[str] = ()) -> None:
         self._taken = set(taken)
         self._last: dict[str, int] = {}
 
     def free(self, wanted: str) -> str:
-        """Return the name, or the first free one with a number behind it."""
-        base = name = clean(wanted)
+        """Return a name, with the first free number behind it if it is used already."""
+        base = clean(wanted)
+        name = base
         number = self._last.get(base, 1)
         while name in self._taken:
             number += 1
@@ -311,15 +323,13 @@ class Names:
 
 
 def clean(name: str) -> str:
-    """Return a name of letters, digits, dashes and underscores, 60 at most."""
+    """Return a name reduced to letters, digits, dashes and underscores, 60 at most."""
     return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
 
 
 LARGEST_FACES = 2_000_000
-"""Triangles that a mesh may have, before `scaled`; each takes over 1 KB of memory to
-import.
-"""
-MOST_CORNERS = 10_000  # corners that one face may have
+"""Limit of the triangles of a mesh, before `scaled`; each takes over 1 KB of memory."""
+MOST_CORNERS = 10_000  # limit of the corners of a face
 
 
 def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
@@ -328,8 +338,7 @@ def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
 
 
 class Notes:
-    """What is said about a file, each sentence once; what the file has that was not
-    taken; and errors about it.
+    """Warnings about one file, the things in it that were not read, and its errors.
 
         notes = Notes("chair.ply")
         notes.say("the alpha of 'wood.png' is left out")
@@ -337,50 +346,50 @@ class Notes:
         notes.take("property", "x")
         list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
-    A thing that a file has is a kind (a word of the format: ``"property"``,
-    ``"keyword"``) and its name in the file.
+    A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``) and
+    its name. Each warning is given once.
     """
 
     def __init__(self, path: Path | str) -> None:
-        self.path, self.source = path, path.name if isinstance(path, Path) else path
-        # quick, since a file may give cause for 100,000 warnings
+        self.path = path
+        self.source = path.name if isinstance(path, Path) else path
+        # A dict for speed, since a file may cause 100,000 warnings.
         self._said: dict[str, None] = {}
         self._has: Counter[tuple[str, str]] = Counter()
         self._taken: set[tuple[str, str]] = set()
 
     def say(self, clause: str) -> None:
-        """Warn, once; a clause that begins with a blank goes on after the file's
-        name.
+        """Add a warning, if it is new.
+
+        The name of the file precedes the clause, with a colon unless the clause begins
+        with a blank.
         """
-        self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = (
-            None
-        )
+        separator = "" if clause.startswith(" ") else ": "
+        self._said[f"{self.source}{separator}{clause}"] = None
 
     def damaged(self, expected: str, got: str | bytes) -> FileFormatError:
-        """Return the error of `damaged`; of content, what it looks like."""
-        return damaged(
-            self.path, expected, got if isinstance(got, str) else looks_like(got)
-        )
+        """Return the error of `damaged`; content, as bytes, is described."""
+        text = got if isinstance(got, str) else looks_like(got)
+        return damaged(self.path, expected, text)
 
     def check_most(self, count: int, limit: int, expected: str) -> None:
-        """See `check_most`."""
+        """Check a limit of the file; see `check_most`."""
         check_most(self.path, count, limit, expected)
 
     def check_faces(self, count: int) -> None:
-        """See `check_faces`."""
+        """Check the number of triangles of the file; see `check_faces`."""
         check_faces(self.path, count)
 
     def has(self, kind: str, name: str) -> None:
+        """Record that the file has something."""
         self._has[kind, name] += 1
 
     def take(self, kind: str, name: str) -> None:
-        """Note that this is used; that the file need not have it makes readers
-        short.
-        """
+        """Record that something is read; the file need not have it."""
         self._taken.add((kind, name))
 
     def __iter__(self) -> Iterator[str]:
-        """All that was said, then what the file has and nobody took, in its order."""
+        """Yield all warnings, then what the file has and was not read."""
         yield from self._said
         for (kind, name), count in self._has.items():
             if (kind, name) not in self._taken:
@@ -389,8 +398,6 @@ class Notes:
 
 
 def last_line(said: str) -> str:
-    """Return the last line of what Blender has said, for a message; empty if there is
-    none.
-    """
+    """Return the last line of a program's output after a colon, "" if there is none."""
     lines = [line for line in said.splitlines() if line.strip()]
     return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""

@@ -1,8 +1,8 @@
 """Repair of imported geometry: welding, faces without area, winding, normals.
 
-Everything works on a `Soup`: welded points, and attributes that belong to the corners
-of faces, so that no step has to care where a file splits its vertices. They are split
-again, where normals or UVs differ, when the mesh is assembled.
+Everything works on a `Soup`: welded points, and attributes of the corners of faces, so
+that no step depends on how a file splits its vertices. Vertices are split again, where
+normals or UVs differ, when the mesh is assembled.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.parts import ImportedPart
 
 WELD = 1e-6
-"""Points closer than this share of the largest extent are one point; text and 32-bit
+"""Points closer than this fraction of the largest extent are one point; text and 32-bit
 files round to about that.
 """
-# twice the area, in squared extents, up to which a face counts as having none
+# Twice the area, in squared extents, up to which a face counts as having none.
 FLAT = 1e-12
 CREASE_DEGREES = 40.0
 """Where the normals of two neighbouring faces differ by more, a computed normal is not
 smoothed across their edge.
 """
 TRUSTED = 0.98
-"""Share of the surface on which a file's normals must face the same way as the faces
-for the normals to be kept.
+"""Fraction of the surface on which a file's normals must agree with the faces for the
+normals to be used.
 """
 
 
@@ -40,129 +40,141 @@ class Soup:
     points: Doubles  # (P, 3), the largest extent 1
     faces: Ints  # (F, 3) points
     part: Ints  # (F,) the part of the file that the face belongs to
-    normals: Doubles  # (F, 3, 3) unit normals of the corners; NaN where unknown
-    uvs: Doubles  # (F, 3, 2); NaN where unknown
-    # (F, 3, 3) linear factors of the base colour; 1 where the file gives none
+    normals: Doubles  # (F, 3, 3) unit normals of the corners; NaN if unknown
+    uvs: Doubles  # (F, 3, 2); NaN if unknown
+    # (F, 3, 3) linear factors of the base color; 1 if the file has none.
     colors: Doubles
-    # (F,) the faces that are flat where they have no normals; None where none are
+    # (F,) whether a face is shaded flat if it has no normals; None: none is.
     flat: Bools | None = None
-    stored: Ints | None = (
-        # (F, 3) vertices of the parts, one after the other, that the corners were;
-        # None: unknown
-        None
-    )
+    # (F, 3) for each corner its vertex in the concatenated parts; None if unknown.
+    stored: Ints | None = None
 
     def only(self, keep: Bools) -> Soup:
-        """Return the soup with a part of its faces; `keep` is (F,)."""
-        held = {
-            name: values
+        """Return the soup with the faces selected by a mask (F,)."""
+        selected = {
+            name: values[keep]
             for name, values in vars(self).items()
             if name != "points" and values is not None
         }
-        return replace(self, **{name: values[keep] for name, values in held.items()})
+        return replace(self, **selected)
 
     def reversed(self, turn: Bools) -> Soup:
-        """Return the soup with some faces turned over; `turn` is (F,). Normals stay as
-        they are.
+        """Return the soup with the faces of a mask (F,) wound the other way.
+
+        Normals stay as they are.
         """
         order = np.where(turn[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
-        corners = (
-            "faces",
-            "normals",
-            "uvs",
-            "colors",
-            *(() if self.stored is None else ("stored",)),
-        )
+        names = ["faces", "normals", "uvs", "colors"]
+        if self.stored is not None:
+            names.append("stored")
         return replace(
-            self, **{name: getattr(self, name)[rows, order] for name in corners}
+            self, **{name: getattr(self, name)[rows, order] for name in names}
         )
 
     def face_vectors(self) -> Doubles:
-        """Return (F, 3) vectors along the face normals, as long as twice the faces'
-        areas.
-        """
+        """Return face normals (F, 3), as long as twice the faces' areas."""
         return face_vectors(self.points[self.faces])
 
 
 def compute_turn(up: str, front: str) -> Doubles:
-    """Return the rotation (3, 3) from a file's axes to ours, where its front faces +x
-    and its up axis +z.
+    """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
     `up` is "y" or "z", `front` one of `FACINGS` along another axis.
     """
-    ahead = np.eye(3)["xyz".index(front[1])] * (-1.0 if front[0] == "-" else 1.0)
-    above = np.eye(3)["xyz".index(up)]
-    return np.stack([ahead, np.cross(above, ahead), above]) + 0.0  # no zero has a sign
+    front_axis = np.eye(3)["xyz".index(front[1])]
+    front_axis = front_axis * (-1.0 if front[0] == "-" else 1.0)
+    up_axis = np.eye(3)["xyz".index(up)]
+    side_axis = np.cross(up_axis, front_axis)
+    # Adding 0 turns -0.0 into 0.0.
+    return np.stack([front_axis, side_axis, up_axis]) + 0.0
 
 
 def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
-    """Join parts, at least one, into one soup of unit extent with welded points, turned
-    by a rotation (3, 3). Raises InputError, with the name of the file: vertices that
-    are NaN or infinite, or no extent.
+    """Join parts into one soup of unit extent with welded points.
+
+    Args:
+        parts: at least one.
+        source: name of the file, for messages.
+        turn: rotation (3, 3) that is applied to all of them.
+
+    Raises:
+        InputError: vertices are NaN or infinite, or the object has no extent.
     """
     vertices = np.concatenate([part.vertices for part in parts])
+    _check_finite(vertices, source)
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    bad = ~np.isfinite(vertices).all(axis=1)
-    if bad.any():
-        first = int(bad.argmax())
-        raise InputError(
-            f"{source}: expected finite vertices, got {int(bad.sum())} of "
-            f"{len(vertices)} with NaN or infinite"
-            f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or "
-            "export it again"
-        )
     faces = np.concatenate(
         [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
     )
     low = vertices[np.unique(faces)].min(axis=0)
     size = extent_of(parts)
     if not 0.0 < size < np.inf:
-        what = (
-            "all vertices coincide"
-            if size == 0.0
-            else ("its extent is too large to compute with")
-        )
+        problem = "its extent is too large to compute with"
+        if size == 0.0:
+            problem = "all vertices coincide"
         raise InputError(
             f"{source}: expected an object with a size, got a mesh in "
-            f"which {what}; export it again"
+            f"which {problem}; export it again"
         )
-    points, index = np.unique(
-        (vertices - low) / size @ turn.T + 0.0, axis=0, return_inverse=True
+    points, index = _weld((vertices - low) / size @ turn.T + 0.0)
+    n_faces = [len(part.faces) for part in parts]
+    normals = np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])
+    colors = [
+        np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
+        for part in parts
+    ]
+    has_movable = any(part.movable is not None for part in parts)
+    return Soup(
+        points=points,
+        faces=index[faces],
+        part=np.arange(len(parts)).repeat(n_faces),
+        normals=unit_vectors(normals) @ turn.T,
+        uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
+        colors=np.concatenate(colors),
+        flat=np.array([part.flat for part in parts]).repeat(n_faces),
+        stored=faces if has_movable else None,
     )
-    from scipy.spatial import cKDTree  # late, as in `parts`
 
+
+def _check_finite(vertices: Doubles, source: str) -> None:
+    is_bad = ~np.isfinite(vertices).all(axis=1)
+    if is_bad.any():
+        first = int(is_bad.argmax())
+        raise InputError(
+            f"{source}: expected finite vertices, got {int(is_bad.sum())} of "
+            f"{len(vertices)} with NaN or infinite"
+            f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or "
+            "export it again"
+        )
+
+
+def _weld(vertices: Doubles) -> tuple[Doubles, Ints]:
+    """Merge vertices (V, 3) that are closer than `WELD`.
+
+    Returns:
+        The points (P, 3), and the point of each vertex (V,).
+    """
+    # Imported late, as in `parts`.
+    from scipy.spatial import cKDTree
+
+    points, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.reshape(-1)
     pairs = cKDTree(points).query_pairs(WELD, output_type="ndarray")
     if len(pairs):
         cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
-        _, kept, merged = np.unique(cluster, return_index=True, return_inverse=True)
-        points = points[kept]
-        index = merged[index].astype(np.int64)
-    counts = [len(part.faces) for part in parts]
-    return Soup(
-        points=points,
-        faces=index[faces],
-        part=np.arange(len(parts)).repeat(counts),
-        normals=unit_vectors(
-            np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])
+        _, first_of_cluster, cluster_of_point = np.unique(
+            cluster, return_index=True, return_inverse=True
         )
-        @ turn.T,
-        uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
-        colors=np.concatenate(
-            [
-                np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors
-                for p in parts
-            ]
-        ),
-        flat=np.array([part.flat for part in parts]).repeat(counts),
-        stored=faces if any(part.movable is not None for part in parts) else None,
-    )
+        points = points[first_of_cluster]
+        index = cluster_of_point[index].astype(np.int64)
+    return points, index
 
 
 def extent_of(parts: Sequence[ImportedPart]) -> float:
-    """Return the largest extent of all faces together along an axis, in the file's
-    unit; infinite beyond float64.
+    """Return the largest extent of all faces along an axis, in the file's unit.
+
+    It is infinite beyond float64.
     """
     used = [part.vertices[np.unique(part.faces)] for part in parts]
     low = np.min([points.min(axis=0) for points in used], axis=0)
@@ -171,229 +183,272 @@ def extent_of(parts: Sequence[ImportedPart]) -> float:
 
 
 def repaired(soup: Soup, source: str, notes: Notes) -> Soup:
-    """Return a soup, as `join` gives it, without faces without area, its winding
-    consistent and outward, every normal of unit length and on the front of its face.
-    Raises InputError, with the name of the file: no face has an area.
+    """Repair a soup that `join` returned.
+
+    Faces without area are removed, the winding becomes consistent and outward, and
+    every normal has unit length and is on the front of its face.
+
+    Raises:
+        InputError: no face has an area; the message names the file, `source`.
     """
-    flat = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
-    if flat.all():
+    has_no_area = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
+    if has_no_area.all():
         raise InputError(
-            f"{source}: expected faces with an area, got {len(flat)} "
+            f"{source}: expected faces with an area, got {len(has_no_area)} "
             "without; export it again"
         )
-    if flat.any():
-        notes.say(f"{int(flat.sum())} faces without area were removed")
-        soup = soup.only(~flat)
+    if has_no_area.any():
+        notes.say(f"{int(has_no_area.sum())} faces without area were removed")
+        soup = soup.only(~has_no_area)
     return _shaded(_wound(soup, notes), notes)
 
 
 def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
-    """Return the soup as a mesh, and which stored vertex each of its vertices was:
-    corners with the same point, normal and UV, and the same stored vertex where that is
-    known, become one.
+    """Return the soup as a mesh, and the stored vertex of each of its vertices.
+
+    Corners with the same point, normal and UV, and the same stored vertex if that is
+    known, become one vertex.
     """
-    normals = soup.normals.astype(np.float32) + np.float32(0.0)
-    uvs = soup.uvs.astype(np.float32) + np.float32(0.0)
+    normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
+    uvs = (soup.uvs.astype(np.float32) + np.float32(0.0)).reshape(-1, 2)
     corners = soup.faces.reshape(-1)
-    keys = np.column_stack(
-        [
-            corners,
-            normals.reshape(-1, 3).view(np.int32),
-            uvs.reshape(-1, 2).view(np.int32),
-        ]
-    )
+    keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
     if soup.stored is not None:
         keys = np.column_stack([keys, soup.stored.reshape(-1)])
     _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     mesh = Mesh(
         vertices=soup.points[corners[first]].astype(np.float32),
         faces=index.reshape(-1, 3).astype(np.uint32),
-        normals=normals.reshape(-1, 3)[first],
-        uvs=uvs.reshape(-1, 2)[first],
+        normals=normals[first],
+        uvs=uvs[first],
     )
-    return mesh, None if soup.stored is None else soup.stored.reshape(-1)[first]
+    if soup.stored is None:
+        return mesh, None
+    return mesh, soup.stored.reshape(-1)[first]
 
 
-# --- winding ----------------------------------------
+# ---- Winding ----
 
 
 def _wound(soup: Soup, notes: Notes) -> Soup:
-    turn, shell, twisted = _agreement(soup)
-    if turn.any():
+    """Return the soup with consistent and outward winding, and note the changes."""
+    is_turned, shell, has_moebius_strip = _agreement(soup)
+    if is_turned.any():
         notes.say(
-            f"{int(turn.sum())} faces wound against their neighbours were turned over"
+            f"{int(is_turned.sum())} faces wound against their neighbours were turned "
+            "over"
         )
-    if twisted:
+    if has_moebius_strip:
         notes.say(
             "has a one-sided surface (a Moebius strip), so some faces show their backs"
         )
-    soup = soup.reversed(turn)
-    inside_out = _inside_out(soup, shell)[shell]
-    if inside_out.any():
+    soup = soup.reversed(is_turned)
+    is_inside_out = _inside_out(soup, shell)[shell]
+    if is_inside_out.any():
         notes.say(
-            f"{int(inside_out.sum())} faces were inside out and have been turned over"
+            f"{int(is_inside_out.sum())} faces were inside out and have been turned "
+            "over"
         )
-    return soup.reversed(inside_out)
+    return soup.reversed(is_inside_out)
 
 
 def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
-    """Return, for each edge of exactly two faces, the corner in each of them at which
-    the edge starts (3 face + k).
+    """Find the edges that belong to exactly two faces (F, 3).
 
-    The third array tells whether both faces run along the edge in the same direction,
-    that is, disagree in winding.
+    Returns:
+        For each edge the corner in either face at which it starts (3 face + k); and
+        whether both faces run along it in the same direction, that is, disagree in
+        winding.
     """
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
-    low = np.minimum(start, end)
-    high = np.maximum(start, end)
-    order = np.lexsort((high, low))
-    fresh = np.concatenate(
-        [[True], (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)]
+    lower = np.minimum(start, end)
+    upper = np.maximum(start, end)
+    order = np.lexsort((upper, lower))
+    is_new_edge = np.concatenate(
+        [[True], (np.diff(lower[order]) != 0) | (np.diff(upper[order]) != 0)]
     )
-    first = np.flatnonzero(fresh)
-    pairs = first[np.diff(np.append(first, len(order))) == 2]
+    first = np.flatnonzero(is_new_edge)
+    edge_counts = np.diff(np.append(first, len(order)))
+    pairs = first[edge_counts == 2]
     left = order[pairs]
     right = order[pairs + 1]
     return left, right, start[left] == start[right]
 
 
 def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
-    """Return which faces (F,) to turn over so that neighbours agree, keeping the way of
-    most of each shell's area; the shell that each belongs to (F,); and whether some
-    shell is one-sided. Every face stands for two nodes of a graph, "as it is" and
-    "turned"; neighbours that agree are linked like to like, others crosswise. A shell
-    is orientable when the two nodes of its faces fall into two components.
+    """Decide which faces to turn over so that neighbours agree in winding.
+
+    Every face is two nodes of a graph, "as it is" and "turned". Neighbours that agree
+    are linked like to like, others crosswise. A shell is orientable if the two nodes of
+    its faces are in two components. Each shell keeps the winding of most of its area.
+
+    Returns:
+        Which faces (F,) to turn over; the shell of each face (F,); and whether some
+        shell is one-sided.
     """
-    left, right, same_way = neighbours(soup.faces)
+    left, right, same_direction = neighbours(soup.faces)
     area = np.linalg.norm(soup.face_vectors(), axis=1)
-    f = left // 3
-    g = right // 3
-    count = len(area)
-    a = np.concatenate([2 * f, 2 * f + 1])
-    b = np.concatenate([2 * g + same_way, 2 * g + 1 - same_way])
-    side = connected(2 * count, a, b)
-    kept = side[0::2]
-    turned = side[1::2]
-    votes = np.bincount(kept, weights=area, minlength=int(side.max()) + 1)
-    turn = (votes[turned] > votes[kept]) | (
-        (votes[turned] == votes[kept]) & (turned < kept)
+    left_face = left // 3
+    right_face = right // 3
+    starts = np.concatenate([2 * left_face, 2 * left_face + 1])
+    ends = np.concatenate(
+        [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
     )
-    _, shell = np.unique(np.minimum(kept, turned), return_inverse=True)
-    return turn, shell.astype(np.int64), bool((kept == turned).any())
+    component = connected(2 * len(area), starts, ends)
+    as_is = component[0::2]
+    turned = component[1::2]
+    votes = np.bincount(as_is, weights=area, minlength=int(component.max()) + 1)
+    is_turned = (votes[turned] > votes[as_is]) | (
+        (votes[turned] == votes[as_is]) & (turned < as_is)
+    )
+    _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
+    return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
 
 
 def _inside_out(soup: Soup, shell: Ints) -> Bools:
-    """Return, for each shell, whether it must be turned over: a closed shell, all of
-    whose edges belong to exactly two faces of it, when its signed volume is negative,
-    unless it lies within another closed shell (then it is the wall of a hollow) and the
-    file's normals do not object; an open sheet when the file's normals point away from
-    its front.
+    """Return for each shell (S,) whether it must be turned over.
+
+    A closed shell, all of whose edges belong to exactly two of its faces, is turned if
+    its signed volume is negative, unless it lies within another closed shell (then it
+    is the wall of a hollow) and the file's normals do not object. An open sheet is
+    turned if the file's normals point away from its front.
+
+    Args:
+        soup: a soup whose neighbours agree in winding.
+        shell: the shell of each face, (F,).
     """
-    faces = np.bincount(shell)
+    face_counts = np.bincount(shell)
     vectors = soup.face_vectors()
-    count = len(faces)
-    paired = (
-        np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=len(faces)) * 2
-    )
-    closed = np.equal(paired, 3 * faces)
-    corners = soup.points[soup.faces]
-    sums = [np.bincount(shell, weights=place) for place in corners.mean(axis=1).T]
-    middle = np.stack(sums, axis=1) / faces[:, None]
-    volume = np.bincount(
-        shell,
-        weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1),
-        minlength=count,
-    )
+    n_shells = len(face_counts)
+    edge_shell = shell[neighbours(soup.faces)[0] // 3]
+    paired_edges = np.bincount(edge_shell, minlength=n_shells) * 2
+    is_closed = np.equal(paired_edges, 3 * face_counts)
+    volume = _signed_volumes(soup, shell, vectors, face_counts)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
-    # with the file's normals; 0 where it has none
-    agreement = np.bincount(shell, weights=toward, minlength=count)
-    low = np.full((count, 3), np.inf)
-    high = np.full((count, 3), -np.inf)
-    np.minimum.at(low, shell, corners.min(axis=1))
-    np.maximum.at(high, shell, corners.max(axis=1))
-    # then the whole object is inside out, hollows included
-    mostly = volume[closed].sum() < 0.0
-    negative = (volume < 0.0) ^ mostly
-    for number in np.flatnonzero(closed & negative):
-        around = (
-            closed & (low < low[number]).all(axis=1) & (high > high[number]).all(axis=1)
+    # Agreement with the file's normals; 0 if it has none.
+    agreement = np.bincount(shell, weights=toward, minlength=n_shells)
+    corners = soup.points[soup.faces]
+    lower = np.full((n_shells, 3), np.inf)
+    upper = np.full((n_shells, 3), -np.inf)
+    np.minimum.at(lower, shell, corners.min(axis=1))
+    np.maximum.at(upper, shell, corners.max(axis=1))
+    # If so, the whole object is inside out, hollows included.
+    mostly_negative = volume[is_closed].sum() < 0.0
+    is_inverted = (volume < 0.0) ^ mostly_negative
+    for index in np.flatnonzero(is_closed & is_inverted):
+        is_enclosing = (
+            is_closed
+            & (lower < lower[index]).all(axis=1)
+            & (upper > upper[index]).all(axis=1)
         )
-        negative[number] = not around.any() or (
-            agreement[number] > 0.0 if mostly else agreement[number] < 0.0
-        )
-    return np.where(closed, negative ^ mostly, agreement < 0.0)
+        if not is_enclosing.any():
+            continue  # it stays inverted
+        if mostly_negative:
+            is_inverted[index] = agreement[index] > 0.0
+        else:
+            is_inverted[index] = agreement[index] < 0.0
+    return np.where(is_closed, is_inverted ^ mostly_negative, agreement < 0.0)
 
 
-# --- normals ----------------------------------------
+def _signed_volumes(
+    soup: Soup, shell: Ints, vectors: Doubles, face_counts: Ints
+) -> Doubles:
+    """Return six times the signed volume of each shell, (S,)."""
+    corners = soup.points[soup.faces]
+    sums = [
+        np.bincount(shell, weights=coordinate) for coordinate in corners.mean(axis=1).T
+    ]
+    center = np.stack(sums, axis=1) / face_counts[:, None]
+    heights = ((corners[:, 0] - center[shell]) * vectors).sum(axis=1)
+    return np.asarray(np.bincount(shell, weights=heights, minlength=len(face_counts)))
+
+
+# ---- Normals ----
 
 
 def _shaded(soup: Soup, notes: Notes) -> Soup:
+    """Return the soup with a normal on the front of its face at every corner.
+
+    The file's normals are kept if they agree with the faces on most of the surface.
+    """
     vectors = soup.face_vectors()
     area = np.linalg.norm(vectors, axis=1)
-    known = np.isfinite(soup.normals).all(axis=2)
-    front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
+    is_known = np.isfinite(soup.normals).all(axis=2)
+    is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
     normals = soup.normals
-    if known.any():
-        weight = np.where(known, area[:, None], 0.0)
-        share = float((weight * front).sum() / weight.sum())
-        if share < 1.0 - TRUSTED:
+    if is_known.any():
+        weight = np.where(is_known, area[:, None], 0.0)
+        front_fraction = float((weight * is_front).sum() / weight.sum())
+        if front_fraction < 1.0 - TRUSTED:
             notes.say("its normals pointed inwards and were turned around")
             normals = -normals
-            front = known & ~front
-        elif share < TRUSTED:
+            is_front = is_known & ~is_front
+        elif front_fraction < TRUSTED:
             notes.say("its normals contradict its faces and were computed anew")
-            front = np.zeros_like(front)
-    if not front.all():
-        made = smooth_normals(soup)
+            is_front = np.zeros_like(is_front)
+    if not is_front.all():
+        computed = smooth_normals(soup)
         if soup.flat is not None:
-            made = np.where(
-                soup.flat[:, None, None], unit_vectors(vectors)[:, None], made
-            )
-        normals = np.where((known & front)[:, :, None], normals, made)
+            face_normals = unit_vectors(vectors)[:, None]
+            computed = np.where(soup.flat[:, None, None], face_normals, computed)
+        normals = np.where((is_known & is_front)[:, :, None], normals, computed)
     return replace(soup, normals=normals)
 
 
 def smooth_normals(soup: Soup) -> Doubles:
-    """Return unit normals of corners (F, 3, 3), smooth except across creases. At each
-    point, the faces that can be reached from one another over edges with less than the
-    crease angle share one normal: the mean of their normals weighted by their angles at
-    that point (Thuermer and Wuethrich 1998).
+    """Compute unit normals of corners (F, 3, 3), smooth except across creases.
+
+    At each point, the faces that can be reached from one another over edges with less
+    than the crease angle share one normal: the mean of their normals weighted by their
+    angles at that point (Thuermer and Wuethrich 1998).
     """
-    unit = unit_vectors(soup.face_vectors())
-    left, right, same_way = neighbours(soup.faces)
-    gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(
-        np.radians(CREASE_DEGREES)
-    )
-    left = left[gentle & ~same_way]
-    right = right[gentle & ~same_way]
-    after = [corner - corner % 3 + (corner + 1) % 3 for corner in (left, right)]
-    a = np.concatenate([left, after[0]])
-    b = np.concatenate([after[1], right])
-    group = connected(soup.faces.size, a, b)
-    corners = soup.points[soup.faces]
-    ahead = np.roll(corners, -1, axis=1) - corners
-    behind = np.roll(corners, 1, axis=1) - corners
-    angles: Doubles = np.arctan2(
-        np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2)
-    )
-    weighted = unit[:, None] * angles[:, :, None]
+    face_normals = unit_vectors(soup.face_vectors())
+    left, right, same_direction = neighbours(soup.faces)
+    cosine = (face_normals[left // 3] * face_normals[right // 3]).sum(axis=1)
+    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
+    left = left[is_smooth & ~same_direction]
+    right = right[is_smooth & ~same_direction]
+    # At either end of the edge, a corner of one face meets a corner of the other.
+    starts = np.concatenate([left, _next_corner(left)])
+    ends = np.concatenate([_next_corner(right), right])
+    group = connected(soup.faces.size, starts, ends)
+    weighted = face_normals[:, None] * _corner_angles(soup)[:, :, None]
     sums: Doubles = np.stack(
         [np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1
     )
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
-    # NaN, where normals cancel, is not
-    sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0
-    return np.where(sound, smooth, unit[:, None])
+    # False also for NaN, where normals cancel.
+    is_valid = (smooth * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
+    return np.where(is_valid, smooth, face_normals[:, None])
+
+
+def _next_corner(corner: Ints) -> Ints:
+    """Return the corners (3 face + k) that follow corners in their faces."""
+    return corner - corner % 3 + (corner + 1) % 3
+
+
+def _corner_angles(soup: Soup) -> Doubles:
+    """Return the angle in radians at each corner, (F, 3)."""
+    corners = soup.points[soup.faces]
+    to_next = np.roll(corners, -1, axis=1) - corners
+    to_previous = np.roll(corners, 1, axis=1) - corners
+    sine = np.linalg.norm(np.cross(to_next, to_previous), axis=2)
+    cosine = (to_next * to_previous).sum(axis=2)
+    return np.asarray(np.arctan2(sine, cosine))
 
 
 def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:
-    return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
+    """Return values (V, width) of vertices at corners, (F, 3, width); NaN for None."""
+    if values is None:
+        return np.full((len(faces), 3, width), np.nan)
+    return values[faces]
 
 
 def unit_vectors(vectors: Doubles) -> Doubles:
-    """Scale vectors, along the last axis, to unit length; NaN where they have no
-    direction.
+    """Scale vectors, along the last axis, to unit length.
+
+    Vectors without a direction become NaN.
     """
     with np.errstate(all="ignore"):
         largest = np.abs(vectors).max(axis=-1, keepdims=True)
@@ -403,187 +458,241 @@ def unit_vectors(vectors: Doubles) -> Doubles:
 
 
 def connected(count: int, a: Ints, b: Ints) -> Ints:
-    """Return the component (count,) of each node of a graph with edges between a
-    and b.
+    """Return the connected component (count,) of each node of a graph.
+
+    Edges are between the nodes `a` (E,) and `b` (E,).
     """
-    from scipy.sparse import coo_array, csgraph  # late, as in `parts`
+    # Imported late, as in `parts`.
+    from scipy.sparse import coo_array, csgraph
 
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
-    return np.asarray(
-        csgraph.connected_components(graph, directed=False)[1], dtype=np.int64
-    )
+    _, component = csgraph.connected_components(graph, directed=False)
+    return np.asarray(component, dtype=np.int64)
 
 
-# ---- Polygons as triangles: fans where those are right, else ears are cut off, for
-# many polygons at a time ----------
+# ---- Triangulation of many polygons at a time: fans if those are right, else ears ----
 
-# points that are compared with ears, in all; then the polygons that are left are cut up
-# as fans
+# Limit of the comparisons of points with ears; beyond it, polygons are cut up untested.
 MOST_WORK = 50_000_000
-# twice the area of a triangle, as a share of that of its polygon, up to which it has
-# none
+# Twice the area of a triangle, as a fraction of that of its polygon, up to which it
+# counts as having none.
 _FLAT = 1e-9
 
 
 def cut_up(points: Doubles, counts: Ints, notes: Notes) -> tuple[Ints, Ints]:
-    """Return the triangles of polygons, and the polygon of each, as `triangulated`;
-    what is odd is noted.
+    """Triangulate polygons, and note those that may be wrong.
+
+    Arguments and results are those of `triangulated`.
     """
-    if few := int((counts < 3).sum()):
+    n_degenerate = int((counts < 3).sum())
+    if n_degenerate:
+        plural = "" if n_degenerate == 1 else "s"
+        notes.say(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
+    triangles, polygon, n_wrong = triangulated(points, counts)
+    if n_wrong:
         notes.say(
-            f"{few:,} face{'' if few == 1 else 's'} of fewer than 3 corners left out"
-        )
-    triangles, owner, wrong = triangulated(points, counts)
-    if wrong:
-        notes.say(
-            f"{wrong:,} faces cross themselves, or are too much work, and may be "
+            f"{n_wrong:,} faces cross themselves, or are too much work, and may be "
             "cut up wrongly"
         )
-    return triangles, owner
+    return triangles, polygon
 
 
 def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
-    """Cut polygons up into triangles: return their corners (T, 3), as indices into
-    `points`, in the order of the polygons; the polygon of each (T,); and of how many
-    polygons some triangles may lie outside: they cross themselves, or were too much
-    work.
+    """Triangulate polygons.
 
-    Where the triangles from a polygon's first corner all face as the polygon does (it
-    is convex, mostly), these are taken. Otherwise ears are cut off (Meisters 1975) in
-    the plane that the polygon lies in on average (Newell). Points (C, 3) are those of
-    the corners of all polygons, one polygon after the other, and may be NaN; counts
-    (P,) are of each one's corners, and those of fewer than 3 become no triangle.
+    If the triangles from a polygon's first corner all face as the polygon does (it is
+    convex, mostly), these are taken. Otherwise ears are cut off (Meisters 1975) in the
+    plane that the polygon lies in on average (Newell).
+
+    Args:
+        points: (C, 3) the corners of all polygons, concatenated; may be NaN.
+        counts: (P,) the number of corners of each polygon; those of fewer than 3 become
+            no triangle.
+
+    Returns:
+        The corners of the triangles (T, 3), as indices into `points`, in the order of
+        the polygons; the polygon of each triangle (T,); and the number of polygons of
+        which some triangles may be outside, because they cross themselves or were too
+        much work.
     """
     starts = np.cumsum(counts) - counts
-    kinds, group = np.unique(counts, return_inverse=True)
+    distinct_counts, group = np.unique(counts, return_inverse=True)
     triangles = []
     owners = []
-    wrong = 0
-    left = MOST_WORK
-    for number, count in enumerate(kinds):
+    n_wrong = 0
+    budget = MOST_WORK
+    for index, count in enumerate(distinct_counts):
         if count < 3:
             continue
-        polygons = np.flatnonzero(group == number)
+        polygons = np.flatnonzero(group == index)
         corners = starts[polygons, None] + np.arange(count)
-        cut = np.stack(
-            [
-                corners[:, :1].repeat(count - 2, axis=1),
-                corners[:, 1:-1],
-                corners[:, 2:],
-            ],
-            axis=2,
-        )
-        if count > 3:
-            flat = _flattened(points[corners])
-            areas = _doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
-            bad = np.flatnonzero(
-                (areas <= _FLAT * np.abs(areas.sum(axis=1))[:, None]).any(axis=1)
-            )
-            if len(bad):
-                ears, failed, used = _ears(flat[bad], left)
-                left = left - used
-                wrong = wrong + failed
-                cut[bad] = corners[bad][np.arange(len(bad))[:, None, None], ears]
+        cut, n_failed, used = _triangulate_equal(points, corners, budget)
+        budget = budget - used
+        n_wrong = n_wrong + n_failed
         triangles.append(cut.reshape(-1, 3))
         owners.append(np.repeat(polygons, count - 2))
     if not owners:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), wrong
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), n_wrong
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
-    return np.concatenate(triangles)[order], owner[order], wrong
+    return np.concatenate(triangles)[order], owner[order], n_wrong
+
+
+def _triangulate_equal(
+    points: Doubles, corners: Ints, budget: int
+) -> tuple[Ints, int, int]:
+    """Triangulate polygons (P, n) with the same number of corners.
+
+    Args:
+        points: (C, 3).
+        corners: (P, n) indices into `points`.
+        budget: limit of the comparisons of points with ears.
+
+    Returns:
+        The triangles (P, n - 2, 3), the number of polygons that may be wrong, and the
+        number of comparisons made.
+    """
+    count = corners.shape[1]
+    first = corners[:, :1].repeat(count - 2, axis=1)
+    fans = np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
+    if count == 3:
+        return fans, 0, 0
+    flat = _flattened(points[corners])
+    areas = _doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
+    min_area = _FLAT * np.abs(areas.sum(axis=1))[:, None]
+    concave = np.flatnonzero((areas <= min_area).any(axis=1))
+    if not len(concave):
+        return fans, 0, 0
+    ears, n_failed, used = _ears(flat[concave], budget)
+    rows = np.arange(len(concave))[:, None, None]
+    fans[concave] = corners[concave][rows, ears]
+    return fans, n_failed, used
 
 
 def _flattened(corners: Doubles) -> Doubles:
-    """Return polygons (P, n, 3) in their planes, (P, n, 2), counter-clockwise and about
-    1 large.
+    """Project polygons (P, n, 3) to their planes, (P, n, 2).
+
+    They are counter-clockwise and about 1 large.
     """
     corners = corners - corners.mean(axis=1, keepdims=True)
-    corners = corners / np.maximum(
-        np.abs(corners).max(axis=(1, 2), keepdims=True), 1e-300
-    )
+    sizes = np.abs(corners).max(axis=(1, 2), keepdims=True)
+    corners = corners / np.maximum(sizes, 1e-300)
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    aside = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    across = np.cross(aside, normal)
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-    plane = np.stack([across, np.cross(normal, across)], axis=2)
+    other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    x_axis = np.cross(other_axis, normal)
+    x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
+    plane = np.stack([x_axis, np.cross(normal, x_axis)], axis=2)
     return np.asarray(corners @ plane)
 
 
 def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
-    ahead = b - a
-    aside = c - a
-    return np.asarray(ahead[..., 0] * aside[..., 1] - ahead[..., 1] * aside[..., 0])
+    """Return twice the signed area of triangles with corners (..., 2)."""
+    to_b = b - a
+    to_c = c - a
+    return np.asarray(to_b[..., 0] * to_c[..., 1] - to_b[..., 1] * to_c[..., 0])
 
 
 def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
-    """Cut the ears off polygons (P, n, 2) with the same number of corners, as
-    `_flattened` gives them, all at once, each in turns of its own, with so many
-    comparisons at most. Return the corners of the triangles (P, n - 2, 3); how many
-    polygons with an area had no ear at some time, or were left over; and the
-    comparisons that were made.
+    """Triangulate polygons (P, n, 2) by cutting off ears, in all polygons in parallel.
+
+    Each polygon has a tip, the corner that is tried next. If the triangle of the tip
+    and its two neighbours is an ear, it is cut off; otherwise the tip moves on. A
+    polygon whose corners have all been tried has no ear, and its tip is cut off anyway.
+
+    Args:
+        flat: polygons as `_flattened` returns them.
+        budget: limit of the comparisons; then all ears are cut off untested.
+
+    Returns:
+        The corners of the triangles (P, n - 2, 3); how many polygons with an area
+        lacked an ear at some time, or were over the budget; and the comparisons made.
     """
-    count, corners = flat.shape[:2]
-    after = np.tile(np.roll(np.arange(corners), -1), (count, 1))
-    before = np.tile(np.roll(np.arange(corners), 1), (count, 1))
-    triangles = np.zeros((count, corners - 2, 3), dtype=np.int64)
-    cut, tip, tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
-    failed = np.zeros(count, dtype=np.bool_)
-    size = np.abs(
+    count, n_corners = flat.shape[:2]
+    # Linked lists of the corners that are left.
+    after = np.tile(np.roll(np.arange(n_corners), -1), (count, 1))
+    before = np.tile(np.roll(np.arange(n_corners), 1), (count, 1))
+    triangles = np.zeros((count, n_corners - 2, 3), dtype=np.int64)
+    n_cut, tip, n_tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
+    is_failed = np.zeros(count, dtype=np.bool_)
+    area = np.abs(
         _doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1)
     )
-    # only a corner that is not convex can lie in an ear
-    dents = (
-        _doubled_areas(np.roll(flat, 1, axis=1), flat, np.roll(flat, -1, axis=1))
-        <= _FLAT * size[:, None]
-    )
-    dent = np.argsort(~dents, axis=1, kind="stable")[:, : int(dents.sum(axis=1).max())]
-    there = np.take_along_axis(dents, dent, axis=1)
-    places = np.take_along_axis(flat, dent[:, :, None], axis=1)
-    busy = np.arange(count)
-    used = 0
-    while len(busy):
-        b = tip[busy]
-        a = before[busy, b]
-        c = after[busy, b]
-        left = corners - cut[busy]
-        ear = left == 3
-        hopeless = tries[busy] >= left
-        if used < budget:
-            used += places[busy].size // 2
-            ends = [flat[busy, corner] for corner in (a, b, c)]
-            ear |= _is_ear(ends, places[busy], there[busy], _FLAT * size[busy])
+    dent, is_present = _find_dents(flat, area)
+    dent_points = np.take_along_axis(flat, dent[:, :, None], axis=1)
+    active = np.arange(count)
+    n_compared = 0
+    while len(active):
+        b = tip[active]
+        a = before[active, b]
+        c = after[active, b]
+        n_left = n_corners - n_cut[active]
+        is_cut = n_left == 3
+        is_hopeless = n_tries[active] >= n_left
+        if n_compared < budget:
+            n_compared += dent_points[active].size // 2
+            corners = [flat[active, corner] for corner in (a, b, c)]
+            is_cut |= _is_ear(
+                corners,
+                dent_points[active],
+                is_present[active],
+                _FLAT * area[active],
+            )
         else:
-            hopeless[:] = True
-        failed[busy] |= hopeless & ~ear
-        ear |= hopeless
-        tip[busy], tries[busy] = c, tries[busy] + 1
-        rows = busy[ear]
-        a = a[ear]
-        b = b[ear]
-        c = c[ear]
-        triangles[rows, cut[rows]] = np.stack([a, b, c], axis=1)
-        there[rows] &= dent[rows] != b[:, None]
-        after[rows, a], before[rows, c], tries[rows] = c, a, 0
-        cut[rows] += 1
-        busy = busy[cut[busy] < corners - 2]
-    return triangles, int((failed & (size > _FLAT)).sum()), used
+            is_hopeless[:] = True
+        is_failed[active] |= is_hopeless & ~is_cut
+        is_cut |= is_hopeless
+        tip[active] = c
+        n_tries[active] += 1
+        rows = active[is_cut]
+        a = a[is_cut]
+        b = b[is_cut]
+        c = c[is_cut]
+        triangles[rows, n_cut[rows]] = np.stack([a, b, c], axis=1)
+        is_present[rows] &= dent[rows] != b[:, None]
+        after[rows, a] = c
+        before[rows, c] = a
+        n_tries[rows] = 0
+        n_cut[rows] += 1
+        active = active[n_cut[active] < n_corners - 2]
+    return triangles, int((is_failed & (area > _FLAT)).sum()), n_compared
+
+
+def _find_dents(flat: Doubles, area: Doubles) -> tuple[Ints, Bools]:
+    """Find the corners of polygons (P, n, 2) that are not convex.
+
+    Only these can lie in an ear.
+
+    Returns:
+        Corners (P, d), as many as any polygon has; and which are not convex.
+    """
+    previous = np.roll(flat, 1, axis=1)
+    following = np.roll(flat, -1, axis=1)
+    is_dent = _doubled_areas(previous, flat, following) <= _FLAT * area[:, None]
+    max_dents = int(is_dent.sum(axis=1).max())
+    dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
+    return dent, np.take_along_axis(is_dent, dent, axis=1)
 
 
 def _is_ear(
-    ends: list[Doubles], places: Doubles, there: Bools, least: Doubles
+    corners: list[Doubles], points: Doubles, is_present: Bools, min_area: Doubles
 ) -> Bools:
-    """Tell of triangles, three times (P, 2), whether they have an area and hold no
-    place (P, n, 2) that is there.
+    """Return which triangles have an area and contain no present point, (P,).
+
+    Args:
+        corners: the three corners of each triangle, (P, 2) each.
+        points: (P, n, 2) points that may lie in them.
+        is_present: (P, n) which of the points count.
+        min_area: (P,) twice the area up to which a triangle has none.
     """
-    ear: Bools = _doubled_areas(*ends) > least
-    x = places[ear, :, 0]
-    y = places[ear, :, 1]
-    inside = there[ear]
-    for begin, end in zip(ends, [*ends[1:], ends[0]], strict=True):
-        (x0, y0) = begin[ear, :, None].swapaxes(0, 1)
-        (x1, y1) = end[ear, :, None].swapaxes(0, 1)
-        inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
-        inside &= (x != x0) | (y != y0)
-    ear[ear] = ~inside.any(axis=1)
-    return ear
+    is_ear: Bools = _doubled_areas(*corners) > min_area
+    x = points[is_ear, :, 0]
+    y = points[is_ear, :, 1]
+    is_inside = is_present[is_ear]
+    for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+        x0, y0 = start[is_ear, :, None].swapaxes(0, 1)
+        x1, y1 = end[is_ear, :, None].swapaxes(0, 1)
+        is_inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+        is_inside &= (x != x0) | (y != y0)
+    is_ear[is_ear] = ~is_inside.any(axis=1)
+    return is_ear

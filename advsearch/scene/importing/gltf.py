@@ -1,6 +1,4 @@
-"""glTF files: the header, read strictly and held to limits, and the numbers in their
-buffers.
-"""
+"""glTF files: their headers, checked strictly and against limits, and their buffers."""
 
 from __future__ import annotations
 
@@ -33,17 +31,47 @@ from advsearch.trust.named_files import References, plain_name
 from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
 MOST_VALUES = 1_000_000
-"""Lists, objects and values in a header; each takes hundreds of bytes of memory, and
-may take two of the file.
+"""Limit of the lists, objects and values in a header; each may take two bytes of the
+file, and takes hundreds of bytes of memory.
 """
 
 
 def read_header(path: Path, data: bytes) -> Header:
-    """Return the header of a .gltf or .glb file. Raises FileFormatError: the file is
-    not glTF, is shorter than it says, has other types in its header than glTF has,
-    refers to what is not there, is over a limit, or needs what is not supported.
+    """Read and check the header of a .gltf or .glb file.
+
+    Raises:
+        FileFormatError: the file is not glTF, is shorter than it states, has other
+            types in its header than glTF has, refers to what is not there, is over a
+            limit, or needs what is not supported.
     """
-    chunk = _chunks(path, data)[0]
+    chunk, _ = _chunks(path, data)
+    content = _parse_content(path, chunk)
+    try:
+        version = Asset.model_validate(content["asset"]).version
+        if version.split(".")[0] != "2":
+            raise damaged(path, "glTF of version 2", f"version {shown(version)}")
+        header = Header.model_validate(content)
+    except ValidationError as error:
+        raise _invalid_entry(path, error) from None
+    extensions = _find_extensions(path, content)
+    entries = zip(header.nodes, content.get("nodes", ()), strict=True)
+    for index, (node, entry) in enumerate(entries):
+        node_extensions = entry.get("extensions") or {}
+        has_light = node_extensions.get("KHR_lights_punctual") is not None
+        if node.lamp is None and has_light:
+            raise damaged(
+                path,
+                f"glTF with nodes[{index}].extensions.KHR_lights_punctual.light",
+                "nothing",
+            )
+    used = sorted({*header.extensionsUsed, *extensions})
+    header = header.model_copy(update={"extensionsUsed": used})
+    check_header(path, header)
+    return header
+
+
+def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
+    """Parse the JSON of a header, which must have an asset."""
     text = text_of(chunk)
     check_most(
         path,
@@ -55,79 +83,65 @@ def read_header(path: Path, data: bytes) -> Header:
     try:
         content = parse_json(text)
     except ValueError as error:
-        otherwise = (
-            str(error) if isinstance(error, JsonBoundsError) else "something else"
-        )
-        raise damaged(
-            path, "glTF with a JSON header", find_kind(chunk) or otherwise
-        ) from None
+        got = find_kind(chunk)
+        if not got:
+            is_over_limit = isinstance(error, JsonBoundsError)
+            got = str(error) if is_over_limit else "something else"
+        raise damaged(path, "glTF with a JSON header", got) from None
     if not isinstance(content, dict) or "asset" not in content:
         raise damaged(path, "glTF with an 'asset' entry", "other JSON")
-    try:
-        version = Asset.model_validate(content["asset"]).version
-        if version.split(".")[0] != "2":
-            raise damaged(path, "glTF of version 2", f"version {shown(version)}")
-        header = Header.model_validate(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = "".join(
-            f"[{part}]" if isinstance(part, int) else f".{part}"
-            for part in first["loc"]
-        ).lstrip(".")
-        if first["type"] == "missing":
-            raise damaged(path, f"glTF with {place}", "nothing") from None
-        needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
-        got = shown(json.dumps(first["input"], default=str))
-        raise damaged(path, f"glTF whose {place} is {needed}", got) from None
+    return content
+
+
+def _invalid_entry(path: Path, error: ValidationError) -> FileFormatError:
+    """Return the error for the first entry of a header that is invalid."""
+    first = error.errors(include_url=False)[0]
+    keys = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"])
+    location = "".join(keys).lstrip(".")
+    if first["type"] == "missing":
+        return damaged(path, f"glTF with {location}", "nothing")
+    needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
+    got = shown(json.dumps(first["input"], default=str))
+    return damaged(path, f"glTF whose {location} is {needed}", got)
+
+
+def _find_extensions(path: Path, content: JsonValue) -> set[str]:
+    """Return the names of all extensions that entries of a header have.
+
+    Raises:
+        FileFormatError: some are no objects.
+    """
     extensions: set[str] = set()
-    level: list[JsonValue] = [content]
-    while level:
-        entry = level.pop()
+    stack: list[JsonValue] = [content]
+    while stack:
+        entry = stack.pop()
         if isinstance(entry, list):
-            level.extend(entry)
+            stack.extend(entry)
         elif isinstance(entry, dict):
-            held = {} if entry.get("extensions") is None else entry["extensions"]
-            if not isinstance(held, dict) or not all(
+            held = entry.get("extensions")
+            if held is None:
+                held = {}
+            are_objects = isinstance(held, dict) and all(
                 isinstance(held.get(name) or {}, dict) for name in READ
-            ):
+            )
+            if not isinstance(held, dict) or not are_objects:
                 raise damaged(
                     path, "glTF whose extensions are objects", shown(json.dumps(held))
                 )
             extensions.update(held)
-            level.extend(value for key, value in entry.items() if key != "extras")
-    for number, (node, entry) in enumerate(
-        zip(header.nodes, content.get("nodes", ()), strict=True)
-    ):
-        if (
-            node.lamp is None
-            and (entry.get("extensions") or {}).get("KHR_lights_punctual") is not None
-        ):
-            raise damaged(
-                path,
-                f"glTF with nodes[{number}].extensions.KHR_lights_punctual.light",
-                "nothing",
-            )
-    header = header.model_copy(
-        update={"extensionsUsed": sorted({*header.extensionsUsed, *extensions})}
-    )
-    check_header(path, header)
-    return header
+            stack.extend(value for key, value in entry.items() if key != "extras")
+    return extensions
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the header of a file as text, and what follows it in a .glb file; None
-    where nothing does.
-    """
+    """Return the JSON of a file, and the binary chunk of a .glb file or None."""
     if path.suffix.lower() == ".gltf":
         return data, None
-    if not data.startswith(b"glTF") or len(data) < 20:
-        got = (
-            "the first few bytes of one"
-            if data.startswith(b"glTF")
-            else looks_like(data)
-        )
+    has_magic = data.startswith(b"glTF")
+    if not has_magic or len(data) < 20:
+        got = "the first few bytes of one" if has_magic else looks_like(data)
         raise damaged(path, "a binary glTF file", got)
-    version, length, chunk, kind = struct.unpack_from("<4xIII4s", data)
+    version, length, json_size, kind = struct.unpack_from("<4xIII4s", data)
     if version != 2:
         raise damaged(path, "binary glTF of version 2", f"version {version}")
     if length > len(data):
@@ -136,26 +150,28 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
             f"{length} bytes, as its header says",
             f"{len(data)}; the file is cut short",
         )
-    if kind != b"JSON" or 20 + chunk > length:
+    if kind != b"JSON" or 20 + json_size > length:
         raise damaged(
             path,
             "a chunk of JSON first",
-            f"{chunk} bytes of {shown(kind.decode('latin-1'))}",
+            f"{json_size} bytes of {shown(kind.decode('latin-1'))}",
         )
-    start = 28 + chunk
-    rest = None
-    if start <= length:
-        size, kind = struct.unpack_from("<I4s", data, start - 8)
-        rest = data[start : min(start + size, length)] if kind == b"BIN\0" else None
-    return data[20 : 20 + chunk].rstrip(b"\0"), rest  # some pad with zeros
+    binary_start = 28 + json_size
+    binary = None
+    if binary_start <= length:
+        size, kind = struct.unpack_from("<I4s", data, binary_start - 8)
+        if kind == b"BIN\0":
+            binary = data[binary_start : min(binary_start + size, length)]
+    # Some writers pad the JSON with zeros.
+    return data[20 : 20 + json_size].rstrip(b"\0"), binary
 
 
 LARGEST_VALUES = 1 << 28
-"""Bytes that all views, and all accessors, of a file may have; they may overlap, so its
-size says nothing.
+"""Limit of the bytes of all views, and of all accessors, of a file; they may overlap, so
+the size of the file is no bound.
 """
-LARGEST_TREE = 20_000  # nodes, and pieces of geometry at their places, in one file
-DEEPEST_TREE = 500  # nodes from the root to a leaf
+LARGEST_TREE = 20_000  # limit of the nodes, and of the drawn primitives, of a file
+DEEPEST_TREE = 500  # limit of the nodes from the root to a leaf
 READ = tuple(
     "EXT_texture_webp KHR_lights_punctual KHR_materials_emissive_strength "
     "KHR_materials_pbrSpecularGlossiness "
@@ -163,22 +179,25 @@ READ = tuple(
 )
 """Extensions that are understood."""
 _LOOKS = ("KHR_materials_", "KHR_xmp")
-"""Beginnings of those without which a file looks otherwise and has the same geometry:
-they are named in warnings.
+"""Prefixes of extensions without which a file looks different but has the same geometry:
+warnings name them.
 """
 
 
 def is_of_splats(name: str) -> bool:
-    """Whether an extension or an attribute holds Gaussian splats:
-    KHR_gaussian_splatting, and those that pack it.
+    """Return whether an extension or attribute holds Gaussian splats.
+
+    These are KHR_gaussian_splatting and the extensions that compress it.
     """
     return "gaussian_splat" in name.lower()
 
 
 def check_header(path: Path, header: Header) -> None:
-    """Check what the types leave open: extensions, limits, and that whatever is
-    referred to is there. Raises FileFormatError: the header needs what is not
-    supported, refers to what is not there, or is over a limit.
+    """Check what the types of a header leave open.
+
+    Raises:
+        FileFormatError: the header needs an extension that is not supported, refers to
+            what is not there, or is over a limit.
     """
     needed = sorted(
         name
@@ -189,25 +208,31 @@ def check_header(path: Path, header: Header) -> None:
         raise _needs(path, needed)
     for entry in header.entries():
         for kind, index in entry.references():
-            if index >= (count := len(getattr(header, kind))):
+            count = len(getattr(header, kind))
+            if index >= count:
                 raise damaged(
                     path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
                 )
     for animation in header.animations:
-        most = max((channel.curve for channel in animation.channels), default=-1)
-        count = len(animation.samplers)
-        if most >= count:
+        max_index = max((channel.curve for channel in animation.channels), default=-1)
+        n_samplers = len(animation.samplers)
+        if max_index >= n_samplers:
             raise damaged(
                 path,
-                f"glTF with {most + 1} samplers of an animation, as it refers to",
-                f"{count}",
+                f"glTF with {max_index + 1} samplers of an animation, as it refers to",
+                f"{n_samplers}",
             )
-    sizes = (
+    accessor_sizes = (
         entry.count * entry.width * np.dtype(_TYPES[entry.componentType]).itemsize
         for entry in header.accessors
     )
-    size = max(sum(view.byteLength for view in header.bufferViews), sum(sizes))
-    check_most(path, size, LARGEST_VALUES, "geometry and pictures of at most {} bytes")
+    view_size = sum(view.byteLength for view in header.bufferViews)
+    check_most(
+        path,
+        max(view_size, sum(accessor_sizes)),
+        LARGEST_VALUES,
+        "geometry and pictures of at most {} bytes",
+    )
     for mesh in header.meshes:
         for primitive in mesh.primitives:
             _check_primitive(path, header, primitive)
@@ -215,60 +240,55 @@ def check_header(path: Path, header: Header) -> None:
 
 
 def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
+    """Return the error for a file that needs extensions that are not supported."""
     names = list(names)
     if any(map(is_of_splats, names)):
         return FileFormatError(f"{path}: needs Gaussian splats, a model that {SPLATS}")
-    named = shown(", ".join(names), quoted=False)
+    text = shown(", ".join(names), quoted=False)
     return FileFormatError(
-        f"{path}: needs {named}, which is not supported; export it without that option"
+        f"{path}: needs {text}, which is not supported; export it without that option"
     )
 
 
 def unread_extensions(entry: Entry) -> list[str]:
     """Return the names of an entry's extensions that are not understood."""
-    held = entry.extensions
-    return (
-        sorted(name for name in held if name not in READ)
-        if isinstance(held, dict)
-        else []
-    )
+    if not isinstance(entry.extensions, dict):
+        return []
+    return sorted(name for name in entry.extensions if name not in READ)
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
-    held = {
+    """Check the accessors of a primitive; raise FileFormatError if one is wrong."""
+    accessors = {
         name: header.accessors[index] for name, index in primitive.attributes.items()
     }
-    coordinates = (
-        "TEXCOORD_0"
-        if primitive.material is None
-        else header.materials[primitive.material].attribute
-    )
-    kinds_of = {
+    uv_name = "TEXCOORD_0"
+    if primitive.material is not None:
+        uv_name = header.materials[primitive.material].attribute
+    valid_types = {
         "POSITION": ("VEC3",),
         "NORMAL": ("VEC3",),
         "COLOR_0": ("VEC3", "VEC4"),
-        coordinates: ("VEC2",),
+        uv_name: ("VEC2",),
     }
-    for name, kinds in kinds_of.items():
-        if name in held and held[name].type not in kinds:
-            raise damaged(path, f"{name} of type {' or '.join(kinds)}", held[name].type)
-        if (
-            name in held
-            and "POSITION" in held
-            and held[name].count != held["POSITION"].count
-        ):
-            expected = (
-                f"as many values of {name} as of POSITION, {held['POSITION'].count:,}"
-            )
-            raise damaged(path, expected, f"{held[name].count:,}")
+    positions = accessors.get("POSITION")
+    for name, types in valid_types.items():
+        if name not in accessors:
+            continue
+        accessor = accessors[name]
+        if accessor.type not in types:
+            raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
+        if positions is not None and accessor.count != positions.count:
+            expected = f"as many values of {name} as of POSITION, {positions.count:,}"
+            raise damaged(path, expected, f"{accessor.count:,}")
     indices = None if primitive.indices is None else header.accessors[primitive.indices]
-    for values in (*held.values(), indices):
-        bare = (
+    unread = unread_extensions(primitive)
+    is_packed = unread and not any(map(is_of_splats, unread))
+    for values in (*accessors.values(), indices):
+        has_no_data = (
             values is not None and values.bufferView is None and values.sparse is None
         )
-        unread = unread_extensions(primitive)
-        is_packed = bare and unread and not any(map(is_of_splats, unread))
-        if is_packed:  # an extension has the numbers, as Draco's
+        if has_no_data and is_packed:  # an extension has the numbers, such as Draco's
             raise _needs(path, unread)
     if indices is not None and indices.type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", indices.type)
@@ -277,62 +297,80 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 
 
 def _check_tree(path: Path, header: Header) -> None:
-    def triangles_of(primitive: Primitive) -> int:  # at most
-        index = (
-            primitive.attributes.get("POSITION")
-            if primitive.indices is None
-            else primitive.indices
-        )
-        count = (
-            0 if index is None or primitive.mode < 4 else header.accessors[index].count
-        )
-        return count // 3 if primitive.mode == 4 else max(0, count - 2)
-
-    triangles = [sum(map(triangles_of, mesh.primitives)) for mesh in header.meshes]
-    pieces = [len(mesh.primitives) for mesh in header.meshes]
-    drawn = [node.mesh for node in header.nodes if node.mesh is not None]
-    parents: set[int] = set()
-    for child in [child for node in header.nodes for child in node.children]:
-        if child in parents:
-            raise damaged(path, "nodes with one parent each", f"two for node {child}")
-        parents.add(child)
-    check_faces(path, max(sum(triangles[mesh] for mesh in drawn), sum(triangles)))
-    most = max(sum(pieces[mesh] for mesh in drawn), sum(pieces), len(header.nodes))
-    check_most(path, most, LARGEST_TREE, "glTF of at most {} nodes and pieces")
-    level = [index for index in range(len(header.nodes)) if index not in parents]
-    reached = 0
+    """Check the number of triangles and primitives, and that nodes form trees."""
+    triangles = [
+        sum(_max_triangles(header, primitive) for primitive in mesh.primitives)
+        for mesh in header.meshes
+    ]
+    primitives = [len(mesh.primitives) for mesh in header.meshes]
+    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
+    children: set[int] = set()
+    for node in header.nodes:
+        for child in node.children:
+            if child in children:
+                raise damaged(
+                    path, "nodes with one parent each", f"two for node {child}"
+                )
+            children.add(child)
+    n_instanced_triangles = sum(triangles[mesh] for mesh in instanced_meshes)
+    check_faces(path, max(n_instanced_triangles, sum(triangles)))
+    n_instanced = sum(primitives[mesh] for mesh in instanced_meshes)
+    check_most(
+        path,
+        max(n_instanced, sum(primitives), len(header.nodes)),
+        LARGEST_TREE,
+        "glTF of at most {} nodes and pieces",
+    )
+    level = [index for index in range(len(header.nodes)) if index not in children]
+    n_reached = 0
     depth = 0
     while level:
         check_most(path, depth + 1, DEEPEST_TREE, "nodes of at most {} levels", "more")
         depth = depth + 1
-        reached = reached + len(level)
+        n_reached = n_reached + len(level)
         level = [child for index in level for child in header.nodes[index].children]
-    if reached < len(header.nodes):
+    if n_reached < len(header.nodes):
         raise damaged(path, "nodes that form trees", "a cycle")
+
+
+def _max_triangles(header: Header, primitive: Primitive) -> int:
+    """Return an upper bound of the number of triangles of a primitive."""
+    index = primitive.indices
+    if index is None:
+        index = primitive.attributes.get("POSITION")
+    if index is None or primitive.mode < 4:  # points or lines
+        return 0
+    count = header.accessors[index].count
+    return count // 3 if primitive.mode == 4 else max(0, count - 2)
 
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
 
 class GltfFile:
-    """A file: its header, and what that refers to, also in files that `references`
-    finds. Raises FileFormatError: as `read_header`.
+    """The header of a glTF file, and the data that it refers to.
+
+    Data may be in other files, which `references` finds.
+
+    Raises:
+        FileFormatError: as `read_header`.
     """
 
     def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.header, self.references = (
-            path,
-            read_header(path, data),
-            References(path),
-        )
-        self._chunk = _chunks(path, data)[1]
-        self._read: dict[int, bytes] = {}
-        self._put_in: dict[int, npt.NDArray[Any]] = {}
+        self.path = path
+        self.header = read_header(path, data)
+        self.references = References(path)
+        _, self._chunk = _chunks(path, data)
+        self._buffers: dict[int, bytes] = {}
+        self._with_sparse: dict[int, npt.NDArray[Any]] = {}
 
     def uri(self, uri: str) -> bytes:
-        """Return what a URI holds, or the file in the folder that it names. Raises
-        FileNotFoundError: there is no such file, or it must not be read; the references
-        say which. Raises ValueError: base64 that is none.
+        """Return the content of a data URI, or of the file in the folder that it names.
+
+        Raises:
+            FileNotFoundError: there is no such file, or it must not be read; the
+                references state which.
+            ValueError: the data is not valid base64.
         """
         if not uri.startswith("data:"):
             return self.references.get(uri)
@@ -341,41 +379,13 @@ class GltfFile:
         return base64.b64decode(data) if kind.endswith(";base64") else data
 
     def view(self, index: int) -> memoryview:
-        """Return the bytes of a view. Raises FileFormatError: they are not there."""
+        """Return the bytes of a buffer view.
+
+        Raises:
+            FileFormatError: they are not there.
+        """
         view = self.header.bufferViews[index]
-        number = view.buffer
-        uri = self.header.buffers[view.buffer].uri
-        if number not in self._read:
-            try:
-                if uri is None and (number > 0 or self._chunk is None):
-                    views = [
-                        view
-                        for view in self.header.bufferViews
-                        if view.buffer == number
-                    ]
-                    # as meshopt's
-                    if unread := {
-                        name for view in views for name in unread_extensions(view)
-                    }:
-                        raise _needs(self.path, sorted(unread))
-                    raise damaged(self.path, f"a buffer {number} with content", "none")
-                self._read[number] = (
-                    self.uri(uri) if uri is not None else self._chunk or b""
-                )
-            except FileNotFoundError:
-                name = plain_name(uri or "")
-                reason = self.references.refused.get(name, "is missing")
-                message = (
-                    f"{self.path}: needs {shown(name)}, which {reason}; put "
-                    "that "
-                    "file beside it"
-                )
-                raise FileFormatError(message) from None
-            except ValueError:
-                raise damaged(
-                    self.path, f"a buffer {number} in base64", "other text"
-                ) from None
-        data = self._read[number]
+        data = self._buffer(view.buffer)
         end = view.byteOffset + view.byteLength
         if end > len(data):
             raise damaged(
@@ -385,12 +395,57 @@ class GltfFile:
             )
         return memoryview(data)[view.byteOffset : end]
 
+    def _buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer, which are loaded on first use."""
+        if index in self._buffers:
+            return self._buffers[index]
+        uri = self.header.buffers[index].uri
+        try:
+            if uri is not None:
+                data = self.uri(uri)
+            elif index == 0 and self._chunk is not None:
+                data = self._chunk
+            else:
+                raise self._without_content(index)
+        except FileNotFoundError:
+            name = plain_name(uri or "")
+            reason = self.references.refused.get(name, "is missing")
+            message = (
+                f"{self.path}: needs {shown(name)}, which {reason}; put "
+                "that "
+                "file beside it"
+            )
+            raise FileFormatError(message) from None
+        except ValueError:
+            raise damaged(
+                self.path, f"a buffer {index} in base64", "other text"
+            ) from None
+        self._buffers[index] = data
+        return data
+
+    def _without_content(self, index: int) -> FileFormatError:
+        """Return the error for a buffer without data."""
+        # An extension of its views may have the data, such as meshopt's.
+        unread = {
+            name
+            for view in self.header.bufferViews
+            if view.buffer == index
+            for name in unread_extensions(view)
+        }
+        if unread:
+            return _needs(self.path, sorted(unread))
+        return damaged(self.path, f"a buffer {index} with content", "none")
+
     def values(self, index: int) -> npt.NDArray[Any]:
-        """Return the values (count, width) of an accessor as they are stored, those
-        that are sparse put in. Raises FileFormatError: they reach beyond their view.
+        """Return the values (count, width) of an accessor as they are stored.
+
+        Sparse values are filled in.
+
+        Raises:
+            FileFormatError: they reach beyond their view.
         """
-        if index in self._put_in:
-            return self._put_in[index]
+        if index in self._with_sparse:
+            return self._with_sparse[index]
         accessor = self.header.accessors[index]
         values = np.zeros(
             (accessor.count, accessor.width), _TYPES[accessor.componentType]
@@ -406,15 +461,19 @@ class GltfFile:
             )
         if accessor.sparse is None or not accessor.sparse.count:
             return values
-        places = accessor.sparse.indices
-        fresh = accessor.sparse.values
+        sparse_indices = accessor.sparse.indices
+        sparse_values = accessor.sparse.values
         count = accessor.sparse.count
         if count > accessor.count:
             raise damaged(
                 self.path, f"at most {accessor.count:,} sparse values", f"{count:,}"
             )
-        kind = np.dtype(_TYPES[places.componentType])
-        rows = self._array(places.bufferView, places.byteOffset, (count, 1), kind)[:, 0]
+        rows = self._array(
+            sparse_indices.bufferView,
+            sparse_indices.byteOffset,
+            (count, 1),
+            np.dtype(_TYPES[sparse_indices.componentType]),
+        )[:, 0]
         if rows.max() >= accessor.count:
             raise damaged(
                 self.path,
@@ -423,9 +482,12 @@ class GltfFile:
             )
         values = np.array(values)
         values[rows] = self._array(
-            fresh.bufferView, fresh.byteOffset, (count, accessor.width), values.dtype
+            sparse_values.bufferView,
+            sparse_values.byteOffset,
+            (count, accessor.width),
+            values.dtype,
         )
-        self._put_in[index] = values
+        self._with_sparse[index] = values
         return values
 
     def _array(
@@ -436,9 +498,15 @@ class GltfFile:
         kind: np.dtype[Any],
         stride: int | None = None,
     ) -> npt.NDArray[Any]:
+        """Return an array in a buffer view, without copying it.
+
+        Raises:
+            FileFormatError: the view is too short.
+        """
         data = self.view(view)
-        step = stride or shape[1] * kind.itemsize
-        end = offset + (shape[0] - 1) * step + shape[1] * kind.itemsize
+        row_size = shape[1] * kind.itemsize
+        step = stride or row_size
+        end = offset + (shape[0] - 1) * step + row_size
         if end > len(data):
             raise damaged(
                 self.path, f"a view of at least {end:,} bytes", f"{len(data):,}"
@@ -449,8 +517,10 @@ class GltfFile:
         return values
 
     def numbers(self, index: int, rows: Ints) -> Doubles:
-        """Return rows (N,) of an accessor as (N, width), normalised integers as the
-        numbers that they stand for.
+        """Return rows (N,) of an accessor as float64 (N, width).
+
+        Normalised integers are converted to the numbers in [-1, 1] for which they
+        stand.
         """
         values = self.values(index)[rows]
         numbers: Doubles = values.astype(np.float64)

@@ -1,5 +1,6 @@
-"""The entries of a glTF header, as far as they are read; field names are the format's
-(glTF 2.0, section 5).
+"""The entries of a glTF header that are read; field names are the format's.
+
+See glTF 2.0, section 5.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from pydantic import (
     JsonValue,
 )
 
-# what the glTF is made by; what it leaves out is in the extras of its asset
+# Generator of glTF that was converted from USD; its notes are in the asset's extras.
 GENERATOR = "advsearch, of OpenUSD"
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
-"""A list of which only the first wrong entry is reported; a million reports take
+"""A list of which only the first wrong entry is reported, since a million reports take
 gigabytes.
 """
 Unread = Annotated[JsonValue, Field(exclude=True)]
-"""What is never read, and named in a warning of its own, or makes no difference."""
+"""A value that is never read: it has a warning of its own, or changes nothing."""
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
 _ELEMENTS = {
@@ -62,13 +63,11 @@ REFERENCES = {
         "skin": "skins",
     },
 }
-"""What of the header the numbers in a field refer to."""
+"""The list of the header to which the indices in a field refer."""
 
 
 class Entry(BaseModel):
-    """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`,
-    to be named as left out.
-    """
+    """A JSON object of glTF; keys without a field are in `model_extra`."""
 
     model_config = ConfigDict(
         strict=True, extra="allow", allow_inf_nan=False, frozen=True
@@ -76,42 +75,42 @@ class Entry(BaseModel):
     extensions: Unread = None  # as they are in the file
 
     def entries(self) -> Iterator[Entry]:
-        """Yield this entry, and all that it consists of."""
-        level: list[object] = [self]
-        for held in level:  # which grows
-            if isinstance(held, Entry):
-                yield held
-                level.extend(vars(held).values())
-            elif isinstance(held, (list, dict)):
-                inside = held.values() if isinstance(held, dict) else held
-                level.extend(inner for inner in inside if isinstance(inner, Entry))
+        """Yield this entry, and all entries within it."""
+        queue: list[object] = [self]
+        for item in queue:  # it grows
+            if isinstance(item, Entry):
+                yield item
+                queue.extend(vars(item).values())
+            elif isinstance(item, (list, dict)):
+                children = item.values() if isinstance(item, dict) else item
+                queue.extend(child for child in children if isinstance(child, Entry))
 
     @classmethod
     def read_of_extensions(cls) -> dict[str, set[str]]:
-        """Return the keys that are read of extensions, by their names; none where an
-        extension is an entry itself.
+        """Return the keys that are read of each extension.
+
+        They are empty if an extension is an entry itself.
         """
-        read: dict[str, set[str]] = {}
+        keys_of_extension: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
             if isinstance(info.validation_alias, AliasPath):
                 path = [str(key) for key in info.validation_alias.path]
-                read.setdefault(path[1], set()).update(path[2:3])
-        return read
+                keys_of_extension.setdefault(path[1], set()).update(path[2:3])
+        return keys_of_extension
 
     def references(self) -> Iterator[tuple[str, int]]:
+        """Yield a list of the header, and an index in it, for each reference."""
         for name, value in vars(self).items():
-            level: list[Any] = [value] if name in REFERENCES else []
-            for held in level:
-                if isinstance(held, int):
-                    yield REFERENCES[name], held
-                elif isinstance(held, (list, dict)):
-                    level.extend(held.values() if isinstance(held, dict) else held)
+            queue: list[Any] = [value] if name in REFERENCES else []
+            for item in queue:  # it grows
+                if isinstance(item, int):
+                    yield REFERENCES[name], item
+                elif isinstance(item, (list, dict)):
+                    queue.extend(item.values() if isinstance(item, dict) else item)
 
 
 def _extension(*path: str, default: Any = None) -> Any:
-    """A field that an extension of the entry holds; those that are not understood are
-    named by `gltf_left_out`.
-    """
+    """Return a field whose value is in an extension of the entry."""
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
 
@@ -143,7 +142,7 @@ class SparseIndices(SparseValues):
 
 
 class Sparse(Entry):
-    """Values in place of some of an accessor's own."""
+    """Values that replace some of an accessor's values."""
 
     count: Size
     indices: SparseIndices
@@ -161,7 +160,7 @@ class Accessor(Entry):
 
     @property
     def width(self) -> int:
-        """Numbers of one of its values."""
+        """How many numbers one of its values has."""
         return _ELEMENTS[self.type]
 
 
@@ -170,16 +169,15 @@ class Primitive(Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    # morph targets: how far each attribute goes where their weight is 1
+    # Morph targets: what is added to each attribute at weight 1.
     targets: List[dict[str, Index]] = []
 
 
 class MeshEntry(Entry):
     primitives: List[Primitive]
     name: str | None = None
-    weights: List[float] = []  # of its morph targets, where a node says none of its own
-    # `targetNames` in it are what they are called: not of the format, but exporters
-    # write them
+    weights: List[float] = []  # of its morph targets, unless a node has weights
+    # Exporters write the names of morph targets to `targetNames`.
     extras: Unread = None
 
 
@@ -188,7 +186,7 @@ class Node(Entry):
     mesh: Index | None = None
     camera: Index | None = None
     skin: Index | None = None
-    # number of the light that the node carries
+    # Index of the light of the node.
     lamp: Index | None = _extension("KHR_lights_punctual", "light")
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
@@ -199,16 +197,14 @@ class Node(Entry):
 
 
 class Skin(Entry):
-    """The nodes that move a mesh, and the accessor of the matrices from the mesh to
-    each of them.
-    """
+    """The nodes that move a mesh, and the accessor of its inverse bind matrices."""
 
     joints: Annotated[list[Index], FailFast(), Field(min_length=1)]
     inverseBindMatrices: Index | None = None
 
 
 class ChannelTarget(Entry):
-    """What a channel moves; without a node nothing (an extension may know what)."""
+    """What a channel moves; without a node, something of an extension."""
 
     path: str
     node: Index | None = None
@@ -220,7 +216,7 @@ class Channel(Entry):
 
 
 class AnimationSampler(Entry):
-    """Accessors of times in seconds and of what holds at them."""
+    """Accessors of times in seconds and of the values at these times."""
 
     input: Index
     output: Index
@@ -234,7 +230,7 @@ class Animation(Entry):
 
 
 class HumanBone(Entry):
-    """The node that is a bone of a person, in VRM; its name is here in VRM 0 alone."""
+    """The node of a bone of a person in VRM; only VRM 0 has the name here."""
 
     node: Index
     bone: str = ""
@@ -256,8 +252,8 @@ class CameraEntry(Entry):
 
 
 class Cone(Entry):
-    """Of a spot light: angles from its axis in radians, up to which it shines fully and
-    beyond which not at all.
+    """Angles in radians from the axis of a spot light: full inside the inner one, dark
+    outside the outer one.
     """
 
     innerConeAngle: Annotated[float, Field(ge=0.0)] = 0.0
@@ -265,9 +261,7 @@ class Cone(Entry):
 
 
 class LightEntry(Entry):
-    """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in
-    lux.
-    """
+    """A light of KHR_lights_punctual; intensity in candela, or lux if directional."""
 
     type: Literal["point", "spot", "directional"]
     color: Annotated[
@@ -284,9 +278,7 @@ Map = Annotated[int, Field(ge=0, lt=256)]
 
 
 class TextureTransform(Entry):
-    """KHR_texture_transform: scaled, then turned counter-clockwise in radians, then
-    moved.
-    """
+    """KHR_texture_transform: scale, then rotate counter-clockwise, then translate."""
 
     offset: Pair = [0.0, 0.0]
     rotation: float = 0.0
@@ -298,23 +290,23 @@ class TextureUse(Entry):
     index: Index
     texCoord: Map = 0
     transform: Annotated[
-        TextureTransform, BeforeValidator(lambda given: given or {})
+        TextureTransform, BeforeValidator(lambda value: value or {})
     ] = _extension("KHR_texture_transform", default=TextureTransform())
-    """What is done to the texture coordinates before it is looked up."""
+    """Transform of the texture coordinates."""
 
     @property
     def attribute(self) -> str:
-        """Name of the texture coordinates by which it is looked up."""
+        """Name of the attribute with its texture coordinates."""
         other = self.transform.texCoord
         return f"TEXCOORD_{self.texCoord if other is None else other}"
 
     def looked_up_as(self, other: TextureUse) -> bool:
-        """Whether another texture is looked up at the same places."""
-        moves = [
-            (by.offset, by.rotation, by.scale)
-            for by in (self.transform, other.transform)
+        """Return whether another texture has the same coordinates and transform."""
+        transforms = [
+            (transform.offset, transform.rotation, transform.scale)
+            for transform in (self.transform, other.transform)
         ]
-        return self.attribute == other.attribute and moves[0] == moves[1]
+        return self.attribute == other.attribute and transforms[0] == transforms[1]
 
 
 class NormalUse(TextureUse):
@@ -338,8 +330,8 @@ class SpecularGlossiness(Entry):
     glossinessFactor: float = 1.0
 
 
-CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base colour counts
-# the alpha under which there is nothing, where the file does not say which
+CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base color counts
+# Default alpha below which a masked surface is cut out.
 CUTOFF = 0.5
 
 
@@ -364,49 +356,47 @@ class MaterialEntry(Entry):
 
     @property
     def surface(self) -> MetallicRoughness:
-        """Its base colour, roughness and metallic: the format's where it says none, and
-        those of an old extension, whose diffuse colour is the base colour.
+        """Base color, roughness and metallic.
+
+        Those of KHR_materials_pbrSpecularGlossiness have its diffuse color.
         """
-        old = self.glossiness
-        if old is None:
+        glossy = self.glossiness
+        if glossy is None:
             return self.pbrMetallicRoughness or MetallicRoughness()
-        color = old.diffuseFactor
-        texture = old.diffuseTexture
-        rough = 1.0 - old.glossinessFactor
         return MetallicRoughness(
-            baseColorFactor=color,
-            baseColorTexture=texture,
+            baseColorFactor=glossy.diffuseFactor,
+            baseColorTexture=glossy.diffuseTexture,
             metallicFactor=0.0,
-            roughnessFactor=rough,
+            roughnessFactor=1.0 - glossy.glossinessFactor,
         )
 
     @property
     def layout(self) -> TextureUse | None:
-        """The use of a texture whose coordinates the mesh gets: of the base colour, if
-        it has one.
-        """
+        """The texture whose coordinates the mesh gets: that of the base color, if any."""
         return (
             self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
         )
 
     @property
     def attribute(self) -> str:
-        """Name of the texture coordinates that are read."""
+        """Name of the attribute with the texture coordinates that are read."""
         return "TEXCOORD_0" if self.layout is None else self.layout.attribute
 
     def reads(self, use: TextureUse | None) -> bool:
-        """Whether a texture is looked up at the same places as the others, if there is
-        one; else it is left out.
+        """Return whether a texture has the coordinates of `layout`, or is None.
+
+        Others are left out.
         """
         return use is None or self.layout is None or use.looked_up_as(self.layout)
 
     @property
     def emission(self) -> list[float]:
-        """(3,) linear radiance, where there is a texture that times its colour."""
+        """Linear radiance (3,), which a texture multiplies."""
         return [channel * self.strength for channel in self.emissiveFactor]
 
 
-REPEAT = 10497  # how a texture goes on beyond its edges
+# Wrap modes.
+REPEAT = 10497
 MIRRORED = 33648
 CLAMPED = 33071
 BORDER = 33069  # nothing beyond the edges: OpenGL's and USD's, not glTF's
@@ -427,9 +417,7 @@ class Texture(Entry):
 
     @property
     def image(self) -> int | None:
-        """Number of its picture; None where only an extension that is not understood
-        has one.
-        """
+        """Index of its image; None if only an unknown extension has one."""
         return self.source if self.webp is None else self.webp
 
 
@@ -440,9 +428,7 @@ class Image(Entry):
 
 
 class Header(Entry):
-    """What is read of the JSON of a glTF file; field names are the format's (glTF 2.0,
-    section 5).
-    """
+    """The JSON of a glTF file."""
 
     asset: Asset
     scene: Index | None = None
@@ -470,26 +456,26 @@ class Header(Entry):
     extensionsRequired: List[str] = []
 
     def below(self, nodes: Iterable[int]) -> set[int]:
-        """Return nodes, and all that hang on them."""
+        """Return nodes and all their descendants."""
         reached = set[int]()
         level = set(nodes)
         while level:
             reached |= level
-            level = {
-                child for node in level for child in self.nodes[node].children
-            } - reached
+            children = {child for node in level for child in self.nodes[node].children}
+            level = children - reached
         return reached
 
     @property
     def parents(self) -> list[int]:
-        parents = [-1] * len(self.nodes)  # of roots
-        for number, node in enumerate(self.nodes):
+        """The parent of each node, -1 for a root."""
+        parents = [-1] * len(self.nodes)
+        for index, node in enumerate(self.nodes):
             for child in node.children:
-                parents[child] = number
+                parents[child] = index
         return parents
 
     def label(self, index: int) -> str:
-        """Return what a node is called: by its name, its mesh's, or its number."""
+        """Return the name of a node, or of its mesh, or its index in words."""
         node = self.nodes[index]
-        mesh = None if node.mesh is None else self.meshes[node.mesh].name
-        return node.name or mesh or f"node {index}"
+        mesh_name = None if node.mesh is None else self.meshes[node.mesh].name
+        return node.name or mesh_name or f"node {index}"

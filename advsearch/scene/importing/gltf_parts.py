@@ -1,7 +1,7 @@
-"""glTF files as a list of parts: the primitives that its nodes draw, in their places.
+"""Reader of glTF files: the primitives that nodes draw, as parts in their poses.
 
-What materials look like is said in glTF 2.0, section 3.9; how their textures go on in
-section 3.8.4.
+Materials are those of glTF 2.0, section 3.9; wrap modes of textures are in section
+3.8.4.
 """
 
 from __future__ import annotations
@@ -47,13 +47,11 @@ from advsearch.scene.importing.parts import (
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
 from advsearch.scene.importing.unread import TrackedKeys
-from advsearch.scene.skeleton import Movable, Target
+from advsearch.scene.skeleton import Movable, Skeleton, Target
 
-# ---------------------------------------------------------------------------------------------------------------------
-# What a glTF file has and a scene of ours has not, in sentences: nothing is dropped in
-# silence.
+# ---- Notes on what a glTF file has and our scenes do not have ----
 #
-# Each of them begins with the name of the file, which the caller puts before it.
+# Nothing is dropped silently. The caller prepends the name of the file.
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 EXTENSIONS = {
@@ -67,56 +65,56 @@ EXTENSIONS = {
     "KHR_materials_variants": " has variants of its materials ({name}); those that it "
     "shows by itself are taken",
 }
-"""What becomes of a file with an extension; of all that are not named here, nor
-understood, `UNKNOWN`.
-"""
+"""Sentence about each extension; `UNKNOWN` is that of all others not understood."""
 UNKNOWN = " uses {name}, which is not understood and left out"
 LONGEST_SENTENCE = 500  # characters of what the reader of OpenUSD says
 FAR = 1000.0  # distance of a directional light, in object sizes
 
 
 def left_out(header: Header, notes: Notes) -> None:
-    """Say what the file has that is not carried over, whether one node or all of it is
-    the object.
+    """Note what a file has that is not imported.
+
+    It is the same whether one node of the file or all of it is the object.
     """
-    if header.asset.generator == GENERATOR and isinstance(header.asset.extras, dict):
+    is_converted = header.asset.generator == GENERATOR
+    if is_converted and isinstance(header.asset.extras, dict):
         sentences = header.asset.extras.get("left_out")
-        for what in sentences if isinstance(sentences, list) else ():
-            notes.say(" " + shown(str(what), quoted=False, longest=LONGEST_SENTENCE))
-    if any(map(is_of_splats, {*header.extensionsUsed, *header.extensionsRequired})):
-        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
+        for sentence in sentences if isinstance(sentences, list) else ():
+            notes.say(
+                " " + shown(str(sentence), quoted=False, longest=LONGEST_SENTENCE)
+            )
     used = {*header.extensionsUsed, *header.extensionsRequired}
+    if any(map(is_of_splats, used)):
+        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
         if not is_of_splats(name):
-            notes.say(
-                EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False))
-            )
-    drawn = header.below(
-        header.scenes[header.scene or 0].nodes
-        if header.scenes
-        else range(len(header.nodes))
-    )
-    looks = header.materials
+            sentence = EXTENSIONS.get(name, UNKNOWN)
+            notes.say(sentence.format(name=shown(name, quoted=False)))
+    roots: Iterable[int] = range(len(header.nodes))
+    if header.scenes:
+        roots = header.scenes[header.scene or 0].nodes
+    in_scene = header.below(roots)
+    materials = header.materials
     kinds = {
         "occlusion map{s}: left out": (
-            look.occlusionTexture is not None for look in looks
+            material.occlusionTexture is not None for material in materials
         ),
         "normal map{s} with other texture coordinates than the base colour: left out": (
-            not look.reads(look.normalTexture) for look in looks
+            not material.reads(material.normalTexture) for material in materials
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
         "with the emission": (
-            any(look.emission) and not look.reads(look.emissiveTexture)
-            for look in looks
+            any(material.emission) and not material.reads(material.emissiveTexture)
+            for material in materials
         ),
         "material{s} with an alphaMode that glTF does not have: opaque": (
-            look.alphaMode not in ("OPAQUE", *CUT_OUTS) for look in looks
+            material.alphaMode not in ("OPAQUE", *CUT_OUTS) for material in materials
         ),
         "further scene{s}: left out": (True for _ in header.scenes[1:]),
         "node{s} with a mesh outside of its scene: left out": (
             node.mesh is not None
             for index, node in enumerate(header.nodes)
-            if index not in drawn
+            if index not in in_scene
         ),
     }
     for sentence in _counts(kinds):
@@ -139,14 +137,15 @@ WORDS = {
     },
     **{"TextureTransform": "entry of KHR_texture_transform"},
 }
-"""What is left out of entries whose contents are seen."""
+"""Kind, for notes, of the keys left out of each type of entry."""
 PLAIN = frozenset(("name", "weights", "extensions"))
-"""Keys without a field that make no difference, or are named with what they belong
-to.
+"""Keys without a field that need no note: they change nothing, or another note covers
+them.
 """
 
 
 def _note_unread(header: Header, notes: Notes) -> None:
+    """Note the keys of entries, and the attributes of primitives, that are not read."""
     for entry in header.entries():
         kind = WORDS.get(type(entry).__name__)
         if kind is None:
@@ -156,63 +155,60 @@ def _note_unread(header: Header, notes: Notes) -> None:
         )
         extensions = keys.nested("extensions")
         for name, read_keys in entry.read_of_extensions().items():
-            extensions.nested(name).mark_read(
-                *(read_keys or (key for key, _ in extensions.nested(name).items()))
-            )
-        # others are named with the file's
+            extension = extensions.nested(name)
+            all_keys = [key for key, _ in extension.items()]
+            extension.mark_read(*(read_keys or all_keys))
+        # Extensions that are not understood are noted once for the file.
         extensions.mark_read(*(name for name, _ in extensions.items()))
         for key in keys.unread():
             notes.has(kind, key)
     for kind in set(WORDS.values()):
-        # notes of applications
-        for key in (
-            PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}
-        ):
+        is_of_material = "material" in kind or "texture" in kind
+        # Elsewhere, extras are notes of applications.
+        for key in PLAIN if is_of_material else {*PLAIN, "extras"}:
             notes.take(kind, key)
     for mesh in header.meshes:
         for primitive in mesh.primitives:
-            material = (
-                None
-                if primitive.material is None
-                else header.materials[primitive.material]
-            )
-            read = {
-                "POSITION",
-                "NORMAL",
-                "COLOR_0",
-                "TEXCOORD_0",
-                material.attribute if material else "",
-            }
-            packed = material.surface.metallicRoughnessTexture if material else None
-            read.add(packed.attribute if packed else "")
-            for name in primitive.attributes:
-                is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
-                if name not in read and not is_of_skin and not is_of_splats(name):
-                    notes.has("attribute", name)
+            _note_unread_attributes(header, primitive, notes)
+
+
+def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
+    """Note the vertex attributes of a primitive that are not read."""
+    read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
+    if primitive.material is not None:
+        material = header.materials[primitive.material]
+        read.add(material.attribute)
+        packed = material.surface.metallicRoughnessTexture
+        if packed is not None:
+            read.add(packed.attribute)
+    for name in primitive.attributes:
+        is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
+        if name not in read and not is_of_skin and not is_of_splats(name):
+            notes.has("attribute", name)
 
 
 def beside(header: Header, file: str) -> list[str]:
-    """Return what a file of that name, read as one object, leaves out of its scene: one
-    sentence, or none.
+    """Describe the lights and cameras that a file read as one object leaves out.
+
+    Returns:
+        One sentence, or none if there are no lights and cameras.
     """
-    lights, cameras = (
-        [getattr(node, kind) is not None for node in header.nodes]
-        for kind in ("lamp", "camera")
-    )
-    what = " and ".join(_counts({"light{s}": lights, "camera{s}": cameras}))
-    left = f"{'is' if sum(lights + cameras) == 1 else 'are'} left out of the object"
-    what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return [f"{file}: {what} {left}; {what_to_do}"] if what else []
+    has_light = [node.lamp is not None for node in header.nodes]
+    has_camera = [node.camera is not None for node in header.nodes]
+    counts = _counts({"light{s}": has_light, "camera{s}": has_camera})
+    if not counts:
+        return []
+    verb = "is" if sum(has_light) + sum(has_camera) == 1 else "are"
+    advice = "name one node as the object, FILE#NODE, to keep the rest around it"
+    return [f"{file}: {' and '.join(counts)} {verb} left out of the object; {advice}"]
 
 
 def lights_and_cameras(header: Header, file: str) -> list[str]:
-    """Return what becomes of lights and cameras that are not what they are in a file of
-    that name.
-    """
-    distant = f"directional light{{s}}, here as lamps {FAR:g} object sizes away"
+    """Describe the lights and cameras of a file that are imported as something else."""
+    directional = f"directional light{{s}}, here as lamps {FAR:g} object sizes away"
     ranged = "light{s} with a range, which is left out: light reaches beyond it"
     kinds = {
-        distant: (light.type == "directional" for light in header.lights),
+        directional: (light.type == "directional" for light in header.lights),
         ranged: (light.range is not None for light in header.lights),
         "camera{s} without perspective: left out": (
             camera.perspective is None for camera in header.cameras
@@ -222,22 +218,25 @@ def lights_and_cameras(header: Header, file: str) -> list[str]:
 
 
 def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
-    """Return how many there are of each kind, but for those of which there are none;
-    {s} and {es} are for several.
+    """Return one phrase with a count for each kind of thing that is there at all.
+
+    Args:
+        kinds: for each phrase whether each thing is of that kind; {s} and {es} in it
+            become plural endings.
     """
-    counts = {what: sum(those) for what, those in kinds.items()}
-    ends = {True: {"s": "", "es": ""}, False: {"s": "s", "es": "es"}}
-    return [
-        f"{count} {what.format(**ends[count == 1])}"
-        for what, count in counts.items()
-        if count
-    ]
+    phrases = []
+    for phrase, is_of_kind in kinds.items():
+        count = sum(is_of_kind)
+        if count == 1:
+            phrases.append(f"{count} {phrase.format(s='', es='')}")
+        elif count:
+            phrases.append(f"{count} {phrase.format(s='s', es='es')}")
+    return phrases
 
 
-# how far texture coordinates may lie outside of a texture before it matters how that
-# goes on
+# How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
 BEYOND = 1e-4
-SMALL = 256  # texels a side up to which half a texel at an edge is seen
+SMALL = 256  # texels of a side up to which half a texel at an edge is visible
 EDGES = (
     " has textures that do not repeat beyond their edges; where they differ, or "
     "reach far, they do here"
@@ -251,11 +250,11 @@ BLURRED = (
 
 @dataclass
 class GltfSurfaces:
-    """Turns the materials of one file into surfaces; `notes` are about it."""
+    """Converts the materials of one glTF file to surfaces."""
 
     file: GltfFile
-    notes: Notes
-    # longest side of a texture; None for what `FilePictures` takes for an object
+    notes: Notes  # about the file
+    # Longest side of a texture; None: as `FilePictures` limits those of an object.
     texture_limit: int | None = None
 
     def __post_init__(self) -> None:
@@ -267,88 +266,111 @@ class GltfSurfaces:
     def surface(
         self, number: int | None, pieces: Sequence[Piece]
     ) -> tuple[ImportedSurface, Doubles, Doubles]:
-        """Return the surface of a material (None: the format's default), and by what
-        texture coordinates are scaled, (2,), and shifted then, (2,), to fit its
-        pictures; `pieces` are all that have it, with the format's.
+        """Convert one material.
+
+        Args:
+            number: index of the material; None is the format's default.
+            pieces: all primitives with the material, with texture coordinates as the
+                format has them.
+
+        Returns:
+            The surface; and the scale (2,) and the shift (2,), applied after it, that
+            fit texture coordinates to its images.
         """
-        material = (
-            MaterialEntry() if number is None else self.file.header.materials[number]
+        material = MaterialEntry()
+        name = ""
+        if number is not None:
+            material = self.file.header.materials[number]
+            name = material.name or f"material {number}"
+        color, texture = self._base_color(material)
+        roughness, metallic = self._roughness_and_metallic(material, pieces)
+        surface = ImportedSurface(
+            color,
+            texture,
+            unit(roughness),
+            unit(metallic),
+            self._normals(material),
+            self._emission(material),
+            name,
         )
+        uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
+        return self._fitted(surface, material, uvs)
+
+    def _base_color(
+        self, material: MaterialEntry
+    ) -> tuple[Floats | None, Floats | None]:
+        """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB."""
         entry = material.surface
-        scaled = np.array(
-            [1.0] * 4 if entry.baseColorFactor is None else entry.baseColorFactor,
-            np.float32,
-        ).clip(0, 1)
-        factor = scaled[:3]
-        alpha = material.alphaMode in CUT_OUTS
-        color = linear_to_srgb(factor)
+        stated_factor = entry.baseColorFactor
+        if stated_factor is None:
+            stated_factor = [1.0] * 4
+        factor = np.array(stated_factor, np.float32).clip(0, 1)
+        color_factor = factor[:3]
+        has_alpha = material.alphaMode in CUT_OUTS
+        color = linear_to_srgb(color_factor)
         texture = self._picture(
             entry.baseColorTexture,
-            "colours and alpha" if alpha else "colours",
+            "colours and alpha" if has_alpha else "colours",
             f" names the texture {{name}}, which {{why}}; {instead_of_texture(color)} "
             "is used instead",
         )
-        if texture is not None and (factor != 1.0).any():
-            tinted = linear_to_srgb(srgb_to_linear(texture[:, :, :3]) * factor)
-            texture = np.concatenate([tinted, texture[:, :, 3:]], axis=2)
-        kept: Floats | None = color
+        if texture is not None and (color_factor != 1.0).any():
+            linear = srgb_to_linear(texture[:, :, :3]) * color_factor
+            texture = np.concatenate(
+                [linear_to_srgb(linear), texture[:, :, 3:]], axis=2
+            )
+        base_color: Floats | None = color
         if entry.baseColorTexture is not None and (color > 0.999).all():
-            kept = None  # plain white only leaves a texture alone
-        if alpha:
+            base_color = None  # plain white does not change a texture
+        if has_alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
-            kept = with_opacity(kept, scaled[3:], cutoff)
-            texture = with_opacity(texture, scaled[3:], cutoff)
-        roughness, metallic = self._roughness_and_metallic(material, pieces)
-        normals = emission = None
-        if material.normalTexture is not None and material.reads(
-            material.normalTexture
-        ):
-            normals = self._picture(
-                material.normalTexture,
-                "numbers",
-                "the normal map {name} {why}; it is left out",
-            )
-            normals = (
-                None
-                if normals is None
-                else normal_map(normals, material.normalTexture.scale)
-            )
-        # in the unit of environments, as Blender has it (section 3.9.3, and
-        # KHR_materials_emissive_strength)
-        glow = np.array(material.emission)
-        glowing = material.emissiveTexture
-        if glow.any() and material.reads(glowing):
-            picture = self._picture(
-                glowing,
-                "colours",
-                "the texture {name} of the emission {why}; it is left out",
-            )
-            if glowing is None or picture is not None:
-                emission = limited_radiance(glow, picture, self.notes)
-        name = "" if number is None else material.name or f"material {number}"
-        surface = ImportedSurface(
-            kept, texture, unit(roughness), unit(metallic), normals, emission, name
+            base_color = with_opacity(base_color, factor[3:], cutoff)
+            texture = with_opacity(texture, factor[3:], cutoff)
+        return base_color, texture
+
+    def _normals(self, material: MaterialEntry) -> Floats | None:
+        """Return the normal map (H, W, 3) of a material, or None."""
+        use = material.normalTexture
+        if use is None or not material.reads(use):
+            return None
+        image = self._picture(
+            use, "numbers", "the normal map {name} {why}; it is left out"
         )
-        return self._fitted(
-            surface,
-            material,
-            [piece.part.uvs for piece in pieces if piece.part.uvs is not None],
+        return None if image is None else normal_map(image, use.scale)
+
+    def _emission(self, material: MaterialEntry) -> Floats | None:
+        """Return the radiance (H, W, 3) that a material emits, or None.
+
+        Its unit is that of environments, as in Blender (section 3.9.3, and
+        KHR_materials_emissive_strength).
+        """
+        factor = np.array(material.emission)
+        use = material.emissiveTexture
+        if not factor.any() or not material.reads(use):
+            return None
+        image = self._picture(
+            use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
+        if use is not None and image is None:
+            return None
+        return limited_radiance(factor, image, self.notes)
 
     def _roughness_and_metallic(
         self, material: MaterialEntry, pieces: Sequence[Piece]
     ) -> tuple[float, float]:
-        """The factors times the mean of their picture over the faces that show it; over
-        all of it where they have no coordinates.
+        """Return roughness and metallic: the factors times the mean of their texture.
+
+        The mean is taken over the faces that show the texture, or over all of it if
+        they have no texture coordinates.
         """
         entry = material.surface
-        use = material.surface.metallicRoughnessTexture
-        packed = self._picture(
+        use = entry.metallicRoughnessTexture
+        image = self._picture(
             use,
             "numbers",
             "the texture {name} of roughness and metallic {why}; it is left out",
         )
-        if packed is None or use is None:
+        if image is None or use is None:
             return entry.roughnessFactor, entry.metallicFactor
         self.notes.say("textures of roughness and metallic are replaced by their means")
         mapped = [
@@ -356,76 +378,77 @@ class GltfSurfaces:
             for piece in pieces
             if piece.packed_uvs is not None
         ]
-        mean = np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
+        mean = np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
         if mapped:
-            corners = np.concatenate(
+            corner_uvs = np.concatenate(
                 [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped]
             )
-            sides = face_vectors(
+            vectors = face_vectors(
                 np.concatenate([part.vertices[part.faces] for part, _ in mapped])
             )
-            mean = mean_over(packed, corners, np.linalg.norm(sides, axis=1))
+            mean = mean_over(image, corner_uvs, np.linalg.norm(vectors, axis=1))
         _, green, blue = mean.tolist()
         return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _picture(self, use: TextureUse | None, kind: Kind, words: str) -> Floats | None:
-        """Return the values of a texture, each texel as often as its filter asks for;
-        say why it cannot be had.
+        """Return the texels (H, W, C) of a texture; None, and a note, if it has none.
+
+        A texture that is not to be filtered is enlarged by repeating its texels.
         """
         if use is None:
             return None
-        number = self.file.header.textures[use.index].image
-        entry = (
-            gltf_entries.Image() if number is None else self.file.header.images[number]
-        )
-        name = (
-            "(embedded)"
-            if entry.uri is None or entry.uri.startswith("data:")
-            else entry.uri
-        )
-        if number is None:
+        image_index = self.file.header.textures[use.index].image
+        if image_index is None:
             self._pictures.lacks(
-                name, "has a picture of a kind that is not understood", words
+                "(embedded)", "has a picture of a kind that is not understood", words
             )
             return None
+        entry = self.file.header.images[image_index]
+        is_embedded = entry.uri is None or entry.uri.startswith("data:")
+        name = "(embedded)" if is_embedded else str(entry.uri)
 
-        def content() -> bytes:
+        def load_content() -> bytes:
             if entry.uri is not None:
                 return self.file.uri(entry.uri)
-            return (
-                b""
-                if entry.bufferView is None
-                else bytes(self.file.view(entry.bufferView))
-            )
+            if entry.bufferView is None:
+                return b""
+            return bytes(self.file.view(entry.bufferView))
 
         texels = self._pictures.read(
-            (entry.uri, entry.bufferView), content, kind, name, words
+            (entry.uri, entry.bufferView), load_content, kind, name, words
         )
-        if (
-            texels is None
-            or self._sampler(use).magFilter != gltf_entries.NEAREST
-            or texels.shape[:2] == (1, 1)
-        ):
+        is_sharp = self._sampler(use).magFilter == gltf_entries.NEAREST
+        if texels is None or not is_sharp or texels.shape[:2] == (1, 1):
             return texels
-        # so many that filtering does not show
-        sharp = min(self._pictures.side, TEXTURE_LIMIT) // 2
-        times = sharp // max(texels.shape[:2])
-        if times < 2:
-            self.notes.say(BLURRED.format(most=sharp // 2))
+        # At this size, filtering is not visible.
+        sharp_size = min(self._pictures.side, TEXTURE_LIMIT) // 2
+        repeats = sharp_size // max(texels.shape[:2])
+        if repeats < 2:
+            self.notes.say(BLURRED.format(most=sharp_size // 2))
             return texels
-        return texels.repeat(times, axis=0).repeat(times, axis=1)
+        return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 
     def _sampler(self, use: TextureUse) -> Sampler:
-        number = self.file.header.textures[use.index].sampler
-        return Sampler() if number is None else self.file.header.samplers[number]
+        sampler_index = self.file.header.textures[use.index].sampler
+        if sampler_index is None:
+            return Sampler()
+        return self.file.header.samplers[sampler_index]
 
     def _fitted(
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
     ) -> tuple[ImportedSurface, Doubles, Doubles]:
-        places = np.concatenate([*uvs, np.zeros((0, 2))])
+        """Make the images of a surface behave under repetition as their wrap modes say.
+
+        The renderer repeats all textures. Mirrored images are doubled, clamped ones and
+        those with a border are padded, as far as texture coordinates reach.
+
+        Returns:
+            The surface, and the scale (2,) and shift (2,) of texture coordinates.
+        """
+        coordinates = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
-        # the layout first
+        # The texture whose coordinates the mesh has is first.
         uses = (
             material.surface.baseColorTexture,
             material.normalTexture,
@@ -436,72 +459,142 @@ class GltfSurfaces:
             for use in uses
             if use is not None and material.reads(use)
         ]
-        pictures = list(surface.pictures)
-        normals_at = 0 if surface.texture is None else 1  # if there are any
-        normals_at = -1 if surface.normal_map is None else normals_at
-        if not pictures or not len(places) or not np.isfinite(places).all():
+        images = list(surface.pictures)
+        if not images or not len(coordinates) or not np.isfinite(coordinates).all():
             return surface, scale, shift
-        for axis, wraps in enumerate(
-            ([use.wrapS for use in samplers], [use.wrapT for use in samplers])
-        ):
-            low = float(places[:, axis].min())
-            high = float(places[:, axis].max())
-            side = 1 - axis  # rows of pictures come first
-            sizes = [picture.shape[side] for picture in pictures]
-            out = low < -BEYOND or high > 1.0 + BEYOND
-            # small ones would be filtered across their edges, and look otherwise for it
-            differ = (
-                size <= SMALL
-                and not np.array_equal(
-                    np.take(picture, 0, side), np.take(picture, -1, side)
-                )
-                for picture, size in zip(pictures, sizes, strict=True)
+        normals_index = None
+        if surface.normal_map is not None:
+            normals_index = 0 if surface.texture is None else 1
+        wraps_by_axis = (
+            [sampler.wrapS for sampler in samplers],
+            [sampler.wrapT for sampler in samplers],
+        )
+        for axis, wraps in enumerate(wraps_by_axis):
+            bounds = (
+                float(coordinates[:, axis].min()),
+                float(coordinates[:, axis].max()),
             )
-            if out and len(set(wraps)) > 1:
-                self.notes.say(EDGES)
-            if wraps[0] == gltf_entries.BORDER and out:
-                pictures = [_enlarged(picture, side) for picture in pictures]
-                sizes = [picture.shape[side] for picture in pictures]
-            if wraps[0] == gltf_entries.MIRRORED and out:
-                pictures = [
-                    np.concatenate([picture, np.flip(picture, side)], axis=side)
-                    for picture in pictures
-                ]
-                scale[axis] = 0.5
-            elif wraps[0] in (
-                gltf_entries.CLAMPED,
-                gltf_entries.BORDER,
-                gltf_entries.MIRRORED,
-            ) and (out or any(differ)):
-                unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
-                before, after = (
-                    max(0, int(np.ceil(beyond * unit_size))) + 1
-                    for beyond in (-low, high - 1.0)
+            images, scale[axis], shift[axis] = self._fit_axis(
+                images, 1 - axis, wraps, bounds, normals_index
+            )
+        return surface.with_pictures(images), scale, shift
+
+    def _fit_axis(
+        self,
+        images: list[Floats],
+        axis: int,
+        wraps: Sequence[int],
+        bounds: tuple[float, float],
+        normals_index: int | None,
+    ) -> tuple[list[Floats], float, float]:
+        """Fit images (H, W, C) along one axis to the wrap mode of the first of them.
+
+        Args:
+            images: the images of a surface.
+            axis: axis of their arrays, 0 for rows.
+            wraps: wrap mode of each.
+            bounds: smallest and largest texture coordinate along the axis.
+            normals_index: which of the images is a normal map.
+
+        Returns:
+            The images, and scale and shift of texture coordinates.
+        """
+        reaches_out = bounds[0] < -BEYOND or bounds[1] > 1.0 + BEYOND
+        edges_differ = any(_edges_differ(image, axis) for image in images)
+        wrap = wraps[0]
+        if reaches_out and len(set(wraps)) > 1:
+            self.notes.say(EDGES)
+        if wrap == gltf_entries.BORDER and reaches_out:
+            images = [_enlarged(image, axis) for image in images]
+        if wrap == gltf_entries.MIRRORED and reaches_out:
+            mirrored = [
+                np.concatenate([image, np.flip(image, axis)], axis=axis)
+                for image in images
+            ]
+            return mirrored, 0.5, 0.0
+        is_padded = wrap in (
+            gltf_entries.CLAMPED,
+            gltf_entries.BORDER,
+            gltf_entries.MIRRORED,
+        )
+        if not is_padded or not (reaches_out or edges_differ):
+            return images, 1.0, 0.0
+        has_border = wrap == gltf_entries.BORDER and reaches_out
+        return self._pad_images(images, axis, bounds, normals_index, has_border)
+
+    def _pad_images(
+        self,
+        images: list[Floats],
+        axis: int,
+        bounds: tuple[float, float],
+        normals_index: int | None,
+        has_border: bool,
+    ) -> tuple[list[Floats], float, float]:
+        """Pad images along an axis as far as texture coordinates reach.
+
+        Arguments and result are those of `_fit_axis`; `has_border` is whether pads are
+        black (flat in a normal map), and otherwise repeat the edge.
+        """
+        low, high = bounds
+        sizes = [image.shape[axis] for image in images]
+        # A pad is an integer number of texels in every image.
+        unit_size = int(np.gcd.reduce(sizes))
+        before = max(0, int(np.ceil(-low * unit_size))) + 1
+        after = max(0, int(np.ceil((high - 1.0) * unit_size))) + 1
+        total = unit_size + before + after
+        if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
+            self.notes.say(EDGES)
+            return images, 1.0, 0.0
+        padded = []
+        for index, image in enumerate(images):
+            border = None
+            if has_border:
+                border = FLAT if index == normals_index else np.zeros(1, np.float32)
+            texels_per_unit = sizes[index] // unit_size
+            padded.append(
+                _pad(
+                    image,
+                    axis,
+                    before * texels_per_unit,
+                    after * texels_per_unit,
+                    border,
                 )
-                total = unit_size + before + after
-                if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
-                    self.notes.say(EDGES)
-                    continue
-                for number, size in enumerate(sizes):
-                    step = size // unit_size
-                    texels = np.clip(
-                        np.arange(-before * step, (unit_size + after) * step),
-                        0,
-                        size - 1,
-                    )
-                    pictures[number] = np.take(pictures[number], texels, side)
-                    if wraps[0] == gltf_entries.BORDER and out:
-                        beyond = np.arange(len(texels)) // step
-                        is_outside = (beyond < before) | (beyond >= before + unit_size)
-                        along_axis = np.moveaxis(pictures[number], side, 0)
-                        along_axis[is_outside] = FLAT if number == normals_at else 0.0
-                scale[axis], shift[axis] = unit_size / total, before / total
-        return surface.with_pictures(pictures), scale, shift
+            )
+        return padded, unit_size / total, before / total
+
+
+def _edges_differ(image: Floats, axis: int) -> bool:
+    """Return whether a repeated image would blend visibly at its edges along an axis.
+
+    Only in small images half a texel at an edge is visible.
+    """
+    if image.shape[axis] > SMALL:
+        return False
+    return not np.array_equal(np.take(image, 0, axis), np.take(image, -1, axis))
+
+
+def _pad(
+    image: Floats, axis: int, before: int, after: int, border: Floats | None
+) -> Floats:
+    """Pad an image along an axis by a number of texels before and after it.
+
+    The pad has the value `border`, or repeats the texel at the edge if that is None.
+    """
+    size = image.shape[axis]
+    texels = np.clip(np.arange(-before, size + after), 0, size - 1)
+    padded = np.take(image, texels, axis)
+    if border is not None:
+        position = np.arange(len(texels))
+        is_outside = (position < before) | (position >= before + size)
+        along_axis = np.moveaxis(padded, axis, 0)  # a view
+        along_axis[is_outside] = border
+    return padded
 
 
 def _enlarged(picture: Floats, axis: int) -> Floats:
-    """Return a picture with at least `SMALL` texels along an axis, of which a border of
-    one is not seen.
+    """Enlarge an image to at least `SMALL` texels along an axis, interpolating linearly.
+
+    At that size a border of one texel is not visible.
     """
     size = picture.shape[axis]
     times = -(-SMALL // size)
@@ -511,18 +604,18 @@ def _enlarged(picture: Floats, axis: int) -> Floats:
     lower = np.floor(position).astype(np.int64)
     shape = [1] * picture.ndim
     shape[axis] = -1
-    share = (position - lower).reshape(shape).astype(np.float32)
+    fraction = (position - lower).reshape(shape).astype(np.float32)
     upper = np.minimum(lower + 1, size - 1)
     return np.asarray(
-        np.take(picture, lower, axis) * (1.0 - share)
-        + np.take(picture, upper, axis) * share
+        np.take(picture, lower, axis) * (1.0 - fraction)
+        + np.take(picture, upper, axis) * fraction
     )
 
 
-# --- primitives in their places
-# --------------------------------------------------------------------------------------
+# ---- Primitives ----
 
-TRIANGLES = 4  # modes of primitives; those below are points and lines
+# Modes of primitives; those below `TRIANGLES` are points and lines.
+TRIANGLES = 4
 STRIP = 5
 FAN = 6
 SEE_THROUGH = "mesh{es} with an opacity in vertex colours, which is left out"
@@ -533,153 +626,269 @@ DEFAULT = (
 
 @np.errstate(all="ignore")
 def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Parse a glTF file; arguments, results and errors as for the others
-    (`advsearch.scene.importing.objects`).
+    """Read the primitives of a glTF file that its nodes draw, as one part each.
+
+    Arguments, results and errors are those of all readers
+    (`advsearch.scene.importing.objects.read_parts`).
     """
     file = GltfFile(path, data)
     header = file.header
     poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
-    drawn = [
+    # Node, mesh and pose of everything that is drawn.
+    instances = [
         (node, mesh, pose)
         for node, pose in poses
         if (mesh := header.nodes[node].mesh) is not None
     ]
-    moving = gltf_skeleton.check_moving(file, [node for node, _, _ in drawn])
-    skinned = {mesh for node, mesh, _ in drawn if header.nodes[node].skin is not None}
-    pieces = {
-        (mesh, number): read_piece(
-            file, primitive, header.meshes[mesh].extras, mesh in skinned
-        )
-        for mesh in dict.fromkeys(mesh for _, mesh, _ in drawn)
-        for number, primitive in enumerate(header.meshes[mesh].primitives)
-    }
+    mesh_nodes = [node for node, _, _ in instances]
+    moving = gltf_skeleton.check_moving(file, mesh_nodes)
+    pieces = _read_pieces(file, mesh_nodes)
     with_faces = {
         key: piece
         for key, piece in pieces.items()
         if piece is not None and len(piece.part.faces)
     }
     if not with_faces:
-        if any(map(is_of_splats, header.extensionsUsed)):
-            raise FileFormatError(
-                f"{path}: expected a mesh with faces, got Gaussian "
-                f"splats, a model that {SPLATS}"
-            )
-        got = "points or lines only" if pieces else "none"
-        raise FileFormatError(
-            f"{path}: expected a mesh with faces, got {got}; export triangles"
-        )
+        raise _no_faces(path, header, bool(pieces))
     left_out(header, notes)
-    primitives = [header.meshes[mesh].primitives[number] for mesh, number in pieces]
-    splats = sum(
-        any(map(is_of_splats, unread_extensions(primitive))) for primitive in primitives
-    )
-    if without_faces := len(pieces) - len(with_faces) - splats:
-        notes.say(f"{without_faces} parts without faces (points, lines) are left out")
-    clear = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
-    bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
-    for sentence in _counts(
-        {SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}
-    ):
-        notes.say(sentence)
-    surfaces = GltfSurfaces(file, notes)
-    finished = dict[tuple[int, int], ImportedPart]()
-    groups = dict[int | None, dict[tuple[int, int], Piece]]()
-    for key, piece in with_faces.items():
-        groups.setdefault(piece.material, {})[key] = piece
-    for material, group in groups.items():
-        surface, scale, shift = surfaces.surface(material, list(group.values()))
-        for key, piece in group.items():
-            part = piece.part
-            uvs = (
-                None
-                if part.uvs is None
-                else (part.uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
-            )
-            finished[key] = replace(part, surface=surface, uvs=uvs)
-    everywhere = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
-    skins = {}
-    for number in {
-        number
-        for node, _, _ in drawn
-        if (number := header.nodes[node].skin) is not None
-    }:
-        joints = header.skins[number].joints
-        inverse = gltf_skeleton.inverse_binds(file, header.skins[number])
-        skins[number] = (
-            np.array(joints),
-            inverse,
-            np.stack([everywhere[joint] for joint in joints]) @ inverse,
-        )
+    _note_pieces(header, list(pieces), with_faces, notes)
+    parts_by_key = _surfaced_parts(GltfSurfaces(file, notes), with_faces)
+    skins = _read_skins(file, mesh_nodes)
     skeleton = gltf_skeleton.skeleton_of(file, moving)
     if skeleton is not None:
-        names = [clip.name for clip in skeleton.clips]
-        clips = (
-            f", and plays {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
-            if names
-            else ""
-        )
-        notes.say(f" is shown at rest: the control body moves it{clips}")
+        _note_skeleton(skeleton, notes)
 
-    def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
-        skin = header.nodes[node].skin
-        piece = with_faces[key]
-        part = finished[key]
-        joints = np.zeros((len(part.vertices), 1), np.int64)
-        nodes = np.array([node])
-        inverse = np.eye(4)[None]
-        # a node of its own, unless there is a skin
-        by = gltf_skeleton.Bound(joints, np.ones(joints.shape))
-        if skin is not None and piece.bound is not None:
-            by = piece.bound
-            (nodes, inverse, matrices) = skins[skin]
-        if skeleton is not None:
-            rest = gltf_skeleton.weights_of(file, node, len(piece.targets))
-            stored = Movable(
-                skeleton, node, part.vertices, nodes, inverse, *by, piece.targets, rest
-            )
-            part = replace(
-                gltf_skeleton.morphed(part, piece.targets, piece.turns, rest),
-                movable=stored,
-            )
-        if skin is None or piece.bound is None:
-            return placed(part, pose)
-        return gltf_skeleton.posed(path, part, piece.bound, matrices)
-
-    parts = [
-        replace(in_place((mesh, number), node, pose), node=node)
-        for node, mesh, pose in drawn
-        for number in range(len(header.meshes[mesh].primitives))
-        if (mesh, number) in finished
-    ]
+    parts = []
+    for node, mesh, pose in instances:
+        skin_index = header.nodes[node].skin
+        skin = None if skin_index is None else skins[skin_index]
+        for primitive_index in range(len(header.meshes[mesh].primitives)):
+            key = (mesh, primitive_index)
+            if key not in parts_by_key:
+                continue
+            piece = with_faces[key]
+            part = parts_by_key[key]
+            if skeleton is not None:
+                part = _movable_part(file, part, piece, node, skin, skeleton)
+            if skin is None or piece.bound is None:
+                part = placed(part, pose)
+            else:
+                _, _, matrices = skin
+                part = gltf_skeleton.posed(path, part, piece.bound, matrices)
+            parts.append(replace(part, node=node))
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
 
 
+SkinPose = tuple[Ints, Doubles, Doubles]
+"""A skin at rest: its joints (J,), which are nodes; its inverse bind matrices (J, 4, 4),
+from the mesh to each joint; and the matrices (J, 4, 4) from the mesh to the scene.
+"""
+
+
+def _read_pieces(
+    file: GltfFile, mesh_nodes: Sequence[int]
+) -> dict[tuple[int, int], Piece | None]:
+    """Read the primitives that some nodes draw, by mesh and index in the mesh."""
+    header = file.header
+    meshes = dict.fromkeys(header.nodes[node].mesh for node in mesh_nodes)
+    skinned_meshes = {
+        header.nodes[node].mesh
+        for node in mesh_nodes
+        if header.nodes[node].skin is not None
+    }
+    pieces = dict[tuple[int, int], Piece | None]()
+    for mesh in meshes:
+        assert mesh is not None
+        entry = header.meshes[mesh]
+        for index, primitive in enumerate(entry.primitives):
+            pieces[mesh, index] = read_piece(
+                file, primitive, entry.extras, mesh in skinned_meshes
+            )
+    return pieces
+
+
+def _no_faces(path: Path, header: Header, has_primitives: bool) -> FileFormatError:
+    """Return the error for a file without any face."""
+    if any(map(is_of_splats, header.extensionsUsed)):
+        return FileFormatError(
+            f"{path}: expected a mesh with faces, got Gaussian "
+            f"splats, a model that {SPLATS}"
+        )
+    got = "points or lines only" if has_primitives else "none"
+    return FileFormatError(
+        f"{path}: expected a mesh with faces, got {got}; export triangles"
+    )
+
+
+def _note_pieces(
+    header: Header,
+    keys: Sequence[tuple[int, int]],
+    with_faces: Mapping[tuple[int, int], Piece],
+    notes: Notes,
+) -> None:
+    """Note primitives without faces or material, and with transparent vertices."""
+    primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
+    n_splats = sum(
+        any(map(is_of_splats, unread_extensions(primitive))) for primitive in primitives
+    )
+    n_without_faces = len(keys) - len(with_faces) - n_splats
+    if n_without_faces:
+        notes.say(f"{n_without_faces} parts without faces (points, lines) are left out")
+    transparent = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
+    bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
+    kinds = {SEE_THROUGH: [True] * len(transparent), DEFAULT: [True] * len(bare)}
+    for sentence in _counts(kinds):
+        notes.say(sentence)
+
+
+def _surfaced_parts(
+    surfaces: GltfSurfaces, with_faces: Mapping[tuple[int, int], Piece]
+) -> dict[tuple[int, int], ImportedPart]:
+    """Return the parts of pieces with their surfaces and final UVs."""
+    groups = dict[int | None, dict[tuple[int, int], Piece]]()
+    for key, piece in with_faces.items():
+        groups.setdefault(piece.material, {})[key] = piece
+    parts = dict[tuple[int, int], ImportedPart]()
+    for material, group in groups.items():
+        surface, scale, shift = surfaces.surface(material, list(group.values()))
+        for key, piece in group.items():
+            uvs = piece.part.uvs
+            if uvs is not None:
+                # v points up in a part.
+                uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+            parts[key] = replace(piece.part, surface=surface, uvs=uvs)
+    return parts
+
+
+def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
+    """Return the skins of some nodes by index."""
+    header = file.header
+    # Joints may be outside of the scene that is shown.
+    all_poses = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
+    skins = dict[int, SkinPose]()
+    for index in {header.nodes[node].skin for node in mesh_nodes}:
+        if index is None:
+            continue
+        joints = header.skins[index].joints
+        inverse = gltf_skeleton.inverse_binds(file, header.skins[index])
+        matrices = np.stack([all_poses[joint] for joint in joints]) @ inverse
+        skins[index] = (np.array(joints), inverse, matrices)
+    return skins
+
+
+def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
+    names = [clip.name for clip in skeleton.clips]
+    clips = ""
+    if names:
+        more = ", ..." if len(names) > 5 else ""
+        clips = f", and plays {', '.join(names[:5])}{more}"
+    notes.say(f" is shown at rest: the control body moves it{clips}")
+
+
+def _movable_part(
+    file: GltfFile,
+    part: ImportedPart,
+    piece: Piece,
+    node: int,
+    skin: SkinPose | None,
+    skeleton: Skeleton,
+) -> ImportedPart:
+    """Return a part with its morph targets at rest, and with what moves it."""
+    # Without a skin, all vertices are bound to the node itself.
+    joints = np.zeros((len(part.vertices), 1), np.int64)
+    bound = gltf_skeleton.Bound(joints, np.ones(joints.shape))
+    nodes = np.array([node])
+    inverse_binds = np.eye(4)[None]
+    if skin is not None and piece.bound is not None:
+        bound = piece.bound
+        nodes, inverse_binds, _ = skin
+    rest = gltf_skeleton.weights_of(file, node, len(piece.targets))
+    movable = Movable(
+        skeleton,
+        node,
+        part.vertices,
+        nodes,
+        inverse_binds,
+        *bound,
+        piece.targets,
+        rest,
+    )
+    morphed = gltf_skeleton.morphed(part, piece.targets, piece.turns, rest)
+    return replace(morphed, movable=movable)
+
+
 class Piece(NamedTuple):
-    """A primitive as it is stored, without surface. Texture coordinates are the
-    format's, v = 0 at the top.
+    """A primitive as the file stores it, without surface.
+
+    Texture coordinates are the format's, with v = 0 at the top.
     """
 
     part: ImportedPart  # its geometry
-    material: int | None
-    see_through: bool  # whether it has vertex colours whose alpha would count
-    bound: gltf_skeleton.Bound | None  # to which joints
-    targets: tuple[Target, ...]  # of morphing
-    turns: tuple[Doubles | None, ...]  # how far each target turns its normals
+    material: int | None  # index
+    see_through: bool  # whether it has vertex colors whose alpha would count
+    bound: gltf_skeleton.Bound | None  # joints and weights
+    targets: tuple[Target, ...]  # morph targets
+    turns: tuple[Doubles | None, ...]  # what each target adds to its normals
     packed_uvs: Doubles | None  # (V, 2) of its texture of roughness and metallic
 
 
 def read_piece(
     file: GltfFile, primitive: Primitive, extras: object, skinned: bool
 ) -> Piece | None:
-    """Return a primitive; None for points, lines and what has no places. `extras` are
-    those of its mesh.
+    """Read one primitive; None if it is points or lines, or has no positions.
+
+    Args:
+        file: the glTF file.
+        primitive: its entry in the header.
+        extras: those of its mesh.
+        skinned: whether a node with a skin draws it.
+
+    Raises:
+        FileFormatError: a face refers to a vertex that is not there.
     """
-    held = primitive.attributes
+    attributes = primitive.attributes
     header = file.header
-    if primitive.mode < TRIANGLES or "POSITION" not in held:
+    if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
-    count = header.accessors[held["POSITION"]].count
+    used, faces = _used_vertices(file, primitive)
+    vertices = file.numbers(attributes["POSITION"], used)
+    material = MaterialEntry()
+    if primitive.material is not None:
+        material = header.materials[primitive.material]
+    uvs = _coordinates(file, attributes, material.layout, used)
+    packed = material.surface.metallicRoughnessTexture
+    packed_uvs = None
+    if packed is not None:
+        packed_uvs = _coordinates(file, attributes, packed, used)
+    colors = None
+    see_through = False
+    if "COLOR_0" in attributes:
+        rgba = file.numbers(attributes["COLOR_0"], used)
+        rgba = np.clip(np.nan_to_num(rgba), 0.0, 1.0)
+        colors = rgba[:, :3][faces]
+        has_alpha = rgba.shape[1] == 4 and bool((rgba[:, 3] < 1.0).any())
+        see_through = material.alphaMode in CUT_OUTS and has_alpha
+    normals = None
+    if "NORMAL" in attributes:
+        normals = file.numbers(attributes["NORMAL"], used)
+    part = ImportedPart(
+        vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True
+    )
+    bound = gltf_skeleton.bound(file, primitive, used) if skinned else None
+    targets, turns = gltf_skeleton.targets_of(file, primitive, used, extras)
+    return Piece(
+        part, primitive.material, see_through, bound, targets, turns, packed_uvs
+    )
+
+
+def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[Ints, Ints]:
+    """Return the vertices (V,) that the faces of a primitive have, and the faces.
+
+    Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
+    indices into the used vertices.
+    """
+    count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
     if primitive.indices is not None:
         order = file.values(primitive.indices)[:, 0].astype(np.int64)
@@ -689,78 +898,53 @@ def read_piece(
             "faces of its own vertices",
             "a face that refers to a vertex that is not there",
         )
-    # others may share the vertices
     used, corners = np.unique(_triangles(order, primitive.mode), return_inverse=True)
-    faces = corners.reshape(-1, 3).astype(np.int64)
-    vertices = file.numbers(held["POSITION"], used)
-    material = (
-        MaterialEntry()
-        if primitive.material is None
-        else header.materials[primitive.material]
-    )
-    colors = None
-    see_through = False
-    uvs = _coordinates(file, held, material.layout, used)
-    packed = material.surface.metallicRoughnessTexture
-    packed_uvs = None if packed is None else _coordinates(file, held, packed, used)
-    if "COLOR_0" in held:
-        rgba = np.clip(np.nan_to_num(file.numbers(held["COLOR_0"], used)), 0.0, 1.0)
-        colors = rgba[:, :3][faces]
-        see_through = (
-            material.alphaMode in CUT_OUTS
-            and rgba.shape[1] == 4
-            and bool((rgba[:, 3] < 1.0).any())
-        )
-    normals = file.numbers(held["NORMAL"], used) if "NORMAL" in held else None
-    part = ImportedPart(
-        vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True
-    )
-    joints = gltf_skeleton.bound(file, primitive, used) if skinned else None
-    targets = gltf_skeleton.targets_of(file, primitive, used, extras)
-    return Piece(part, primitive.material, see_through, joints, *targets, packed_uvs)
+    return used, corners.reshape(-1, 3).astype(np.int64)
 
 
 def _coordinates(
-    file: GltfFile, held: Mapping[str, int], use: TextureUse | None, used: Ints
+    file: GltfFile,
+    attributes: Mapping[str, int],
+    use: TextureUse | None,
+    used: Ints,
 ) -> Doubles | None:
-    """Return the texture coordinates (N, 2) by which a texture is looked up, (0, 0) at
-    its top left corner.
+    """Return the texture coordinates of used vertices, or None if there are none.
+
+    They are (N, 2) after the texture's transform, (0, 0) at its top left corner.
     """
-    attribute = "TEXCOORD_0" if use is None else use.attribute
-    if attribute not in held:
+    name = "TEXCOORD_0" if use is None else use.attribute
+    if name not in attributes:
         return None
-    accessor = file.header.accessors[held[attribute]]
-    if (
-        accessor.type != "VEC2"
-        or accessor.count != file.header.accessors[held["POSITION"]].count
-    ):
-        return None  # those of the base colour are checked with the header
-    uvs = file.numbers(held[attribute], used)
+    accessor = file.header.accessors[attributes[name]]
+    vertex_count = file.header.accessors[attributes["POSITION"]].count
+    if accessor.type != "VEC2" or accessor.count != vertex_count:
+        return None  # those of the base color are checked with the header
+    uvs = file.numbers(attributes[name], used)
     if use is None:
         return uvs
-    by = use.transform
-    sine = np.sin(by.rotation)
-    cosine = np.cos(by.rotation)
-    u, v = (uvs * by.scale).T
-    return np.asarray(
-        np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + by.offset
-    )
+    transform = use.transform
+    sine = np.sin(transform.rotation)
+    cosine = np.cos(transform.rotation)
+    u, v = (uvs * transform.scale).T
+    rotated = np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1)
+    return np.asarray(rotated + transform.offset)
 
 
 def _triangles(order: Ints, mode: int) -> Ints:
-    """Return the faces (F, 3) of a primitive (section 3.7.2.1) with vertices in that
-    order.
+    """Return the faces (F, 3) of a primitive of a mode (section 3.7.2.1).
+
+    `order` are its vertices in the order in which it lists them.
     """
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
-    number = np.arange(max(0, len(order) - 2))
+    index = np.arange(max(0, len(order) - 2))
     if mode == STRIP:
         corners = np.stack(
-            [number, number + 1 + number % 2, number + 2 - number % 2], axis=1
+            [index, index + 1 + index % 2, index + 2 - index % 2], axis=1
         )
     else:
-        corners = np.stack([number + 1, number + 2, np.zeros_like(number)], axis=1)
+        corners = np.stack([index + 1, index + 2, np.zeros_like(index)], axis=1)
     faces = order[corners]
-    # with which strips go on elsewhere
-    joints = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    return np.asarray(faces[~joints], np.int64)
+    # Faces with a repeated vertex join strips that are far apart.
+    is_joint = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return np.asarray(faces[~is_joint], np.int64)

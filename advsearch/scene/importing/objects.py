@@ -1,9 +1,8 @@
-"""Objects from mesh files: ``--object path.obj`` and the other endings of
-`advsearch.files.MESHES`.
+"""Objects from mesh files: ``--object path.obj`` and others of `advsearch.files.MESHES`.
 
-A file is a list of parts: one piece of geometry with one surface each, in the file's
-own coordinates. The formats have readers of our own: those that there are drop without
-a word what they do not know.
+A file is read as a list of parts: one piece of geometry with one surface each, in the
+file's own coordinates. The readers are our own, since existing ones silently drop what
+they do not understand.
 """
 
 from __future__ import annotations
@@ -55,10 +54,20 @@ from advsearch.scene.importing.texture import by_material, textured
 
 
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Return the parts of a mesh file that have faces (at least one), always in the
-    same order, and the warnings. Its ending names the format, and files that it refers
-    to are looked up beside it. Raises FileFormatError: it is damaged, not a mesh,
-    refers to missing geometry, or has no faces.
+    """Read a mesh file with the reader of its suffix.
+
+    Files that it refers to are looked up beside it.
+
+    Args:
+        path: the file.
+        data: its content.
+
+    Returns:
+        The parts that have faces, at least one, in a fixed order; and the warnings.
+
+    Raises:
+        FileFormatError: the file is corrupt, is no mesh, refers to missing geometry, or
+            has no faces.
     """
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
@@ -75,48 +84,61 @@ def import_object(
     up: Literal["y", "z"] | None = None,
     facing: str | None = None,
 ) -> ObjectAsset:
-    """Read an object from a mesh file, one of `advsearch.files.MESHES`, with the files
-    beside it that it refers to; `up` is the axis that points up in it, None for what
-    the format or else the shape says; `facing`, one of `FACINGS`, the one along which
-    its front faces, None for what the format says (`find_front`).
+    """Read an object from a mesh file and the files beside it that it refers to.
 
-    What becomes of materials, units and axes is in docs/scenes.md ("Your own object").
+    The handling of materials, units and axes is in docs/scenes.md ("Your own object").
     The geometry is repaired:
 
     - All of it is joined, with the transforms of the file's scene graph, turned z up
       with its front towards +x, scaled to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that
-    are inside out are turned over.
-    - Normals are the file's; where it has none, or they contradict the faces, they are
+      are inside out are turned over.
+    - Normals are the file's; if it has none, or they contradict the faces, they are
       computed: smooth, with creases where faces meet at more than 40 degrees; flat in
       glTF.
-    - UVs are the file's, moved into [0, 1] where that takes little. Where it has none,
-      where they repeat a texture or are squashed, and where there are several
-      materials, xatlas makes new ones and the pictures are baked into maps.
+    - UVs are the file's, moved into [0, 1] if that takes little. If it has none, if
+      they repeat a texture or are squashed, and if there are several materials, xatlas
+      makes new ones and the images are baked into maps.
 
-    What is left out or changed is named in the warnings. The same file gives the same
-    bytes every time. Raises FileFormatError: the file is missing, of another kind,
-    damaged, or holds no faces; the message names it. Raises InputError: `up` is
-    neither, `facing` none of them or along the same axis, or the geometry has NaN,
-    infinite, or coincident vertices only.
+    The warnings name what is left out or changed. The same file gives the same bytes
+    every time.
+
+    Args:
+        path: a file of one of the kinds of `advsearch.files.MESHES`.
+        up: the axis of the file that points up; None: that of its format, or else the
+            one that its shape suggests.
+        facing: the axis of the file, one of `FACINGS`, along which the object's front
+            faces; None: that of its format (`find_front`).
+
+    Raises:
+        FileFormatError: the file is missing, of another kind, corrupt, or has no faces;
+            the message names it.
+        InputError: `up` is neither, `facing` is none of them or along the same axis, or
+            the geometry has NaN, infinite, or coincident vertices only.
     """
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
     data = read_mesh_bytes(file, "object", list_suffixes())
     parts, notes = read_parts(file, data)
-    header = gltf.read_header(file, data) if file.suffix.lower() in GLTF else None
-    notes += [] if header is None else gltf_parts.beside(header, file.name)
+    header = None
+    format_up: str | None = up
+    if file.suffix.lower() in GLTF:
+        header = gltf.read_header(file, data)
+        notes += gltf_parts.beside(header, file.name)
+        format_up = up or "y"
     if facing is None:
         front = find_front(file, header, up)
     else:
-        front = FileAxis(check_facing(facing, up if header is None else up or "y"))
+        front = FileAxis(check_facing(facing, format_up))
     return object_of(parts, notes, file, safe_name(file), up, front)
 
 
 def check_facing(facing: str, up: str | None) -> str:
-    """Return an axis of `FACINGS`, of which a sign of plus may be left out. Raises
-    InputError: it is none, or the axis that points up.
+    """Return an axis of `FACINGS`, completing a plus sign that was left out.
+
+    Raises:
+        InputError: it is no such axis, or the axis that points up.
     """
     axis = facing if facing.startswith(("+", "-")) else f"+{facing}"
     if axis not in FACINGS:
@@ -133,10 +155,8 @@ def check_facing(facing: str, up: str | None) -> str:
 
 
 OUR_FRONT = "+x"
-"""What is taken for the front where a format has no rule: the axis along which bundled
-objects face.
-"""
-# the axis that points up where the front is along another one that might
+"""The front in formats that define none: the axis along which bundled objects face."""
+# The axis that points up, by that of a front which rules out one of the two.
 UP_OF_FRONT = {"y": "z", "z": "y"}
 BLEND = ".blend"
 USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -145,12 +165,16 @@ VRM_1 = "VRMC_vrm"
 
 
 def find_front(path: Path, header: Header | None, up: str | None = None) -> FileAxis:
-    """Return the axis along which the front of what is in a file faces, by the rule of
-    its format; `header` is that of a glTF file, or of what was converted to glTF.
+    """Return the axis along which the front of an object faces, as its format defines.
 
     The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in
-    Blender. VRM 1.0 says the same, VRM 0.x says -Z. OBJ, PLY, STL and OpenUSD have no
-    rule, nor has a glTF file that is said to be z up.
+    Blender. VRM 1.0 has the same rule, VRM 0.x has -Z. OBJ, PLY, STL and OpenUSD have
+    no rule, nor does it hold for a glTF file that the user declares to be z up.
+
+    Args:
+        path: the file.
+        header: that of a glTF file, or of a file that was converted to glTF.
+        up: the axis that points up, if the user named it.
     """
     suffix = path.suffix.lower()
     if header is None or suffix in USD or up == "z":
@@ -165,12 +189,12 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
     else:
         axis = "+z"
         rule = "as glTF says"
-    other = f"-{axis[1]}" if axis[0] == "+" else f"+{axis[1]}"
+    opposite = f"-{axis[1]}" if axis[0] == "+" else f"+{axis[1]}"
     return FileAxis(
         axis,
         f"{path.name}: its front is taken to face {axis} of the file ({rule}); if it "
         "faces another way, give that, "
-        f"such as `facing={other}`",
+        f"such as `facing={opposite}`",
     )
 
 
@@ -182,82 +206,114 @@ def object_of(
     up: str | None,
     front: FileAxis,
 ) -> ObjectAsset:
-    """Return the object of that name which some parts of a file, at least one, make up;
-    `notes` are warnings about them so far, `up` as in `import_object`, and `front` the
-    axis of its front. Raises InputError: the geometry has NaN, infinite, or coincident
-    vertices only.
+    """Return the object that parts of a file make up.
+
+    Args:
+        parts: at least one.
+        notes: warnings about them so far.
+        file: the file that they are from.
+        name: name of the object.
+        up: as for `import_object`.
+        front: the axis along which its front faces.
+
+    Raises:
+        InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
-    seen = visible(parts)
-    more = Notes(file)
-    gltf_file = file.suffix.lower() in GLTF
-    clear = ", ".join(
-        dict.fromkeys(
-            shown(part.surface.name or "a part") for part in parts if part not in seen
-        )
-    )
-    if clear:
-        more.say(
-            f"all light passes through {clear} (opacity 0): left out; give it an "
-            "opacity to see it"
-        )
-    parts = seen
-    known = up or ("y" if gltf_file else UP_OF_FRONT.get(front.axis[1]))
-    if known is None:
-        as_stored = join(parts, str(file), np.eye(3))
-        axis = guess_up(as_stored.points[np.unique(as_stored.faces)], file.name)
-    else:
-        axis = FileAxis(known)
-    turn = compute_turn(axis.axis, front.axis)
-    soup = join(parts, str(file), turn)
+    more_notes = Notes(file)
+    is_gltf = file.suffix.lower() in GLTF
+    parts = _visible_parts(parts, more_notes)
+    up_axis = _find_up(parts, file, up, front)
+    turn = compute_turn(up_axis.axis, front.axis)
     surfaces = [part.surface for part in parts]
-    soup, maps = textured(repaired(soup, str(file), more), surfaces, more)
-    opacity = (
-        np.ascontiguousarray(maps.color[:, :, 3]) if maps.color.shape[2] == 4 else None
+    soup = repaired(join(parts, str(file), turn), str(file), more_notes)
+    soup, maps = textured(soup, surfaces, more_notes)
+    opacity = None
+    if maps.color.shape[2] == 4:
+        opacity = np.ascontiguousarray(maps.color[:, :, 3])
+        if not opacity.any():
+            opacity = None
+            more_notes.say("it is transparent all over; it is shown opaque")
+    material = _mean_material(soup, surfaces, more_notes)
+    extent = extent_of(parts) * float(
+        np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
     )
-    if opacity is not None and not opacity.any():
-        opacity = None
-        more.say("it is transparent all over; it is shown opaque")
+    has_unit = is_gltf and SMALLEST <= extent <= LARGEST
+    return ObjectAsset(
+        name=name,
+        mesh=_mesh(soup, surfaces, file, parts, turn),
+        base_color=np.ascontiguousarray(maps.color[:, :, :3]),
+        material=material,
+        source=str(file),
+        warnings=_limit_warnings([*notes, *more_notes], file),
+        up=up_axis,
+        front=front,
+        opacity=opacity,
+        normal_map=maps.normals,
+        emission=_let_out(maps.emission, opacity),
+        metres=extent if has_unit else None,
+        extent=extent,
+    )
+
+
+def _visible_parts(parts: list[ImportedPart], notes: Notes) -> list[ImportedPart]:
+    """Return the parts that are not fully transparent, and note the others."""
+    visible_parts = visible(parts)
+    transparent = [part for part in parts if part not in visible_parts]
+    names = dict.fromkeys(shown(part.surface.name or "a part") for part in transparent)
+    if names:
+        notes.say(
+            f"all light passes through {', '.join(names)} (opacity 0): left out; give "
+            "it an opacity to see it"
+        )
+    return visible_parts
+
+
+def _find_up(
+    parts: list[ImportedPart], file: Path, up: str | None, front: FileAxis
+) -> FileAxis:
+    """Return the axis that points up: the user's, the format's, or a guess."""
+    if up:
+        return FileAxis(up)
+    if file.suffix.lower() in GLTF:
+        return FileAxis("y")
+    if front.axis[1] in UP_OF_FRONT:
+        return FileAxis(UP_OF_FRONT[front.axis[1]])
+    as_stored = join(parts, str(file), np.eye(3))
+    return guess_up(as_stored.points[np.unique(as_stored.faces)], file.name)
+
+
+def _mean_material(
+    soup: Soup, surfaces: list[ImportedSurface], notes: Notes
+) -> Material:
+    """Return the roughness and metallic of all surfaces, averaged by area."""
     area = np.bincount(
         soup.part,
         weights=np.linalg.norm(soup.face_vectors(), axis=1),
         minlength=len(surfaces),
     )
-    looks = [Material().with_values(vars(surface), "") for surface in surfaces]
-    values = np.array([[look.roughness, look.metallic] for look in looks])
-    roughness, metallic = map(float, values[area > 0][0])
-    if not (values[area > 0] == values[area > 0][0]).all():
-        roughness, metallic = map(
-            float, (values * area[:, None]).sum(axis=0) / area.sum()
-        )
-        means = f"{roughness:.2g} and {metallic:.2g}"
-        more.say(
+    materials = [Material().with_values(vars(surface), "") for surface in surfaces]
+    values = np.array(
+        [[material.roughness, material.metallic] for material in materials]
+    )
+    visible_values = values[area > 0]
+    roughness, metallic = map(float, visible_values[0])
+    if not (visible_values == visible_values[0]).all():
+        means = (values * area[:, None]).sum(axis=0) / area.sum()
+        roughness, metallic = map(float, means)
+        notes.say(
             "the roughness and metallic of its materials are replaced by their "
-            f"means ({means})"
+            f"means ({roughness:.2g} and {metallic:.2g})"
         )
-    warnings = [*notes, *more]
-    if (rest := len(warnings) - MOST_WARNINGS) > 0:
-        warnings = [
-            *warnings[:MOST_WARNINGS],
-            f"{file.name}: {rest:,} more warnings are left out",
-        ]
-    extent = extent_of(parts) * float(
-        np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
-    )
-    return ObjectAsset(
-        name=name,
-        mesh=_mesh(soup, surfaces, file, parts, turn),
-        base_color=np.ascontiguousarray(maps.color[:, :, :3]),
-        material=Material(roughness=roughness, metallic=metallic),
-        source=str(file),
-        warnings=tuple(warnings),
-        up=axis,
-        front=front,
-        opacity=opacity,
-        normal_map=maps.normals,
-        emission=_let_out(maps.emission, opacity),
-        metres=extent if gltf_file and SMALLEST <= extent <= LARGEST else None,
-        extent=extent,
-    )
+    return Material(roughness=roughness, metallic=metallic)
+
+
+def _limit_warnings(warnings: list[str], file: Path) -> tuple[str, ...]:
+    """Return the first `MOST_WARNINGS` warnings, and one that counts the rest."""
+    n_more = len(warnings) - MOST_WARNINGS
+    if n_more <= 0:
+        return tuple(warnings)
+    rest = f"{file.name}: {n_more:,} more warnings are left out"
+    return (*warnings[:MOST_WARNINGS], rest)
 
 
 def _mesh(
@@ -265,93 +321,116 @@ def _mesh(
     surfaces: list[ImportedSurface],
     file: Path,
     parts: list[ImportedPart],
-    upright: Doubles,
+    turn: Doubles,
 ) -> Mesh:
-    names, number = by_material(soup, surfaces)
+    """Return the normalised mesh with its materials, and a rig if something moves it.
+
+    `turn` (3, 3) leads from the file's axes to ours.
+    """
+    material_names, material_of_face = by_material(soup, surfaces)
+    faces_by_material = zip(material_names, grouped(material_of_face), strict=False)
     materials = {
-        name: faces
-        for name, faces in zip(names, grouped(number), strict=False)
-        if name and len(faces)
+        name: faces for name, faces in faces_by_material if name and len(faces)
     }
     try:
-        mesh, stored = assemble(soup)
-        standing = replace(normalised(mesh), materials=materials)
-    except InputError as error:  # which knows of no file
+        mesh, stored_vertices = assemble(soup)
+        normalised_mesh = replace(normalised(mesh), materials=materials)
+    except InputError as error:  # it does not name the file
         raise InputError(f"{file}: {error}") from None
-    if stored is None:
-        return standing
-    # torch takes seconds, and most have no joints
+    if stored_vertices is None:
+        return normalised_mesh
+    # Imported late: torch takes seconds, and most objects have no joints.
     from advsearch.scene.rigged import SkeletonRig
 
-    moving = [part.movable for part in parts if part.movable is not None]
+    movable_parts = [part.movable for part in parts if part.movable is not None]
     size = extent_of(parts) * float(
         np.ptp(mesh.vertices.astype(np.float64), axis=0).max()
     )
-    return replace(standing, rig=SkeletonRig(moving, stored, upright / size))
+    rig = SkeletonRig(movable_parts, stored_vertices, turn / size)
+    return replace(normalised_mesh, rig=rig)
 
 
 def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
+    """Return the radiance (H, W, 3) that leaves a surface: emission times opacity.
+
+    Both maps are brought to the larger of their sizes. None: it emits nothing.
+    """
     if emission is None or opacity is None:
         return emission
-    (rows, columns) = emission.shape[:2]
-    (height, width) = opacity.shape
-    width, height = max((columns, rows), (width, height))
-    share = np.asarray(
+    rows, columns = emission.shape[:2]
+    width, height = max((columns, rows), (opacity.shape[1], opacity.shape[0]))
+    resized_opacity = np.asarray(
         Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR)
-    )[:, :, None]
-    enlarged = emission[np.arange(height) * rows // height][
-        :, np.arange(width) * columns // width
-    ]
-    radiance = np.asarray(enlarged * share, np.float32)
+    )
+    source_rows = np.arange(height) * rows // height
+    source_columns = np.arange(width) * columns // width
+    enlarged = emission[source_rows][:, source_columns]
+    radiance = np.asarray(enlarged * resized_opacity[:, :, None], np.float32)
     return radiance if radiance.any() else None
 
 
 TOUCHING = 0.02
-"""Height, as a share of the largest extent, up to which a vertex touches the ground:
+"""Height, as a fraction of the largest extent, up to which a vertex touches the ground:
 feet and scans are uneven.
 """
-# the shares of two axes differ by more than this factor, or the shape does not tell
-# which one is up
+# The fractions of two axes must differ by more than this factor for the shape to tell
+# which one is up.
 CLEAR = 1.1
 
 
 def guess_up(points: Doubles, name: str) -> FileAxis:
-    """Return the axis that points up, y or z, by the shape of vertices (P, 3) alone; z
-    where that does not tell.
+    """Guess which axis of a mesh points up, y or z, from its shape alone.
 
-    What stands on a table touches it with a large part of what it covers, seen from
+    What stands on a table touches it with a large fraction of what it covers, seen from
     above: the foot of a vase, the four wheels of a car. Lying on its side it touches
     with less. Of 39 meshes of several authors and the bundled objects, each written
-    with y and with z up, it takes the right axis for all that can stand in only one
-    way.
+    with y and with z up, this finds the right axis for all that have only one stable
+    upright pose.
+
+    Args:
+        points: vertices (P, 3).
+        name: name of the file, for the note.
+
+    Returns:
+        The axis, z if the shape does not tell, and a note with the reason.
     """
-    shares = {"y": touching_share(points[:, [2, 0, 1]]), "z": touching_share(points)}
-    axis, other = ("y", "z") if shares["y"] > CLEAR * shares["z"] else ("z", "y")
-    why = "its shape does not tell, as it rests as well either way"
-    if shares[axis] > CLEAR * shares[other]:
-        on, otherwise = (f"{100 * shares[way]:.0f} %" for way in (axis, other))
-        why = (
-            f"it then rests on {on} of what it covers, seen from above, and on "
-            f"{otherwise} otherwise"
+    fractions = {
+        "y": touching_share(points[:, [2, 0, 1]]),
+        "z": touching_share(points),
+    }
+    axis = "z"
+    other = "y"
+    if fractions["y"] > CLEAR * fractions["z"]:
+        axis = "y"
+        other = "z"
+    reason = "its shape does not tell, as it rests as well either way"
+    if fractions[axis] > CLEAR * fractions[other]:
+        reason = (
+            f"it then rests on {100 * fractions[axis]:.0f} % of what it covers, seen "
+            f"from above, and on {100 * fractions[other]:.0f} % otherwise"
         )
     return FileAxis(
         axis,
-        f"{name}: {axis} is taken for up, because {why}; if it lies "
+        f"{name}: {axis} is taken for up, because {reason}; if it lies "
         f"on its side, give `up={other}`",
     )
 
 
 def touching_share(points: Doubles) -> float:
-    """Return which share, in [0, 1], of what an object covers from above (along its
-    third axis) touches the ground: areas of convex hulls.
+    """Return the fraction of an object's footprint that touches the ground, in [0, 1].
+
+    Up is the third axis of its points (P, 3). Areas are those of convex hulls.
     """
     height = points[:, 2] - points[:, 2].min()
-    touching = height <= TOUCHING * np.ptp(points, axis=0).max()
-    covered = _hull_area(points[:, :2])
-    return _hull_area(points[touching, :2]) / covered if covered > 0.0 else 0.0
+    is_touching = height <= TOUCHING * np.ptp(points, axis=0).max()
+    covered_area = _hull_area(points[:, :2])
+    if covered_area <= 0.0:
+        return 0.0
+    return _hull_area(points[is_touching, :2]) / covered_area
 
 
 def _hull_area(points: Doubles) -> float:
+    """Return the area of the convex hull of points (P, 2); 0 if they are on a line."""
     if len(points) < 3:
         return 0.0
     try:

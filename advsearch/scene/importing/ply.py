@@ -1,11 +1,13 @@
-"""PLY: what elements and properties mean. The format leaves their names open; those of
-many programs are known.
+"""Reader of PLY files.
+
+The format leaves the names of elements and properties open; those of many programs are
+known here.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -64,44 +66,66 @@ _END = re.compile(rb"^end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE)
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """A property with several values in each row."""
+    """The values of a list property: several in each row."""
 
-    counts: Ints  # (N,) how many
-    values: Numbers  # those of all rows, one after the other
+    counts: Ints  # (N,) how many each row has
+    values: Numbers  # those of all rows, concatenated
 
 
 @dataclass
 class Element:
-    """A table of a file, with the types of its properties, and of the counts of those
-    that are lists, as the header has them; and the values (N,) of properties with one a
-    row, and those with several.
-    """
+    """A table of a file: its properties, their types and their values."""
 
     name: str
     count: int  # of its rows
-    # of a list, that of its values
+    # Types of properties; of a list, that of its values.
     types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    # Types of the counts of lists.
     lists: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    # Values (N,) of properties with one in each row.
     scalars: dict[str, Numbers] = field(default_factory=dict)
+    # Values of list properties.
     listed: dict[str, Lists] = field(default_factory=dict)
 
 
 def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[str]]:
-    """Return the elements of a file by their names, and its comments. Raises
-    FileFormatError: it is no PLY file, its header is odd, or it is shorter than that
-    says.
+    """Return the elements of a PLY file by name, and its comments.
+
+    Raises:
+        FileFormatError: the file is no PLY file, has an unknown header, or is shorter
+            than its header states.
     """
-    # carriage returns end its lines
-    lone = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
-    end = _END.search(data.replace(b"\r", b"\n") if lone else data)
-    if not data.startswith(b"ply") or end is None:
-        got = "half of one" if data.startswith(b"ply") else data
+    has_magic = data.startswith(b"ply")
+    # Some files end their lines in carriage returns alone.
+    ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
+    end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
+    if not has_magic or end is None:
+        got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
+    elements, comments, order = _parse_header(text_of(data[: end.start()]), notes)
+    notes.check_faces(elements["face"].count if "face" in elements else 0)
+    body = data[end.end() :]
+    position = 0
+    if order:
+        cells = np.frombuffer(body, np.uint8)
+        text = b""
+    else:
+        cells = numbers_in(body, np.float64).view(np.uint8)
+        text = body
+    for element in elements.values():
+        position = _fill(notes, element, cells, position, text)
+    return elements, comments
+
+
+def _parse_header(
+    header: str, notes: Notes
+) -> tuple[dict[str, Element], list[str], str]:
+    """Return the elements, the comments and the byte order, empty for ASCII."""
     elements: dict[str, Element] = {}
     comments = list[str]()
     order = None
     current = None
-    for line in text_of(data[: end.start()]).splitlines()[1:]:
+    for line in header.splitlines()[1:]:
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
                 order = _FORMATS[kind]
@@ -110,11 +134,11 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
             case ["element", name, count] if (
                 count.isdecimal() and len(count) < 20 and name not in elements
             ):
-                current = elements[name] = Element(name, int(count))
-            case ["property", "list", counts, kind, name] if current and {
-                counts,
-                kind,
-            } <= set(_TYPES):
+                current = Element(name, int(count))
+                elements[name] = current
+            case ["property", "list", counts, kind, name] if (
+                current and counts in _TYPES and kind in _TYPES
+            ):
                 current.types[name] = np.dtype((order or "") + _TYPES[kind])
                 current.lists[name] = np.dtype((order or "") + _TYPES[counts])
             case ["property", kind, name] if (
@@ -132,108 +156,121 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         raise notes.damaged(
             f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these"
         )
-    notes.check_faces(elements["face"].count if "face" in elements else 0)
-    body = data[end.end() :]
-    at = 0
-    cells = (
-        np.frombuffer(body, np.uint8)
-        if order
-        else numbers_in(body, np.float64).view(np.uint8)
-    )
-    for element in elements.values():
-        at = _fill(notes, element, cells, at, b"" if order else body)
-    return elements, comments
+    return elements, comments, order
 
 
 def _fill(
-    notes: Notes, element: Element, cells: npt.NDArray[np.uint8], at: int, text: bytes
+    notes: Notes,
+    element: Element,
+    cells: npt.NDArray[np.uint8],
+    position: int,
+    text: bytes,
 ) -> int:
-    """Read the rows of an element that begin at a byte; return the byte after them. The
-    bytes of a file in ASCII, whose `text` is given, are those of its numbers, float64
-    each.
+    """Read the rows of an element, and return the position of the byte after them.
+
+    Args:
+        notes: about the file.
+        element: its values are filled in.
+        cells: the bytes of the file's body; of an ASCII file, those of its numbers as
+            float64.
+        position: the byte at which the element begins.
+        text: the body of an ASCII file, for messages; empty for a binary file.
+
+    Raises:
+        FileFormatError: the file ends early, or has a list of an impossible length.
     """
 
-    def from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
+    def view_from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
+        """Return the numbers of a type that begin at each byte."""
         kind = np.dtype(np.float64) if text else kind
-        numbers: Numbers = np.ndarray(
-            (max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,)
-        )
+        n_starts = max(0, len(cells) - kind.itemsize + 1)
+        numbers: Numbers = np.ndarray((n_starts,), kind, cells, 0, (1,))
         return numbers
 
-    values = {name: from_any_byte(kind) for name, kind in element.types.items()}
-    counts = {name: from_any_byte(kind) for name, kind in element.lists.items()}
+    values = {name: view_from_any_byte(kind) for name, kind in element.types.items()}
+    counts = {name: view_from_any_byte(kind) for name, kind in element.lists.items()}
+    # Bytes of a scalar, or of the count of a list.
     widths = {
         name: counts.get(name, numbers).itemsize for name, numbers in values.items()
     }
-    most = len(cells) // (8 if text else 1)  # values of a list
 
-    def check(after: int) -> None:
-        if after > len(cells):
-            odd = next(
-                (word for word in map(text_of, text.split()) if not is_number(word)),
-                None,
-            )
-            got = (
-                "fewer; the file is cut short"
-                if odd is None
-                else f"{shown(odd)} among their numbers"
-            )
-            raise notes.damaged(
-                f"{element.count:,} rows of {shown(element.name)}, as "
-                "the PLY header says",
-                got,
-            )
+    def check_end(end: int) -> None:
+        if end > len(cells):
+            raise _too_short(notes, element, text)
 
-    def rows(count: int) -> tuple[dict[str, Ints], int]:
-        """Go through rows one by one; return the bytes at which each property begins,
-        and the byte after them.
+    def walk_rows(n_rows: int) -> tuple[dict[str, Ints], int]:
+        """Walk through rows one by one.
+
+        Returns:
+            The bytes at which each property begins, (n_rows,), and the end of all.
         """
-        places = {name: list[int]() for name in widths}
-        place = at
-        steps = [
-            (places[name].append, widths[name], counts.get(name), values[name].itemsize)
-            for name in widths
-        ]
-        for _ in range(count):
-            for note, width, counted, size in steps:
-                note(place)
-                check(place + width)
-                if counted is not None:
-                    number = counted.item(place)
-                    if not 0 <= number <= most:
-                        what = f"lists in the PLY element {shown(element.name)}"
-                        raise notes.damaged(what, f"one of {number:g} values")
-                    place += size * int(number)
-                place += width
-        check(place)
-        return {
-            name: np.array(begins, dtype=np.int64) for name, begins in places.items()
-        }, place
+        starts = {name: list[int]() for name in widths}
+        byte = position
+        max_length = len(cells) // (8 if text else 1)
+        for _ in range(n_rows):
+            for name, width in widths.items():
+                starts[name].append(byte)
+                check_end(byte + width)
+                if name in counts:
+                    length = counts[name].item(byte)
+                    if not 0 <= length <= max_length:
+                        expected = f"lists in the PLY element {shown(element.name)}"
+                        raise notes.damaged(expected, f"one of {length:g} values")
+                    byte += values[name].itemsize * int(length)
+                byte += width
+        check_end(byte)
+        arrays = {
+            name: np.array(positions, dtype=np.int64)
+            for name, positions in starts.items()
+        }
+        return arrays, byte
 
     if not element.count or not widths:
-        return at
-    check(at + element.count * sum(widths.values()))
-    places, after = rows(1)
-    end = at + (after - at) * element.count
-    steps = (after - at) * np.arange(element.count)
-    places = {name: first + steps for name, first in places.items()}
-    if end > len(cells) or any(
-        np.ptp(numbers[places[name]]) != 0 for name, numbers in counts.items()
-    ):
-        places, end = rows(element.count)  # the lists differ in length
-    for name, begins in places.items():
-        if name not in counts:
-            element.scalars[name] = values[name][begins]
-            continue
-        sizes = counts[name][begins].astype(np.int64)
-        skipped = np.arange(int(sizes.sum())) - np.repeat(
-            np.cumsum(sizes) - sizes, sizes
-        )
-        inside = (
-            np.repeat(begins + widths[name], sizes) + values[name].itemsize * skipped
-        )
-        element.listed[name] = Lists(sizes, values[name][inside])
+        return position
+    check_end(position + element.count * sum(widths.values()))
+    # All rows are assumed to be as long as the first.
+    first_starts, first_end = walk_rows(1)
+    row_size = first_end - position
+    end = position + row_size * element.count
+    row_offsets = row_size * np.arange(element.count)
+    starts = {name: start + row_offsets for name, start in first_starts.items()}
+    lists_differ = end > len(cells) or any(
+        np.ptp(numbers[starts[name]]) != 0 for name, numbers in counts.items()
+    )
+    if lists_differ:
+        starts, end = walk_rows(element.count)
+    for name, property_starts in starts.items():
+        if name in counts:
+            lengths = counts[name][property_starts].astype(np.int64)
+            first_values = property_starts + widths[name]
+            element.listed[name] = _gather_lists(values[name], first_values, lengths)
+        else:
+            element.scalars[name] = values[name][property_starts]
     return end
+
+
+def _gather_lists(values: Numbers, first_values: Ints, lengths: Ints) -> Lists:
+    """Return the lists whose first values are at some bytes, (N,), with lengths (N,).
+
+    `values` are the numbers that begin at each byte.
+    """
+    list_starts = np.cumsum(lengths) - lengths
+    index_in_list = np.arange(int(lengths.sum())) - np.repeat(list_starts, lengths)
+    value_bytes = np.repeat(first_values, lengths) + values.itemsize * index_in_list
+    return Lists(lengths, values[value_bytes])
+
+
+def _too_short(notes: Notes, element: Element, text: bytes) -> FileFormatError:
+    """Return the error for a file that ends within an element."""
+    words = map(text_of, text.split())
+    odd_word = next((word for word in words if not is_number(word)), None)
+    got = "fewer; the file is cut short"
+    if odd_word is not None:
+        got = f"{shown(odd_word)} among their numbers"
+    return notes.damaged(
+        f"{element.count:,} rows of {shown(element.name)}, as the PLY header says",
+        got,
+    )
 
 
 COLORS = (
@@ -252,13 +289,16 @@ MAPPED = (
 )
 WEDGES = ("texcoord", "texcoords", "texture_coordinates")
 CORNERS = ("vertex_indices", "vertex_index", "vertex_indexes")
-"""Names of properties that mean the same, in the order in which they are looked for."""
+"""Names of properties with the same meaning, in the order in which they are tried."""
 _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 
 
 def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read a PLY file as one part for each texture. Raises FileFormatError: it is
-    damaged, refers to vertices that are not there, or has no faces.
+    """Read a PLY file as one part for each texture.
+
+    Raises:
+        FileFormatError: the file is corrupt, refers to vertices that are not there, or
+            has no faces.
     """
     elements, comments = read_elements(data, notes)
     reader = _Properties(elements, notes)
@@ -272,41 +312,60 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
                 f"splats, a model that {SPLATS}"
             )
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
-    corner, counts = reader.polygons(len(points))
-    triangles, face = cut_up(points[corner], counts, notes)
-    at = corner[triangles]
+    return _make_parts(reader, points, _texture_names(comments))
+
+
+def _make_parts(
+    reader: _Properties, points: Doubles, texture_names: Sequence[str]
+) -> list[ImportedPart]:
+    """Return the faces of a file as parts, given its points (N, 3) and textures."""
+    notes = reader.notes
+    corners, corner_counts = reader.polygons(len(points))
+    triangles, polygon = cut_up(points[corners], corner_counts, notes)
+    position = Looked(points, corners[triangles])
     normals = reader.columns("vertex", (("nx", "ny", "nz"),))
-    uvs = reader.mapped(corner, counts, triangles)
-    names = [
-        match[1].strip()
-        for comment in comments
-        if (match := _TEXTURE.match(comment)) and match[1].strip()
+    normal = None if normals is None else Looked(normals, position.at)
+    uvs = reader.mapped(corners, corner_counts, triangles)
+    texture = reader.texture_numbers(texture_names, corners, corner_counts)[polygon]
+    colors = reader.colors(position.at, polygon)
+    # Index -1, of faces without texture, is the last surface.
+    surfaces = [
+        *reader.textures(texture_names, plain=colors is None),
+        ImportedSurface(),
     ]
-    number = reader.texture_numbers(names, corner, counts)[face]
-    tint = reader.colors(at, face)
-    surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
     parts = list[ImportedPart]()
-    mapped = np.full((len(at), 3), -1) if uvs is None else uvs.at
-    for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
-        surface = surfaces[number[chosen[0]]]
-        colors = tint
-        if tint is not None and surface.texture is not None:
-            if tint[chosen].min() < 1.0:
+    has_uvs = np.zeros(len(triangles), np.bool_)
+    if uvs is not None:
+        has_uvs = np.asarray((uvs.at >= 0).all(axis=1))
+    for group in alike(texture, has_uvs):
+        surface = surfaces[texture[group[0]]]
+        tint = colors
+        if colors is not None and surface.texture is not None:
+            if colors[group].min() < 1.0:
                 notes.say(
                     "colours of vertices or faces are left out where there is a texture"
                 )
-            colors = None
-        elif tint is not None:
+            tint = None
+        elif colors is not None:
             surface = ImportedSurface(color=np.ones(3, np.float32))
-        shading = None if normals is None else Looked(normals, at)
-        parts.append(
-            split_at_corners(chosen, Looked(points, at), shading, uvs, colors, surface)
-        )
+        parts.append(split_at_corners(group, position, normal, uvs, tint, surface))
     return parts
+
+
+def _texture_names(comments: Sequence[str]) -> list[str]:
+    """Return the names of textures in comments, as MeshLab writes them."""
+    names = []
+    for comment in comments:
+        match = _TEXTURE.match(comment)
+        if match and match[1].strip():
+            names.append(match[1].strip())
+    return names
 
 
 @dataclass
 class _Properties:
+    """Reads the properties of elements by the names that programs give them."""
+
     elements: dict[str, Element]
     notes: Notes
 
@@ -320,69 +379,84 @@ class _Properties:
 
     @property
     def has_splats(self) -> bool:
-        """Whether vertices are Gaussian splats: as 3D Gaussian Splatting writes them,
-        or packed by PlayCanvas.
-        """
-        has = self.elements["vertex"].scalars if "vertex" in self.elements else {}
-        return "f_dc_0" in has or "packed_position" in has
+        """Whether vertices are Gaussian splats, plain or packed by PlayCanvas."""
+        properties: Mapping[str, Numbers] = {}
+        if "vertex" in self.elements:
+            properties = self.elements["vertex"].scalars
+        return "f_dc_0" in properties or "packed_position" in properties
 
     def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
-        """Return the values (N, C) of the first of several groups of properties that an
-        element has; None for none.
-        """
-        group = self._known(element, "scalars", *names)
-        columns = [
-            self.elements[element].scalars[name].astype(np.float64) for name in group
-        ]
-        return np.stack(columns, axis=1) if columns else None
+        """Return the values (N, C) of the first group of properties that is there.
 
-    def _list(self, element: str, names: Sequence[str]) -> Lists | None:
-        group = self._known(element, "listed", *((name,) for name in names))
+        Args:
+            element: name of the element.
+            names: groups of C properties each.
+
+        Returns:
+            The values as float64, or None if the element has none of the groups.
+        """
+        group = self._find_group(element, "scalars", *names)
+        if not group:
+            return None
+        scalars = self.elements[element].scalars
+        return np.stack([scalars[name].astype(np.float64) for name in group], axis=1)
+
+    def _find_list(self, element: str, names: Sequence[str]) -> Lists | None:
+        """Return the first of several list properties that an element has, or None."""
+        group = self._find_group(element, "listed", *((name,) for name in names))
         return self.elements[element].listed[group[0]] if group else None
 
-    def _known(
+    def _find_group(
         self, element: str, table: str, *groups: tuple[str, ...]
     ) -> tuple[str, ...]:
-        """Take the first of several groups of properties that an element has, and
-        return it; () for none.
+        """Return the first group of properties that an element has, () if it has none.
+
+        The properties count as read. `table` is "scalars" or "listed".
         """
-        has = getattr(self.elements.get(element), table, {})
-        group = next(
-            (group for group in groups if all(name in has for name in group)), ()
-        )
-        for name in group:
-            self.notes.take(f"{element} property", name)
-        return group
+        properties = getattr(self.elements.get(element), table, {})
+        for group in groups:
+            if all(name in properties for name in group):
+                for name in group:
+                    self.notes.take(f"{element} property", name)
+                return group
+        return ()
 
     def polygons(self, points: int) -> tuple[Ints, Ints]:
-        """Return the vertices (C,) of the corners of all polygons, and how many corners
-        each has, (P,); those of faces come first, then the triangles of strips. Raises
-        FileFormatError: there are none, one has too many or too few corners, or refers
-        to what is not there.
+        """Return the polygons of the file: its faces, then the triangles of strips.
+
+        Args:
+            points: how many vertices there are.
+
+        Returns:
+            The vertices (C,) of the corners of all polygons, concatenated, and the
+            number of corners of each, (P,).
+
+        Raises:
+            FileFormatError: there are none, one has too many or too few corners, or
+                refers to what is not there.
         """
-        table = self.elements.get("face")
-        names = (
-            CORNERS
-            if table is None
-            else (*CORNERS, *(name for name in table.listed if name not in WEDGES))
-        )
-        faces = self._list("face", names)
-        strips = self._list("tristrips", CORNERS)
+        face_element = self.elements.get("face")
+        names: tuple[str, ...] = CORNERS
+        if face_element is not None:
+            others = [name for name in face_element.listed if name not in WEDGES]
+            names = (*CORNERS, *others)
+        faces = self._find_list("face", names)
+        strips = self._find_list("tristrips", CORNERS)
         corners = np.zeros(0, np.int64)
         counts = np.zeros(0, np.int64)
         if faces is not None:
-            corners = _whole(faces.values)
+            corners = _to_integers(faces.values)
             counts = faces.counts
         if strips is not None:
-            triangles = _of_strips(_whole(strips.values), strips.counts)
+            triangles = _of_strips(_to_integers(strips.values), strips.counts)
             corners = np.concatenate([corners, triangles.reshape(-1)])
             counts = np.concatenate([counts, np.full(len(triangles), 3)])
         if (counts < 3).all():
-            what = "points or lines only; export triangles"
+            got = "points or lines only; export triangles"
             if self.has_splats:
-                what = f"Gaussian splats, a model that {SPLATS}"
+                got = f"Gaussian splats, a model that {SPLATS}"
             raise FileFormatError(
-                f"{self.notes.path}: expected a mesh with faces, got {what}"
+                f"{self.notes.path}: expected a mesh with faces, got {got}"
             )
         self.notes.check_most(
             int(counts.max()), MOST_CORNERS, "faces with at most {} corners"
@@ -396,168 +470,187 @@ class _Properties:
         return corners, counts
 
     def mapped(self, corner: Ints, counts: Ints, triangles: Ints) -> Looked | None:
-        """Return the texture coordinates of triangles, kept with the corners of faces,
-        or else with vertices.
+        """Return the texture coordinates of triangles, or None if there are none.
+
+        Files store them with the corners of faces (wedges), or else with vertices.
+
+        Args:
+            corner: (C,) the vertex of each corner of the polygons.
+            counts: (P,) how many corners each polygon has.
+            triangles: (T, 3) corners.
         """
-        wedges = self._list("face", WEDGES)
+        wedges = self._find_list("face", WEDGES)
         if wedges is None or not wedges.counts.any():
-            values = self.columns("vertex", MAPPED)
-            return None if values is None else Looked(values, corner[triangles])
-        padded = np.zeros(len(counts), np.int64)
-        padded[: len(wedges.counts)] = wedges.counts
-        whole = padded == 2 * counts
-        if not whole[padded > 0].all():
+            vertex_uvs = self.columns("vertex", MAPPED)
+            if vertex_uvs is None:
+                return None
+            return Looked(vertex_uvs, corner[triangles])
+        # Triangles of strips have no wedges.
+        wedge_counts = np.zeros(len(counts), np.int64)
+        wedge_counts[: len(wedges.counts)] = wedges.counts
+        is_mapped = wedge_counts == 2 * counts
+        if not is_mapped[wedge_counts > 0].all():
             self.notes.say(
                 "texture coordinates of faces that are not two for each "
                 "corner are left out"
             )
-        used = (
-            wedges.values[np.repeat(whole[: len(wedges.counts)], wedges.counts)]
-            .astype(np.float64)
-            .reshape(-1, 2)
+        is_used = np.repeat(is_mapped[: len(wedges.counts)], wedges.counts)
+        used = wedges.values[is_used].astype(np.float64).reshape(-1, 2)
+        # Equal pairs become one; as complex numbers they are compared as a whole.
+        distinct, index_of_pair = np.unique(
+            used.view(np.complex128), return_inverse=True
         )
-        values, same = np.unique(used.view(np.complex128), return_inverse=True)
         index = np.full(len(corner), -1)
-        index[np.repeat(whole, counts)] = same.reshape(-1)
-        return Looked(values.view(np.float64).reshape(-1, 2), index[triangles])
+        index[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
+        return Looked(distinct.view(np.float64).reshape(-1, 2), index[triangles])
 
     def colors(self, at: Ints, face: Ints) -> Doubles | None:
-        """Return the linear colours (T, 3, 3) of the corners of triangles, or None:
-        those of vertices, unless these are all the same and those of faces are not.
+        """Return the linear colors (T, 3, 3) of the corners of triangles, or None.
+
+        Those of vertices are used, unless these are all the same and those of faces are
+        not.
+
+        Args:
+            at: (T, 3) vertices of the triangles.
+            face: (T,) polygon of each triangle.
         """
-        channels = {}
-        for element, index in (("vertex", at), ("face", face)):
-            values = self.columns(element, COLORS)
-            if values is None:
-                continue
-            table = self.elements[element]
-            kind = table.types[self._known(element, "scalars", *COLORS)[0]]
-            for name in set(ALPHAS) & set(table.scalars):
-                alphas = table.scalars[name].astype(np.float64)
-                if not len(alphas) or alphas.min() >= _scale(alphas[:, None], kind):
-                    self.notes.take(f"{element} property", name)
-            linear = srgb_to_linear(
-                np.clip(np.nan_to_num(values / _scale(values, kind)), 0.0, 1.0).astype(
-                    np.float32
-                )
-            )
-            # of strips
-            padded = np.concatenate(
-                [linear, srgb_to_linear(np.full((1, 3), NEUTRAL, np.float32))]
-            )
-            colors = padded[np.minimum(index, len(linear))].astype(np.float64)
-            channels[element] = (
-                colors if element == "vertex" else np.repeat(colors[:, None], 3, axis=1)
-            )
-        if len(channels) < 2:
-            return next(iter(channels.values()), None)
-        better, other = (
-            ("face", "vertices")
-            if np.ptp(channels["vertex"]) == 0.0
-            else ("vertex", "faces")
-        )
-        has = "faces" if better == "face" else "vertices"
-        self.notes.say(f"colours of {other} are left out: its {has} have some, too")
-        return channels[better]
+        vertex_colors = self._element_colors("vertex", at)
+        face_colors = self._element_colors("face", face)
+        if face_colors is not None:
+            face_colors = np.repeat(face_colors[:, None], 3, axis=1)
+        if vertex_colors is None or face_colors is None:
+            return face_colors if vertex_colors is None else vertex_colors
+        if np.ptp(vertex_colors) == 0.0:
+            self.notes.say("colours of vertices are left out: its faces have some, too")
+            return face_colors
+        self.notes.say("colours of faces are left out: its vertices have some, too")
+        return vertex_colors
+
+    def _element_colors(self, element: str, index: Ints) -> Doubles | None:
+        """Return the linear colors (..., 3) of rows of an element, or None."""
+        values = self.columns(element, COLORS)
+        if values is None:
+            return None
+        table = self.elements[element]
+        kind = table.types[self._find_group(element, "scalars", *COLORS)[0]]
+        for name in set(ALPHAS) & set(table.scalars):
+            alphas = table.scalars[name].astype(np.float64)
+            is_opaque = not len(alphas) or alphas.min() >= _scale(alphas[:, None], kind)
+            if is_opaque:
+                self.notes.take(f"{element} property", name)
+        display = np.clip(np.nan_to_num(values / _scale(values, kind)), 0.0, 1.0)
+        linear = srgb_to_linear(display.astype(np.float32))
+        # Triangles of strips have no row: they are neutral grey.
+        neutral = srgb_to_linear(np.full((1, 3), NEUTRAL, np.float32))
+        padded = np.concatenate([linear, neutral])
+        return padded[np.minimum(index, len(linear))].astype(np.float64)
 
     def texture_numbers(self, names: Sequence[str], corner: Ints, counts: Ints) -> Ints:
-        """Return the number (P,) of each polygon's texture among several; -1 for
-        none.
+        """Return the index of each polygon's texture, (P,); -1 for none.
+
+        Args:
+            names: the textures of the file.
+            corner: (C,) the vertex of each corner of the polygons.
+            counts: (P,) how many corners each polygon has.
         """
-        number = np.full(len(counts), -1)
+        texture = np.full(len(counts), -1)
         if not names:
-            return number
-        has = next(
-            (
-                kind
-                for kind in ("face", "vertex")
-                if self._known(kind, "scalars", ("texnumber",))
-            ),
-            None,
-        )
-        if has is None:
+            return texture
+        element = None
+        for candidate in ("face", "vertex"):
+            if self._find_group(candidate, "scalars", ("texnumber",)):
+                element = candidate
+                break
+        if element is None:
             if len(names) > 1:
                 only = f"of its {len(names)} textures only {shown(names[0])} is used"
                 self.notes.say(f"{only}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
-        numbers = _whole(self.elements[has].scalars["texnumber"])
-        if has == "face":
-            number[: len(numbers)] = numbers
+        numbers = _to_integers(self.elements[element].scalars["texnumber"])
+        if element == "face":
+            texture[: len(numbers)] = numbers
         else:
-            number = numbers[
-                corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]
-            ]
-        if wrong := int(((number < -1) | (number >= len(names))).sum()):
+            first_corner = np.cumsum(counts) - counts
+            texture = numbers[corner[np.minimum(first_corner, len(corner) - 1)]]
+        n_wrong = int(((texture < -1) | (texture >= len(names))).sum())
+        if n_wrong:
             self.notes.say(
-                f"{wrong:,} faces have a texnumber of a texture that it "
+                f"{n_wrong:,} faces have a texnumber of a texture that it "
                 "does not name; they have none"
             )
-        return np.where((number >= 0) & (number < len(names)), number, -1)
+        return np.where((texture >= 0) & (texture < len(names)), texture, -1)
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
-        """Return the surface of each texture; `plain` tells that there are no colours
-        beside them.
+        """Return the surface of each texture.
+
+        `plain` is whether the file has no colors that could replace a texture.
         """
         pictures = FilePictures(
             len(names), References(Path(self.notes.path)), self.notes
         )
         surfaces = {}
-        instead = (
-            "neutral grey is" if plain else ("the colours of its vertices or faces are")
-        )
+        substitute = "the colours of its vertices or faces are"
+        if plain:
+            substitute = "neutral grey is"
         for name in dict.fromkeys(names):
             words = (
-                f" names the texture {{name}}, which {{why}}; {instead} used instead"
+                f" names the texture {{name}}, which {{why}}; {substitute} used instead"
             )
-            picture = pictures.of_file(name, "colours and alpha", words)
-            if picture is not None and picture[:, :, 3].min() < 1.0:
-                self.notes.say(f"the alpha of {shown(name)} is left out")
-            texture = (
-                None if picture is None else np.ascontiguousarray(picture[:, :, :3])
-            )
+            texture = pictures.of_file(name, "colours and alpha", words)
+            if texture is not None:
+                if texture[:, :, 3].min() < 1.0:
+                    self.notes.say(f"the alpha of {shown(name)} is left out")
+                texture = np.ascontiguousarray(texture[:, :, :3])
             surfaces[name] = ImportedSurface(texture=texture, name=name)
         return [surfaces[name] for name in names]
 
 
-def _whole(values: npt.NDArray[np.generic]) -> Ints:
+def _to_integers(values: npt.NDArray[np.generic]) -> Ints:
+    """Return values as integers; floats that hold none become -1."""
     if values.dtype.kind == "f":
-        values = np.where(
-            np.abs(values.astype(np.float64)) < 2.0**53, values.astype(np.float64), -1.0
-        )
+        numbers = values.astype(np.float64)
+        values = np.where(np.abs(numbers) < 2.0**53, numbers, -1.0)
     return values.astype(np.int64)
 
 
 def _scale(values: Doubles, kind: np.dtype[np.generic]) -> float:
-    """Return what full brightness is in colours of a type: 1 for floats, unless they
-    are those of bytes.
+    """Return the value of full brightness in colors (N, C) of a type.
+
+    It is 1 for floats, unless they are clearly in [0, 255].
     """
-    most = float(np.nan_to_num(values).max(initial=0.0))
+    largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":
-        return 1.0 if most <= 2.0 else 255.0
-    if kind.itemsize == 1 or (kind.itemsize > 2 and most <= 255.0):
+        return 1.0 if largest <= 2.0 else 255.0
+    if kind.itemsize == 1 or (kind.itemsize > 2 and largest <= 255.0):
         return 255.0
-    return (
-        65535.0
-        if kind.itemsize == 2 or most <= 65535.0
-        else 2.0 ** (8 * kind.itemsize - (kind.kind == "i")) - 1.0
-    )
+    if kind.itemsize == 2 or largest <= 65535.0:
+        return 65535.0
+    is_signed = kind.kind == "i"
+    return 2.0 ** (8 * kind.itemsize - is_signed) - 1.0
 
 
 def _of_strips(vertices: Ints, counts: Ints) -> Ints:
-    """Return the triangles (T, 3) of strips; -1 begins a strip anew, and every second
-    triangle is wound backwards.
+    """Return the triangles (T, 3) of triangle strips.
+
+    Every second triangle of a strip is wound backwards, and vertex -1 starts a new
+    strip.
+
+    Args:
+        vertices: those of all strips, concatenated.
+        counts: (S,) how many vertices each strip has.
     """
     begins = np.zeros(len(vertices) + 1, dtype=np.bool_)
     begins[np.cumsum(counts) - counts] = True
     begins[1:][vertices < 0] = True
-    place = np.arange(len(vertices)) - np.maximum.accumulate(
-        np.where(begins[:-1], np.arange(len(vertices)), 0)
-    )
-    last = np.flatnonzero((place >= 2) & (vertices >= 0))
+    index = np.arange(len(vertices))
+    strip_start = np.maximum.accumulate(np.where(begins[:-1], index, 0))
+    position = index - strip_start
+    last = np.flatnonzero((position >= 2) & (vertices >= 0))
     triangles: Ints = np.stack(
         [vertices[last - 2], vertices[last - 1], vertices[last]], axis=1
     )
-    odd = place[last] % 2 == 1
-    triangles[odd] = triangles[odd][:, [1, 0, 2]]
+    is_odd = position[last] % 2 == 1
+    triangles[is_odd] = triangles[is_odd][:, [1, 0, 2]]
     a, b, c = triangles.T
-    return np.asarray(triangles[(a != b) & (b != c) & (a != c)])
+    is_degenerate = (a == b) | (b == c) | (a == c)
+    return np.asarray(triangles[~is_degenerate])

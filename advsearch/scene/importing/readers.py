@@ -1,6 +1,6 @@
 """Readers of mesh files by suffix, and converters of other files to glTF.
 
-A package outside adds its own reader (docs/extending.md).
+External packages may add readers (docs/extending.md).
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from advsearch.scene.importing.files import Notes, read_bytes
 from advsearch.scene.importing.parts import ImportedPart
 
 Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
-"""From a file, its content and what is said of it to its parts that have faces; raises
-as `objects.read_parts`.
+"""Returns the parts with faces of a file, given its path, content and notes.
+
+It raises as `objects.read_parts`.
 """
 
 READERS: Registry[Reader] = Registry(
@@ -24,24 +25,20 @@ READERS: Registry[Reader] = Registry(
     "a function (path, data, notes) that returns a list of ImportedPart",
     lambda name, entry: callable(entry) and name == name.lower(),
 )
-"""Readers by the suffix of their files, in lower case without the dot; imported when
-they are used.
-"""
+"""Readers by suffix, in lower case without the dot; imported on first use."""
 
 _CONVERTERS = list_built_ins("converter")
 _READ_AS_GLTF = ("glb", "gltf", "vrm", *_CONVERTERS)
 GLTF = tuple(
     f".{name}" for name in _READ_AS_GLTF if name in (*READERS.own, *_CONVERTERS)
 )
-"""Suffixes of glTF files, which have conventions of their own: y up, linear colours;
-and of what is read as glTF.
+"""Suffixes of glTF files and of files that are converted to it: y is up, and vertex colors
+are linear.
 """
 
 
 def list_suffixes() -> tuple[str, ...]:
-    """Return the suffixes of the files that an object can be read from, those of
-    installed packages last.
-    """
+    """Return the suffixes of mesh files, those of external packages last."""
     installed = [name for name in READERS if name not in READERS.own]
     return tuple(f".{name}" for name in (*READERS.own, *_CONVERTERS, *installed))
 
@@ -53,8 +50,7 @@ def get_reader(suffix: str) -> Reader:
 
 
 def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
-    """Return the content of a mesh or scene file; of one that is converted, such as a
-    Blender file, as binary glTF.
+    """Return the content of a mesh or scene file, converted to binary glTF if needed.
 
     Raises:
         FileFormatError: as for `read_bytes`; or the file cannot be converted.

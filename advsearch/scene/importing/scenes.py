@@ -1,9 +1,8 @@
-"""Scenes from glTF files: ``--object scene.glb#chair`` takes one node as the object and
-the rest as its surroundings.
+"""Scenes from glTF files: one node as the object, the rest as its surroundings.
 
-Lengths are in object sizes, so everything is moved and scaled with the object: its
-largest extent is 1, it stands on z = 0, and z is up. The axis of the file that its
-format calls the front of an asset is +x.
+``--object scene.glb#chair`` selects the node. Lengths are in object sizes, so everything
+is moved and scaled with the object: its largest extent is 1, it stands on z = 0, and z
+is up. The axis of the file that its format calls the front of an asset is +x.
 """
 
 from __future__ import annotations
@@ -18,7 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, ObjectAsset, face_vectors, footing
+from advsearch.scene.assets import (
+    Doubles,
+    FileAxis,
+    ObjectAsset,
+    face_vectors,
+    footing,
+)
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Names, clean, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT, compute_turn
@@ -42,18 +47,19 @@ from advsearch.scene.parts import (
 from advsearch.scene.skeleton import with_above
 
 BEHIND = np.diag([-1.0, 1.0, -1.0])
-"""Cameras of glTF look along -z with +x to the right; ours along +z with +x to the
-left.
+"""Rotation (3, 3) between the axes of cameras: glTF's look along -z with +x to the
+right, ours along +z with +x to the left.
 """
-MITSUBA_FILE = ".xml"  # ending of Mitsuba's scenes
+MITSUBA_FILE = ".xml"  # suffix of Mitsuba's scenes
 LUMENS = 683.0
-"""Lumens of a watt: the eye's at 555 nm. Blender's exporter multiplies the power of
-lights by it, and no emission.
+"""Lumens of a watt, at 555 nm. Blender's exporter multiplies the power of lights by it,
+but no emission.
 """
-# distance of a light or camera in object sizes, and radiant intensity of a light
+# Limit of the distance of a light or camera in object sizes, and of the radiant
+# intensity of a light.
 FURTHEST = 1e12
-SQUARE = 1e-3  # cosine of the angle between two axes of a camera, at most
-# field of view of a camera along the larger side of its picture, degrees
+SQUARE = 1e-3  # largest cosine of the angle between two axes of a camera
+# Largest field of view of a camera along the larger side of its image, degrees.
 WIDEST_VIEW = 170.0
 MOST_SURROUNDINGS = 200  # meshes and lamps around an object
 TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
@@ -61,158 +67,182 @@ TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
 
 @dataclass(frozen=True, eq=False)
 class ImportedScene:
-    """What a file holds."""
+    """The content of a scene file."""
 
-    object: ObjectAsset  # the node that was asked for, with all that hangs on it
-    surroundings: tuple[ScenePart, ...] = ()  # meshes and lamps beside it
+    object: ObjectAsset  # the requested node, with all its descendants
+    surroundings: tuple[ScenePart, ...] = ()  # the other meshes, and lamps
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)  # by name
 
 
 def split_node(spec: str) -> tuple[str, str | None]:
-    """Return the file and the node of ``scene.glb#chair``; None where no node is
-    named.
-    """
-    endings = "|".join(map(re.escape, (*GLTF, MITSUBA_FILE)))
-    found = re.fullmatch(rf"(.+({endings}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
-    return (found[1], found[3]) if found and not os.path.exists(spec) else (spec, None)
+    """Split ``scene.glb#chair`` into the file and the node, None if none is named."""
+    suffixes = "|".join(map(re.escape, (*GLTF, MITSUBA_FILE)))
+    match = re.fullmatch(rf"(.+({suffixes}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
+    if match is None or os.path.exists(spec):
+        return spec, None
+    return match[1], match[3]
 
 
-@np.errstate(all="ignore")  # what is out of range is refused
+@np.errstate(all="ignore")  # values out of range are rejected
 def import_scene(path: Path, node: str) -> ImportedScene:
-    """Read a scene from a .glb or .gltf file, with the node of that name as the object:
-    or of that mesh, where a node has no name; "node 3" is the one with that number.
+    """Read a scene from a glTF file, with one node as the object.
 
-    The object is repaired, normalised and textured as `import_object` does it; so is
-    every other node with a mesh, which stays in its place beside it. Point and spot
-    lights of KHR_lights_punctual become lamps, directional ones distant lamps;
-    perspective cameras are kept by name. What is not carried over is among the object's
-    warnings. Raises UnknownNameError: no node of that name has a mesh, or one below it.
-    Raises FileFormatError: as for `import_object`. Raises InputError: as for
-    `import_object`; several nodes have the name; or there is too much beside the
-    object.
+    The object is repaired, normalised and textured as by `import_object`; so is every
+    other node with a mesh, which stays in its position around it. Point and spot lights
+    of KHR_lights_punctual become lamps, directional ones distant lamps; perspective
+    cameras are kept by name. The object's warnings name what is not imported.
+
+    Args:
+        path: the .glb or .gltf file.
+        node: name of the node, or of its mesh if the node has no name; "node 3" is the
+            node with that index.
+
+    Raises:
+        UnknownNameError: no node of that name has a mesh, or one below it.
+        FileFormatError: as for `import_object`.
+        InputError: as for `import_object`; or several nodes have the name; or there are
+            too many other meshes and lights.
     """
     data = read_mesh_bytes(path, "scene", GLTF)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
-    places = dict(poses(header))
-    labels = {
-        index: header.label(index)
-        for index in sorted(with_above(header.parents, {part.node for part in parts}))
+    node_poses = dict(poses(header))
+    object_nodes = header.below([_find_node(path, header, parts, node)])
+    object_parts = [part for part in parts if part.node in object_nodes]
+    lights = {
+        index: header.lights[light_index]
+        for index in node_poses
+        if (light_index := header.nodes[index].lamp) is not None
     }
-    same = [
-        index for index, label in labels.items() if node in (label, f"node {index}")
-    ]
-    if not same:
-        raise UnknownNameError(
-            f"node of {path.name}", node, list(dict.fromkeys(labels.values()))
-        )
-    if len(same) > 1:
-        numbers = ", ".join(f"{path.name}#node {index}" for index in same[:10])
-        raise InputError(
-            f"{path}: {len(same)} nodes are called {shown(node)}; say which: {numbers}"
-        )
-    chosen = header.below(same)
-    chosen_parts = [part for part in parts if part.node in chosen]
-    others = sorted({part.node for part in parts} - chosen)
-    lamps = {
-        index: header.lights[lamp]
-        for index in places
-        if (lamp := header.nodes[index].lamp) is not None
-    }
-    if (count := len(others) + len(lamps)) > MOST_SURROUNDINGS:
-        most = f"at most {MOST_SURROUNDINGS} meshes and lights beside the object"
-        raise InputError(
-            f"{path}: expected {most}, got {count}; join some of them in the file"
-        )
+    n_others = len({part.node for part in parts} - object_nodes)
+    _check_surroundings(path, n_others + len(lights))
     front = find_front(path, header)
     turn = compute_turn("y", front.axis)
-    frame = _frame(chosen_parts, turn)
+    frame = _frame(object_parts, turn)
     names = Names(TAKEN)
-    called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
-    for number in others:
-        group = [part for part in parts if part.node == number]
-        place = _frame(group, turn)
-        shape = object_of(group, [], path, called[number], "y", front)
-        notes.extend(shape.warnings)
-        matrix = np.eye(4)
-        matrix[:3, :3] *= place.size / frame.size
-        matrix[:3, 3] = frame.inside(place.origin)
-        surroundings.append(mesh_part(shape.name, shape, matrix, shape.material))
-    unit = 1.0  # a light of USD emits radiance as its surfaces do
-    why = ""
-    if header.asset.generator != GENERATOR:
-        unit, why = _unit_of_light(
-            header,
-            bool(lamps) and any(part.surface.emission is not None for part in parts),
-        )
-    notes.extend([f"{path.name}: {why}"] if why else [])
-    for index, light in lamps.items():
+    for index, name in _mesh_names(header, parts, names).items():
+        if index not in object_nodes:
+            node_parts = [part for part in parts if part.node == index]
+            part, warnings = _surrounding_mesh(path, name, node_parts, front, frame)
+            surroundings.append(part)
+            notes.extend(warnings)
+    candela, reason = _unit_of_light(header, parts, bool(lights))
+    notes.extend([f"{path.name}: {reason}"] if reason else [])
+    for index, light in lights.items():
         name = names.free(light.name or header.label(index))
-        surroundings.append(_lamp(path, name, light, unit, places[index], frame))
-    cameras = {
-        name: _camera(
-            path,
-            name,
-            header.cameras[header.nodes[index].camera or 0],
-            places[index],
-            frame,
-        )
-        for index, name in _camera_names(header, places).items()
-    }
+        surroundings.append(_lamp(path, name, light, candela, node_poses[index], frame))
+    cameras = {}
+    for index, name in _camera_names(header, node_poses).items():
+        camera = header.cameras[header.nodes[index].camera or 0]
+        cameras[name] = _camera(path, name, camera, node_poses[index], frame)
     notes.extend(gltf_parts.lights_and_cameras(header, path.name))
-    whole = object_of(
-        chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y", front
+    asset = object_of(
+        object_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y", front
     )
-    return ImportedScene(whole, tuple(surroundings), cameras)
+    return ImportedScene(asset, tuple(surroundings), cameras)
+
+
+def _find_node(
+    path: Path, header: Header, parts: Sequence[ImportedPart], name: str
+) -> int:
+    """Return the index of the node of a name that has geometry, or a descendant with it.
+
+    Raises:
+        UnknownNameError: there is none.
+        InputError: there are several.
+    """
+    candidates = sorted(with_above(header.parents, {part.node for part in parts}))
+    labels = {index: header.label(index) for index in candidates}
+    matches = [
+        index for index, label in labels.items() if name in (label, f"node {index}")
+    ]
+    if not matches:
+        known_names = list(dict.fromkeys(labels.values()))
+        raise UnknownNameError(f"node of {path.name}", name, known_names)
+    if len(matches) > 1:
+        choices = ", ".join(f"{path.name}#node {index}" for index in matches[:10])
+        raise InputError(
+            f"{path}: {len(matches)} nodes are called {shown(name)}; say which: "
+            f"{choices}"
+        )
+    return matches[0]
+
+
+def _check_surroundings(path: Path, count: int) -> None:
+    if count > MOST_SURROUNDINGS:
+        limit = f"at most {MOST_SURROUNDINGS} meshes and lights beside the object"
+        raise InputError(
+            f"{path}: expected {limit}, got {count}; join some of them in the file"
+        )
+
+
+def _surrounding_mesh(
+    path: Path,
+    name: str,
+    parts: list[ImportedPart],
+    front: FileAxis,
+    object_frame: FileFrame,
+) -> tuple[ScenePart, tuple[str, ...]]:
+    """Return one node's parts as a scene part around the object, and the warnings."""
+    frame = _frame(parts, object_frame.turn)
+    shape = object_of(parts, [], path, name, "y", front)
+    matrix = np.eye(4)
+    matrix[:3, :3] *= frame.size / object_frame.size
+    matrix[:3, 3] = object_frame.inside(frame.origin)
+    return mesh_part(shape.name, shape, matrix, shape.material), shape.warnings
 
 
 def node_names(path: Path) -> list[str]:
-    """Return what `import_scene` takes as the object of a glTF file, several of the
-    same name once. Raises FileFormatError: as for `import_object`.
+    """Return the node names that `import_scene` accepts for a glTF file.
+
+    A name that several nodes have is listed once.
+
+    Raises:
+        FileFormatError: as for `import_object`.
     """
     header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF))
-    drawn = {index for index, node in enumerate(header.nodes) if node.mesh is not None}
-    return list(
-        dict.fromkeys(map(header.label, sorted(with_above(header.parents, drawn))))
-    )
+    with_mesh = {
+        index for index, node in enumerate(header.nodes) if node.mesh is not None
+    }
+    candidates = sorted(with_above(header.parents, with_mesh))
+    return list(dict.fromkeys(map(header.label, candidates)))
 
 
 def _mesh_names(
     header: Header, parts: Sequence[ImportedPart], names: Names
 ) -> dict[int, str]:
-    return {
-        number: names.free(header.label(number))
-        for number in sorted({part.node for part in parts})
-    }
+    """Return a unique name for each node with parts, by the node's index."""
+    nodes = sorted({part.node for part in parts})
+    return {node: names.free(header.label(node)) for node in nodes}
 
 
 def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
+    """Return a unique name for each node with a perspective camera, by index."""
     names = Names(TAKEN)
-    called = {}
+    name_of_node = {}
     for index in sorted(nodes):
         camera = header.nodes[index].camera
         if camera is not None and header.cameras[camera].perspective is not None:
-            called[index] = names.free(
-                header.cameras[camera].name or header.label(index)
-            )
-    return called
+            label = header.cameras[camera].name or header.label(index)
+            name_of_node[index] = names.free(label)
+    return name_of_node
 
 
 @dataclass(frozen=True)
 class NodeContents:
     """A node with geometry."""
 
-    name: str  # as `import_scene` takes it
-    mesh: str  # what it is called in names of controls, beside another node
-    triangles: int  # of its own mesh
-    # of its bounding box in the file's axes and units, (3,)
+    name: str  # that `import_scene` accepts
+    mesh: str  # its name in controls if another node is the object
+    triangles: int  # number of them in its own mesh
+    # Bounding box in the file's axes and units, (3,).
     size: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What is in a file."""
+    """What can be imported from a file."""
 
     object: ObjectAsset  # everything with geometry, as one object
     nodes: tuple[NodeContents, ...] = ()  # of a glTF file, in their order
@@ -222,45 +252,56 @@ class Contents:
 
 @np.errstate(all="ignore")
 def contents(path: Path) -> Contents:
-    """Return what is understood of a mesh or glTF file; one of Mitsuba has a function
-    of that name of its own. Raises FileFormatError, InputError: as for `import_object`.
+    """Return what can be imported from a mesh or glTF file.
+
+    Mitsuba's files have a function of the same name in their own module.
+
+    Raises:
+        FileFormatError: as for `import_object`.
+        InputError: as for `import_object`.
     """
     data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_FILE))
     parts, notes = read_parts(path, data)
+    name = safe_name(path)
     if path.suffix.lower() not in GLTF:
-        return Contents(
-            object_of(parts, notes, path, safe_name(path), None, find_front(path, None))
-        )
+        front = find_front(path, None)
+        return Contents(object_of(parts, notes, path, name, None, front))
     header = gltf.read_header(path, data)
     notes += gltf_parts.lights_and_cameras(header, path.name)
-    whole = object_of(
-        parts, notes, path, safe_name(path), None, find_front(path, header)
-    )
-    nodes: dict[int, list[ImportedPart]] = {}
+    asset = object_of(parts, notes, path, name, "y", find_front(path, header))
+    parts_of_node: dict[int, list[ImportedPart]] = {}
     for part in parts:
-        nodes.setdefault(part.node, []).append(part)
-    listed = []
-    called = _mesh_names(header, parts, Names(TAKEN))
-    for index, group in sorted(nodes.items()):
-        places = np.concatenate(
-            [part.vertices[part.faces].reshape(-1, 3) for part in group]
-        )
-        x, y, z = map(float, np.ptp(places, axis=0))
-        faces = sum(len(part.faces) for part in group)
-        listed.append(
-            NodeContents(header.label(index), called[index], faces, (x, y, z))
-        )
-    lights = tuple(
+        parts_of_node.setdefault(part.node, []).append(part)
+    mesh_names = _mesh_names(header, parts, Names(TAKEN))
+    nodes = [
+        _node_contents(header.label(index), mesh_names[index], parts_of_node[index])
+        for index in sorted(parts_of_node)
+    ]
+    lights = [
         light.name or f"light {index}" for index, light in enumerate(header.lights)
-    )
+    ]
     cameras = _camera_names(header, dict(poses(header))).values()
-    return Contents(whole, tuple(listed), lights, tuple(cameras))
+    return Contents(asset, tuple(nodes), tuple(lights), tuple(cameras))
+
+
+def _node_contents(
+    name: str, mesh_name: str, parts: Sequence[ImportedPart]
+) -> NodeContents:
+    """Measure the parts of one node."""
+    points = np.concatenate(
+        [part.vertices[part.faces].reshape(-1, 3) for part in parts]
+    )
+    x, y, z = map(float, np.ptp(points, axis=0))
+    n_faces = sum(len(part.faces) for part in parts)
+    return NodeContents(name, mesh_name, n_faces, (x, y, z))
 
 
 @dataclass(frozen=True, eq=False)
 class FileFrame:
-    """How something lies in the file, turned to our axes: its own coordinates times
-    `size`, plus `origin` (3,).
+    """The position and size of something in a file.
+
+    A point of the file, turned to our axes, is `size` times the point in the frame,
+    plus `origin` (3,).
     """
 
     size: float
@@ -268,12 +309,14 @@ class FileFrame:
     turn: Doubles  # (3, 3) from the file's axes to ours
 
     def inside(self, places: Doubles) -> Doubles:
+        """Return points (..., 3) of the file, in our axes, in this frame."""
         return np.asarray((places - self.origin) / self.size)
 
 
 def _frame(parts: Sequence[ImportedPart], turn: Doubles) -> FileFrame:
-    """The frame in which the parts have a largest extent of 1, stand on z = 0 and are
-    centred in x and y.
+    """Return the frame in which parts have extent 1, stand on z = 0 and are centred.
+
+    The largest extent is meant; parts are centred in x and y.
     """
     corners = []
     for part in visible(parts):
@@ -281,25 +324,31 @@ def _frame(parts: Sequence[ImportedPart], turn: Doubles) -> FileFrame:
         area = np.linalg.norm(face_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
         corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
-    places = np.concatenate(corners) @ turn.T
-    if (
-        not np.isfinite(places).all()
-        or not len(places)
-        or not np.ptp(places, axis=0).max() > 0.0
-    ):
-        # refused with a reason when it is repaired
+    points = np.concatenate(corners) @ turn.T
+    is_valid = (
+        np.isfinite(points).all() and len(points) and np.ptp(points, axis=0).max() > 0.0
+    )
+    if not is_valid:
+        # The repair of the geometry rejects it with a reason.
         return FileFrame(1.0, np.zeros(3), turn)
-    origin, size = footing(places)
+    origin, size = footing(points)
     return FileFrame(size, origin, turn)
 
 
-def _unit_of_light(header: Header, both: bool) -> tuple[float, str]:
-    """How many candela are one unit of radiance times the file's area, and what is said
-    of it. Alone, lamps are in watts, as exporters have them. Beside surfaces that emit
-    light, of which one nit is one unit, what a candela is decides how bright they are
-    to each other.
+def _unit_of_light(
+    header: Header, parts: Sequence[ImportedPart], has_lights: bool
+) -> tuple[float, str]:
+    """Return how many candela are one unit of radiant intensity, and a note on it.
+
+    In a file without surfaces that emit light, lamps are taken as watts, as exporters
+    write them. With such surfaces, of which one nit is one unit, a candela decides how
+    bright lamps and surfaces are relative to each other.
     """
-    if not both:
+    if header.asset.generator == GENERATOR:
+        # A light of USD emits radiance, as its surfaces do.
+        return 1.0, ""
+    has_emission = any(part.surface.emission is not None for part in parts)
+    if not has_lights or not has_emission:
         return LUMENS, ""
     if "blender" in str(header.asset.generator).lower():
         return LUMENS, (
@@ -317,63 +366,84 @@ def _lamp(
     path: Path,
     name: str,
     light: LightEntry,
-    unit: float,
+    candela: float,
     pose: Doubles,
     frame: FileFrame,
 ) -> PointLamp | SpotLamp:
-    power = np.array(light.color) * light.intensity / unit
+    """Return a light of a file as a lamp.
+
+    Args:
+        path: the file, for messages.
+        name: name of the lamp.
+        light: its entry in the header.
+        candela: how many are one unit of radiant intensity.
+        pose: (4, 4) of its node.
+        frame: that of the object.
+
+    Raises:
+        InputError: it is too far away or too bright.
+    """
+    intensity = np.array(light.color) * light.intensity / candela
     if light.type == "directional":
-        way = frame.turn @ pose[:3, 2]  # it shines along its -z
-        place = gltf_parts.FAR * way / max(float(np.linalg.norm(way)), 1e-12)
-        power = power * gltf_parts.FAR**2
+        direction = frame.turn @ pose[:3, 2]  # it shines along its -z
+        length = max(float(np.linalg.norm(direction)), 1e-12)
+        position = gltf_parts.FAR * direction / length
+        intensity = intensity * gltf_parts.FAR**2
     else:
-        place = frame.inside(frame.turn @ pose[:3, 3])
-        power = power / frame.size**2
-    if not (np.abs([*place, *power]) <= FURTHEST).all():  # NaN is not
+        position = frame.inside(frame.turn @ pose[:3, 3])
+        intensity = intensity / frame.size**2
+    is_in_range = np.abs([*position, *intensity]) <= FURTHEST  # NaN is not
+    if not is_in_range.all():
         raise InputError(
             f"{path}: expected the light {name} within {FURTHEST:g} object sizes, and "
             "no brighter than that, got "
             "more; correct its place or its intensity, or remove it"
         )
-    x, y, z = map(float, place)
-    red, green, blue = map(float, power)
+    x, y, z = map(float, position)
+    red, green, blue = map(float, intensity)
     lamp = PointLamp(
-        name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue)
+        name, dark=not intensity.any(), position=(x, y, z), intensity=(red, green, blue)
     )
     if light.type != "spot":
         return lamp
-    along = frame.turn @ -pose[:3, 2]
-    across, up, ahead = map(float, along / max(float(np.linalg.norm(along)), 1e-12))
-    cutoff = math.degrees(light.spot.outerConeAngle)
-    beam = math.degrees(light.spot.innerConeAngle)
+    axis = frame.turn @ -pose[:3, 2]
+    axis_x, axis_y, axis_z = map(float, axis / max(float(np.linalg.norm(axis)), 1e-12))
     return SpotLamp(
-        **vars(lamp), direction=(across, up, ahead), cutoff=cutoff, beam=beam
+        **vars(lamp),
+        direction=(axis_x, axis_y, axis_z),
+        cutoff=math.degrees(light.spot.outerConeAngle),
+        beam=math.degrees(light.spot.innerConeAngle),
     )
 
 
 def _camera(
     path: Path, name: str, camera: CameraEntry, pose: Doubles, frame: FileFrame
 ) -> PlacedCamera:
+    """Return a perspective camera of a file, whose node has a pose (4, 4).
+
+    Raises:
+        InputError: it is too far away, has a singular or sheared pose, or too wide a
+            field of view.
+    """
     assert camera.perspective is not None
-    turn = frame.turn @ pose[:3, :3] @ BEHIND
+    axes = frame.turn @ pose[:3, :3] @ BEHIND
+    axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
-    axes = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
-    matrix[:3, :3], matrix[:3, 3] = axes, frame.inside(frame.turn @ pose[:3, 3])
-    # without one, that of the picture holds (section 5.13)
-    ratio = camera.perspective.aspectRatio
-    fov = math.degrees(
-        2.0
-        * math.atan(math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0))
-    )
-    mirrored = np.linalg.det(axes) < 0.0
+    matrix[:3, :3] = axes
+    matrix[:3, 3] = frame.inside(frame.turn @ pose[:3, 3])
+    # Without one, the aspect ratio is that of the image (section 5.13).
+    aspect_ratio = camera.perspective.aspectRatio
+    half_height = math.tan(camera.perspective.yfov / 2.0)
+    fov = math.degrees(2.0 * math.atan(half_height * max(aspect_ratio or 1.0, 1.0)))
+    is_mirrored = np.linalg.det(axes) < 0.0
     if not (np.abs(matrix[:3, 3]) <= FURTHEST).all():  # NaN is not
         problem = f"within {FURTHEST:g} object sizes, got more; correct its place"
     elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         problem = (
             "to look somewhere, got axes without length; correct the scale of its node"
         )
-    elif not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or mirrored:
-        got = "mirrored" if mirrored else "sheared"
+    elif not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or is_mirrored:
+        got = "mirrored" if is_mirrored else "sheared"
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
         problem = f"under nodes that turn, move and scale it, got {got} axes; {advice}"
     elif not 0.0 < fov <= WIDEST_VIEW:
@@ -383,5 +453,5 @@ def _camera(
             "correct it"
         )
     else:
-        return PlacedCamera(matrix, fov, upright=ratio is None)
+        return PlacedCamera(matrix, fov, upright=aspect_ratio is None)
     raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")

@@ -31,59 +31,62 @@ _OWN = 0x8000
 
 
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read an STL file as one part; its facet normals are made anew, as every program
-    does. Raises FileFormatError: it is damaged, or has no facets.
+    """Read an STL file as one part.
+
+    Its facet normals are ignored and computed anew, as in other programs.
+
+    Raises:
+        FileFormatError: the file is corrupt, or has no facets.
     """
-    promised = (
-        84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
-    )
-    corners = None
+    expected_size = 84
+    if len(data) >= 84:
+        (n_facets,) = struct.unpack_from("<I", data, 80)
+        expected_size += 50 * n_facets
+    corner_colors = None
     surface = ImportedSurface()
-    if len(data) == promised:
-        notes.check_faces((promised - 84) // 50)
+    if len(data) == expected_size:
+        notes.check_faces((expected_size - 84) // 50)
         facets = np.frombuffer(data, _FACET, offset=84)
         points = facets["vertices"].astype(np.float64).reshape(-1, 3)
         colors = _colors(data[:80], facets["attribute"], notes)
         if colors is not None:
-            corners = np.repeat(colors[:, None], 3, axis=1)
+            corner_colors = np.repeat(colors[:, None], 3, axis=1)
             surface = ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _of_text(data, notes)
     else:
-        kind = looks_like(data)
-        got = (
-            f"{len(data)} bytes, which is neither ASCII nor that long"
-            if "another" in kind
-            else kind
-        )
+        got = looks_like(data)
+        if "another" in got:
+            got = f"{len(data)} bytes, which is neither ASCII nor that long"
         raise notes.damaged(
-            f"an STL file (in binary, {promised} bytes for its number of facets)", got
+            f"an STL file (in binary, {expected_size} bytes for its number of facets)",
+            got,
         )
     if not len(points):
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
-    return [
-        ImportedPart(
-            points, np.arange(len(points)).reshape(-1, 3), None, None, corners, surface
-        )
-    ]
+    faces = np.arange(len(points)).reshape(-1, 3)
+    return [ImportedPart(points, faces, None, None, corner_colors, surface)]
 
 
 def _of_text(data: bytes, notes: Notes) -> Doubles:
+    """Return the points (3 F, 3) of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise notes.damaged(
             "an ASCII STL file that ends in 'endsolid'", "one that is cut short"
         )
+    # Names may have any words.
     data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
-    found = _VERTEX.findall(data)
-    notes.check_faces(len(found) // 3)
-    if len(found) % 3 or len(found) != 3 * len(
-        re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE)
-    ):
-        raise notes.damaged("facets with 3 vertices", f"{len(found):,} vertices in all")
+    vertices = _VERTEX.findall(data)
+    notes.check_faces(len(vertices) // 3)
+    n_loops = len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE))
+    if len(vertices) % 3 or len(vertices) != 3 * n_loops:
+        raise notes.damaged(
+            "facets with 3 vertices", f"{len(vertices):,} vertices in all"
+        )
     try:
-        points = np.array(found).astype(np.float64)
+        points = np.array(vertices).astype(np.float64)
     except ValueError:
         raise notes.damaged(
             "three numbers after each 'vertex'", "something else"
@@ -95,31 +98,38 @@ def _of_text(data: bytes, notes: Notes) -> Doubles:
 
 
 def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None:
-    # Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=``
-    # and four bytes, the colour of all, into the header, and red in the lowest bits of
-    # a facet whose highest bit is not set. VisCAM has blue in the lowest bits, and sets
-    # the highest where a facet has a colour.
+    """Return the linear color of each facet, (F, 3), or None if there are none.
+
+    Two programs store them with 5 bits for each channel. Magics writes ``COLOR=`` and
+    four bytes, the color of the object, into the header; the lowest bits of a facet are
+    red, and its highest bit is not set. VisCAM has blue in the lowest bits, and sets the
+    highest bit of facets with a color.
+
+    Args:
+        head: the header of the file.
+        attributes: (F,) attribute bytes of the facets.
+        notes: about the file.
+    """
     magics = head.find(b"COLOR=")
-    bits = np.stack(
-        [(attributes >> shift) & 31 for shift in (10, 5, 0)], axis=1
-    ).astype(np.float32) / np.float32(31.0)
+    channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
+    colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
     if 0 <= magics <= 70:
         if b"MATERIAL=" in head:
             notes.has("header entry", "MATERIAL")
-        colored = (attributes & _OWN == 0) & bool(attributes.any())
-        bits = bits[:, ::-1]
-        plain = np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
-        if head[magics + 9] < 255 and head[magics + 9] > 0:
+        has_color = (attributes & _OWN == 0) & bool(attributes.any())
+        colors = colors[:, ::-1]
+        default = np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
+        if 0 < head[magics + 9] < 255:
             notes.has("opacity of its header entry", "COLOR")
     else:
-        colored = attributes & _OWN != 0
-        plain = np.full(3, NEUTRAL, np.float32)
-        if not colored.any():
+        has_color = attributes & _OWN != 0
+        default = np.full(3, NEUTRAL, np.float32)
+        if not has_color.any():
             if attributes.any():
                 notes.has(
                     "attribute bytes of its facets, which are no colours known here,",
                     f"{attributes.max():#06x}",
                 )
             return None
-    display = np.where(colored[:, None], bits, plain).astype(np.float32)
+    display = np.where(has_color[:, None], colors, default).astype(np.float32)
     return np.asarray(srgb_to_linear(display), dtype=np.float64)

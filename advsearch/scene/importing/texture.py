@@ -1,9 +1,8 @@
-"""The maps of an imported object, of its base colour and its normals, and texture
-coordinates that fit them.
+"""Texture maps of an imported object, and texture coordinates that fit them.
 
-The file's own UVs and textures are kept where they can be used as they are. Otherwise
-the mesh is unwrapped with xatlas and whatever the file has (repeating textures, several
-materials, vertex colours) is baked into one texture of a kind.
+The file's UVs and textures are used if they can be used unchanged. Otherwise the mesh is
+unwrapped with xatlas, and what the file has (repeating textures, several materials,
+vertex colors) is baked into one map each of color, normals and emission.
 """
 
 from __future__ import annotations
@@ -24,182 +23,185 @@ from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
 from advsearch.scene.surface_parts import unwrapped
 
-# width and height, in texels, of the base colour map of an object of one colour
+# Width and height, in texels, of the base color map of an object of one color.
 PLAIN_SIZE = 8
-BAKED_SIZE = 512  # width and height of the smallest base colour map that is baked
+BAKED_SIZE = 512  # width and height of the smallest base color map that is baked
 _SLACK = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
-_SQUASHED = 0.05  # share of the surface that may have no area in UV space
-_CRAMPED = 0.02  # share of the unit square that UVs must cover in all
+_SQUASHED = 0.05  # fraction of the surface that may have no area in UV space
+_CRAMPED = 0.02  # fraction of the unit square that UVs must cover in all
 _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
 _BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
-# share of the texels which may lie on several faces where each should have its own
-_SHARED = 0.005
-# how many times more texels a picture may have than a baked texture before that is said
+_SHARED = 0.005  # fraction of the texels that may be on several faces
+# How many times more texels an image may have than a baked texture without a note.
 _FINER = 1.5
-# places at which a mean is taken, and steps along the side of a face at most
+# Limits of the points at which a mean is sampled, and of the steps along a face's side.
 _LOOKS = 1 << 18
 _FINEST = 256
-_FILLED = 0.5  # share of an atlas that its charts fill, about
+_FILLED = 0.5  # approximate fraction of an atlas that its charts fill
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMaps:
-    """What an object looks like by its texture coordinates; row 0 is on top, at v =
-    1.
-    """
+    """The images of an object's surface; row 0 is on top, at v = 1."""
 
-    # (H, W, 3) display-referred base colour in [0, 1]; (H, W, 4) with the opacity of
-    # what has one
+    # (H, W, 3) display-referred base color in [0, 1], or (H, W, 4) with the opacity.
     color: Floats
     normals: Floats | None = None  # (H', W', 3) as `ImportedSurface.normal_map`
-    # (H", W", 3) linear radiance; (1, 1, 3) where it is the same everywhere
+    # (H", W", 3) linear radiance, or (1, 1, 3) if it is the same everywhere.
     emission: Floats | None = None
 
 
 def textured(
     soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes
 ) -> tuple[Soup, SurfaceMaps]:
-    """Return a repaired soup with UVs in [0, 1] on every corner, and the maps that fit
-    them and the surface of each part.
+    """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
+
+    The file's UVs and images are used if possible; else they are baked.
+
+    Args:
+        soup: a repaired soup.
+        surfaces: the surface of each of its parts.
+        notes: where it is reported why images were baked.
     """
-    used = list(
-        {
-            id(surfaces[number]): surfaces[number] for number in np.unique(soup.part)
-        }.values()
-    )
+    used_by_id = {id(surfaces[part]): surfaces[part] for part in np.unique(soup.part)}
+    used = list(used_by_id.values())
     first = used[0]
-    uniform = all(surface.same_maps(used[0]) for surface in used)
-    one_factor = bool((soup.colors == soup.colors[0, 0]).all())
-    colored = uniform and one_factor
-    twice = False
-    material = by_material(soup, surfaces)[1]
-    if colored and not first.pictures:
-        kept = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
-        soup = (
-            replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0))
-            if kept
-            else unwrapped(soup, material)
-        )
-        return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission)
-    if (
-        colored
-        and (first.texture is None or soup.colors.min() == 1.0)
-        and np.isfinite(soup.uvs).all()
-    ):
-        uvs, pictures = _windowed(
-            _into_unit_square(soup), first.pictures, first.texture
-        )
-        usable = _usable(soup, uvs)
-        twice = usable and _lit_twice(uvs, first, pictures)
-        if usable and not twice:
-            cut = first.with_pictures(pictures)
-            color = _of_one_color(soup, first) if cut.texture is None else cut.texture
-            return _unmirrored(
-                soup,
-                np.clip(uvs, 0.0, 1.0),
-                SurfaceMaps(color, cut.normal_map, cut.emission),
+    is_uniform = all(surface.same_maps(first) for surface in used)
+    has_one_factor = bool((soup.colors == soup.colors[0, 0]).all())
+    _, material = by_material(soup, surfaces)
+    is_lit_twice = False
+    if is_uniform and has_one_factor:
+        if not first.pictures:
+            return _without_images(soup, first, material)
+        is_untinted = first.texture is None or soup.colors.min() == 1.0
+        if is_untinted and np.isfinite(soup.uvs).all():
+            uvs, images = _windowed(
+                _into_unit_square(soup), first.pictures, first.texture
             )
-    fresh = unwrapped(soup, material)
-    maps = baked(fresh.uvs, soup, surfaces)
-    shared = (
+            is_usable = _usable(soup, uvs)
+            is_lit_twice = is_usable and _lit_twice(uvs, first, images)
+            if is_usable and not is_lit_twice:
+                return _with_images(soup, uvs, first.with_pictures(images))
+    unwrapped_soup = unwrapped(soup, material)
+    maps = baked(unwrapped_soup.uvs, soup, surfaces)
+    reason = (
         "several faces share a texture that emits light; it was unwrapped anew "
         "and its texture resampled"
     )
+    if not is_lit_twice:
+        reason = _why(soup, used, is_uniform, has_one_factor)
     size = len(maps.color)
-    why = shared if twice else _why(soup, used, uniform, one_factor)
-    times = _texels(soup, surfaces) / (size * size * _FILLED)
-    fewer = (
-        ""
-        if times < _FINER
-        else (f", {times:.0f} times fewer than its pictures have there")
-    )
-    notes.say(f"{why} ({size} x {size} texels{fewer})")
-    return fresh, maps
+    ratio = _texels(soup, surfaces) / (size * size * _FILLED)
+    fewer = ""
+    if ratio >= _FINER:
+        fewer = f", {ratio:.0f} times fewer than its pictures have there"
+    notes.say(f"{reason} ({size} x {size} texels{fewer})")
+    return unwrapped_soup, maps
+
+
+def _without_images(
+    soup: Soup, surface: ImportedSurface, material: Ints
+) -> tuple[Soup, SurfaceMaps]:
+    """Return a soup of one color with UVs, the file's if they do not overlap."""
+    keeps_uvs = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
+    if keeps_uvs:
+        soup_with_uvs = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0))
+    else:
+        soup_with_uvs = unwrapped(soup, material)
+    color = _of_one_color(soup_with_uvs, surface)
+    return soup_with_uvs, SurfaceMaps(color, None, surface.emission)
+
+
+def _with_images(
+    soup: Soup, uvs: Doubles, surface: ImportedSurface
+) -> tuple[Soup, SurfaceMaps]:
+    """Return a soup with the images of its only surface, for UVs (F, 3, 2)."""
+    color = surface.texture
+    if color is None:
+        color = _of_one_color(soup, surface)
+    maps = SurfaceMaps(color, surface.normal_map, surface.emission)
+    return _unmirrored(soup, np.clip(uvs, 0.0, 1.0), maps)
 
 
 def by_material(
     soup: Soup, surfaces: Sequence[ImportedSurface]
 ) -> tuple[list[str], Ints]:
-    """Return the names of materials, "" for none, and the number (F,) of each face's
-    among them.
-    """
-    numbers = {
-        name: number
-        for number, name in enumerate(
-            dict.fromkeys(surface.name for surface in surfaces)
-        )
-    }
-    return list(numbers), np.array([numbers[surface.name] for surface in surfaces])[
-        soup.part
-    ]
+    """Return the names of materials, "" for none, and the index of each face's (F,)."""
+    names = list(dict.fromkeys(surface.name for surface in surfaces))
+    index_of_name = {name: index for index, name in enumerate(names)}
+    index_of_part = np.array([index_of_name[surface.name] for surface in surfaces])
+    return names, index_of_part[soup.part]
 
 
 def _overlap(uvs: Doubles, material: Ints) -> bool:
+    """Return whether faces of different materials share many texels."""
     if material.min() == material.max():
         return False
-    side = BAKED_SIZE
-    face, row, column, _ = pixels_in(uvs * side - 0.5, (side, side), tolerance=-1e-6)
-    least = np.full(side * side, len(uvs))
-    most = np.full(side * side, -1)
-    np.minimum.at(least, row * side + column, material[face])
-    np.maximum.at(most, row * side + column, material[face])
-    return bool((most > least).sum() > _SHARED * (most >= 0).sum())
+    size = BAKED_SIZE
+    face, row, column, _ = pixels_in(uvs * size - 0.5, (size, size), tolerance=-1e-6)
+    first_material = np.full(size * size, len(uvs))
+    last_material = np.full(size * size, -1)
+    np.minimum.at(first_material, row * size + column, material[face])
+    np.maximum.at(last_material, row * size + column, material[face])
+    n_shared = (last_material > first_material).sum()
+    return bool(n_shared > _SHARED * (last_material >= 0).sum())
 
 
 def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
-    color = (
-        _plain(surface)
-        if soup.colors.min() == 1.0
-        else _tinted(_plain(surface), soup.colors[0, 0])
-    )
+    """Return a small map of the only color of a soup."""
+    color = _plain(surface)
+    if soup.colors.min() != 1.0:
+        color = _tinted(color, soup.colors[0, 0])
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
 def _lit_twice(
     uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]
 ) -> bool:
-    """Whether a texel that emits light lies on several faces: Mitsuba would send light
-    from one of them only.
+    """Return whether texels that emit light are on several faces.
+
+    Mitsuba would send light from one of them only.
     """
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
-    lit = pictures[-1].any(axis=2)
-    height, width = lit.shape
+    is_lit = pictures[-1].any(axis=2)
+    height, width = is_lit.shape
     _, rows, columns, _ = pixels_in(
         _in_texels(uvs, (height, width)), (height, width), tolerance=-1e-6
     )
-    count = np.bincount(rows * width + columns, minlength=height * width).reshape(
-        height, width
-    )[lit]
-    return bool((count > 1).sum() > _SHARED * max(1, len(count)))
+    n_faces = np.bincount(rows * width + columns, minlength=height * width)
+    n_faces_if_lit = n_faces.reshape(height, width)[is_lit]
+    return bool((n_faces_if_lit > 1).sum() > _SHARED * max(1, len(n_faces_if_lit)))
 
 
 def _in_texels(uvs: Doubles, shape: tuple[int, int]) -> Doubles:
-    return np.stack(
-        [uvs[:, :, 0] * shape[1] - 0.5, (1.0 - uvs[:, :, 1]) * shape[0] - 0.5], axis=2
-    )
+    """Return UVs (F, 3, 2) as columns and rows of a map of a shape (height, width)."""
+    columns = uvs[:, :, 0] * shape[1] - 0.5
+    rows = (1.0 - uvs[:, :, 1]) * shape[0] - 0.5
+    return np.stack([columns, rows], axis=2)
 
 
 def _why(
     soup: Soup, used: Sequence[ImportedSurface], uniform: bool, one_factor: bool
 ) -> str:
+    """Return the reason why an object was baked, as a sentence for its warnings."""
     if not uniform:
-        count = len({surface.name or id(surface) for surface in used})
-        what = (
-            f"the colours of its {count} materials"
-            if count > 1
-            else "the pictures of its material"
-        )
-        return f"{what} were baked into one texture"
+        n_materials = len({surface.name or id(surface) for surface in used})
+        if n_materials > 1:
+            baked_things = f"the colours of its {n_materials} materials"
+        else:
+            baked_things = "the pictures of its material"
+        return f"{baked_things} were baked into one texture"
     if not one_factor or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
-        mean = (
-            "the texture's mean colour is used"
-            if used[0].texture is not None
-            else "its normal map is left out"
+        substitute = "its normal map is left out"
+        if used[0].texture is not None:
+            substitute = "the texture's mean colour is used"
+        return (
+            "it has a texture but lacks texture coordinates; where it does, "
+            f"{substitute}"
         )
-        return f"it has a texture but lacks texture coordinates; where it does, {mean}"
     return (
         "its texture coordinates repeat or hardly use the texture; it was "
         "unwrapped "
@@ -208,18 +210,18 @@ def _why(
 
 
 def _plain(surface: ImportedSurface) -> Floats:
-    return (
-        np.full(3, NEUTRAL, dtype=np.float32)
-        if surface.color is None
-        else surface.color
-    )
+    """Return the color of a surface, or neutral grey if it has none."""
+    if surface.color is None:
+        return np.full(3, NEUTRAL, dtype=np.float32)
+    return surface.color
 
 
 def _tinted(
     color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]
 ) -> Floats:
-    """Multiply display-referred colours (..., 3 or 4) by linear factors (..., 3);
-    opacity stays.
+    """Multiply display-referred colors (..., 3 or 4) by linear factors (..., 3).
+
+    Opacity stays.
     """
     color = np.asarray(color, np.float32)
     product = srgb_to_linear(color[..., :3]) * factor
@@ -228,42 +230,51 @@ def _tinted(
     )
 
 
-# --- the file's UVs ----------------------------------------
+# ---- The file's UVs ----
 
 
 def _usable(soup: Soup, uvs: Doubles) -> bool:
+    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny."""
     if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
         return False
-    flat = np.abs(doubled_areas(uvs)) / 2.0
-    surface = np.linalg.norm(soup.face_vectors(), axis=1)
+    uv_area = np.abs(doubled_areas(uvs)) / 2.0
+    surface_area = np.linalg.norm(soup.face_vectors(), axis=1)
+    squashed_area = surface_area[uv_area < 1e-12].sum()
     return bool(
-        surface[flat < 1e-12].sum() <= _SQUASHED * surface.sum()
-        and flat.sum() >= _CRAMPED
+        squashed_area <= _SQUASHED * surface_area.sum() and uv_area.sum() >= _CRAMPED
     )
 
 
 def _into_unit_square(soup: Soup) -> Doubles:
-    """Move each chart by whole textures so that it starts in the unit square; a
-    repeating texture looks the same.
+    """Move each chart by an integer offset so that it starts in the unit square.
+
+    A repeating texture looks the same. Returns UVs (F, 3, 2).
     """
-    corners = np.column_stack([soup.faces.reshape(-1), soup.uvs.reshape(-1, 2)])
+    flat_uvs = soup.uvs.reshape(-1, 2)
+    corners = np.column_stack([soup.faces.reshape(-1), flat_uvs])
     _, vertex = np.unique(corners, axis=0, return_inverse=True)
     vertex = vertex.reshape(-1, 3)
-    a = np.concatenate([vertex[:, 0], vertex[:, 1]])
-    b = np.concatenate([vertex[:, 1], vertex[:, 2]])
-    chart = connected(int(vertex.max()) + 1, a, b)
+    starts = np.concatenate([vertex[:, 0], vertex[:, 1]])
+    ends = np.concatenate([vertex[:, 1], vertex[:, 2]])
+    chart = connected(int(vertex.max()) + 1, starts, ends)
     low = np.full((int(chart.max()) + 1, 2), np.inf)
-    np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
-    moved: Doubles = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
-    return moved
+    np.minimum.at(low, chart[vertex.reshape(-1)], flat_uvs)
+    uvs: Doubles = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
+    return uvs
 
 
 def _windowed(
     uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None
 ) -> tuple[Doubles, Sequence[Floats]]:
-    """Cut pictures to the window that UVs span where they overstep the unit square a
-    little or use a corner of it; the layout of the charts stays. Windows larger than
-    `_WINDOW` textures are left alone: there the textures repeat.
+    """Crop images to the window that UVs span; the layout of the charts stays.
+
+    This is done if UVs overstep the unit square a little or use a corner of it. Windows
+    larger than `_WINDOW` textures are left alone: there the textures repeat.
+
+    Args:
+        uvs: (F, 3, 2).
+        pictures: images (H, W, C).
+        colors: which of them has colors, filtered in linear light.
     """
     texel = np.max(
         [1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0
@@ -271,178 +282,210 @@ def _windowed(
     low = uvs.min(axis=(0, 1)) - texel
     high = uvs.max(axis=(0, 1)) + texel
     size = high - low
-    inside = (
+    is_inside = (
         low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
     )
-    if size.max() > _WINDOW or (
-        inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED
-    ):
+    is_filled = is_inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED
+    if size.max() > _WINDOW or is_filled:
         return uvs, pictures
-    cut = []
-    for picture in pictures:  # with texels of the same size
-        width, height = np.clip(
-            np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT
-        ).astype(int)
+    cropped = []
+    for picture in pictures:
+        # Texels keep their size.
+        shape = np.ceil(size * np.array(picture.shape[1::-1]))
+        width, height = np.clip(shape, 1, TEXTURE_LIMIT).astype(int)
         columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
         rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         look_up = filtered if picture is colors else sampled
-        cut.append(look_up(picture, grid).reshape(height, width, -1))
-    return (uvs - low) / size, cut
+        cropped.append(look_up(picture, grid).reshape(height, width, -1))
+    return (uvs - low) / size, cropped
 
 
-# --- baking ----------------------------------------
+# ---- Baking ----
 
 
 def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
-    """Paint the colours and the normals of a soup, with the file's UVs (NaN where it
-    has none), and of the surface of each part into maps (N, N, ...) for new UVs (F, 3,
-    2) in [0, 1] without overlaps, with room for the texels that the object shows.
+    """Bake the colors, normals and emission of a soup into maps for new UVs.
+
     Texels outside every chart repeat the nearest one inside, so that filtering finds no
     seam.
+
+    Args:
+        uvs: (F, 3, 2) new UVs in [0, 1] without overlaps.
+        soup: the object, with the file's UVs (NaN if it has none).
+        surfaces: the surface of each part.
+
+    Returns:
+        Maps (N, N, ...) with room for the texels that the object shows.
     """
     size = BAKED_SIZE
     texels = _texels(soup, surfaces)
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2
-    face, rows, columns, weights = pixels_in(
-        _in_texels(uvs, (size, size)), (size, size), tolerance=1e-9
-    )
-    bases = [
-        _plain(surface) if surface.texture is None else surface.texture
-        for surface in surfaces
-    ]
-    through = any(base.shape[-1] == 4 for base in bases)
-    image = np.ones((size, size, 3 + through), np.float32)
-    inside = np.zeros((size, size), np.bool_)
-    bumpy = any(surface.normal_map is not None for surface in surfaces)
-    glows = any(surface.emission is not None for surface in surfaces)
-    normals = np.full((size, size, 3), FLAT) if bumpy else None
-    emission = np.zeros((size, size, 3), np.float32) if glows else None
+    pixels = pixels_in(_in_texels(uvs, (size, size)), (size, size), tolerance=1e-9)
+    face, rows, columns, weights = pixels
+    has_opacity = any(_plain_or_texture(surface).shape[-1] == 4 for surface in surfaces)
+    color = np.ones((size, size, 3 + has_opacity), np.float32)
+    normals = None
+    if any(surface.normal_map is not None for surface in surfaces):
+        normals = np.full((size, size, 3), FLAT)
+    emission = None
+    if any(surface.emission is not None for surface in surfaces):
+        emission = np.zeros((size, size, 3), np.float32)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    for surface, here in zip(surfaces, grouped(soup.part[face]), strict=False):
-        if not len(here):  # no texel at all
+    for surface, texel in zip(surfaces, grouped(soup.part[face]), strict=False):
+        if not len(texel):
             continue
-        y = rows[here]
-        x = columns[here]
-        at = np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
-        color = _looked_up(surface, at, soup, surfaces)
-        image[y, x, : color.shape[1]] = _tinted(color, factor[here])
-        if (
-            normals is not None
-            and surface.normal_map is not None
-            and np.isfinite(at).all()
-        ):
+        y = rows[texel]
+        x = columns[texel]
+        file_uvs = np.einsum("tk,tkc->tc", weights[texel], soup.uvs[face[texel]])
+        texel_color = _looked_up(surface, file_uvs, soup, surfaces)
+        color[y, x, : texel_color.shape[1]] = _tinted(texel_color, factor[texel])
+        if not np.isfinite(file_uvs).all():
+            continue
+        if normals is not None and surface.normal_map is not None:
             normals[y, x] = turned(
-                sampled(surface.normal_map, at), soup, uvs, face[here], weights[here]
+                sampled(surface.normal_map, file_uvs),
+                soup,
+                uvs,
+                face[texel],
+                weights[texel],
             )
-        if (
-            emission is not None
-            and surface.emission is not None
-            and np.isfinite(at).all()
-        ):
-            emission[y, x] = sampled(surface.emission, at)
-    inside[rows, columns] = True
-    away, nearest = distance_transform_edt(~inside, return_indices=True)
-    whole = tuple(nearest)
+        if emission is not None and surface.emission is not None:
+            emission[y, x] = sampled(surface.emission, file_uvs)
+    is_inside = np.zeros((size, size), np.bool_)
+    is_inside[rows, columns] = True
+    return _fill_gaps(SurfaceMaps(color, normals, emission), is_inside)
+
+
+def _plain_or_texture(surface: ImportedSurface) -> Floats:
+    """Return the base color of a surface: its texture (H, W, C), or its color (C,)."""
+    return _plain(surface) if surface.texture is None else surface.texture
+
+
+def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMaps:
+    """Give texels outside of all charts the values of the nearest texel inside.
+
+    They emit light only close to a chart.
+    """
+    distance, nearest = distance_transform_edt(~is_inside, return_indices=True)
+    nearest_texel = tuple(nearest)
+    normals = maps.normals
+    if normals is not None:
+        normals = normals[nearest_texel]
+    emission = maps.emission
     if emission is not None:
-        emission = emission[whole] * (away < _BORDER)[:, :, None]
-    return SurfaceMaps(
-        image[whole], None if normals is None else normals[whole], emission
-    )
+        emission = emission[nearest_texel] * (distance < _BORDER)[:, :, None]
+    return SurfaceMaps(maps.color[nearest_texel], normals, emission)
 
 
 def _looked_up(
     surface: ImportedSurface,
-    at: Doubles,
+    uvs: Doubles,
     soup: Soup,
     surfaces: Sequence[ImportedSurface],
 ) -> Floats:
-    """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2); where it has none,
-    the mean over all faces that show its texture.
+    """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
+
+    If UVs are missing, it is the mean over all faces that show its texture.
     """
-    if surface.texture is not None and np.isfinite(at).all():
-        return filtered(surface.texture, at)
+    if surface.texture is not None and np.isfinite(uvs).all():
+        return filtered(surface.texture, uvs)
     color = _plain(surface)
     if surface.texture is not None:
-        mine = np.array([other.texture is surface.texture for other in surfaces])[
-            soup.part
-        ]
-        areas = np.linalg.norm(soup.face_vectors(), axis=1)[mine]
-        color = _in_display(
-            mean_over(_in_linear(surface.texture), soup.uvs[mine], areas)
-        )
-    return np.broadcast_to(color[None], (len(at), len(color)))
+        shows_texture = [other.texture is surface.texture for other in surfaces]
+        is_selected = np.array(shows_texture)[soup.part]
+        areas = np.linalg.norm(soup.face_vectors(), axis=1)[is_selected]
+        mean = mean_over(_in_linear(surface.texture), soup.uvs[is_selected], areas)
+        color = _in_display(mean)
+    return np.broadcast_to(color[None], (len(uvs), len(color)))
 
 
 def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
-    texels = 0.0
-    areas = np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
-    for number, area in enumerate(np.bincount(soup.part, areas)):
+    """Return how many texels of the file's images an object shows."""
+    n_texels = 0.0
+    uv_areas = np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
+    for part, area in enumerate(np.bincount(soup.part, uv_areas)):
         sizes = (
-            picture.shape[0] * picture.shape[1] for picture in surfaces[number].pictures
+            picture.shape[0] * picture.shape[1] for picture in surfaces[part].pictures
         )
-        texels += float(area) * max(sizes, default=0)
-    return texels
+        n_texels += float(area) * max(sizes, default=0)
+    return n_texels
 
 
 def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
-    """Return the mean (C,) float32 of a texture (H, W, C) over faces with these UVs (F,
-    3, 2), NaN where one has none, and areas (F,): what none of them shows does not
-    count, unless no face has both.
+    """Return the mean of a texture over faces, weighted by their areas.
+
+    Each face is sampled at the centers of equal small triangles.
+
+    Args:
+        texture: (H, W, C).
+        uvs: (F, 3, 2), NaN if a face has none.
+        areas: (F,).
+
+    Returns:
+        (C,) float32. If no face has both UVs and an area, the mean of the texture.
     """
-    known = np.isfinite(uvs).all(axis=(1, 2)) & (areas > 0.0)
-    if not known.any():
+    is_known = np.isfinite(uvs).all(axis=(1, 2)) & (areas > 0.0)
+    if not is_known.any():
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
-    uvs = uvs[known]
-    areas = areas[known]
+    uvs = uvs[is_known]
+    areas = areas[is_known]
     steps = int(np.clip(np.sqrt(_LOOKS / len(areas)), 1, _FINEST))
-    i, j = (
-        index.reshape(-1) for index in np.meshgrid(np.arange(steps), np.arange(steps))
-    )
-    up = i + j < steps  # the two kinds of small triangles, by their middles
-    down = i + j < steps - 1
-    b, c = (
-        np.concatenate([index[up] + 1.0 / 3.0, index[down] + 2.0 / 3.0]) / steps
-        for index in (i, j)
-    )
-    weights = np.stack([1.0 - b - c, b, c], axis=1)
+    weights = _sample_weights(steps)
+    height, width = texture.shape[:2]
     total = np.zeros(texture.shape[2])
-    for some in np.array_split(
-        np.arange(len(areas)), -(-len(areas) * len(b) // _LOOKS)
-    ):
-        places = np.einsum("pk,fkc->fpc", weights, uvs[some]).reshape(-1, 2)
-        height, width = texture.shape[:2]
-        rows = (1.0 - places[:, 1]) % 1.0 * height
-        columns = places[:, 0] % 1.0 * width
+    n_batches = -(-len(areas) * len(weights) // _LOOKS)
+    for batch in np.array_split(np.arange(len(areas)), n_batches):
+        points = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
+        rows = (1.0 - points[:, 1]) % 1.0 * height
+        columns = points[:, 0] % 1.0 * width
         texels = texture[rows.astype(int) % height, columns.astype(int) % width]
-        total += areas[some] @ texels.reshape(len(some), len(b), -1).mean(
+        face_means = texels.reshape(len(batch), len(weights), -1).mean(
             axis=1, dtype=np.float64
         )
+        total += areas[batch] @ face_means
     return np.asarray(total / areas.sum(), np.float32)
 
 
+def _sample_weights(steps: int) -> Doubles:
+    """Return barycentric weights (P, 3) of the centers of small triangles.
+
+    A triangle is divided into steps**2 equal ones, some of which point up and some
+    down.
+    """
+    grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
+    i = grid_i.reshape(-1)
+    j = grid_j.reshape(-1)
+    is_up = i + j < steps
+    is_down = i + j < steps - 1
+    b, c = (
+        np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
+        for index in (i, j)
+    )
+    return np.stack([1.0 - b - c, b, c], axis=1)
+
+
 def filtered(colors: Floats, uvs: Doubles) -> Floats:
-    """Look a repeating texture of display-referred colours up with bilinear
-    interpolation in linear light; what is transparent does not count. Arguments and
-    result as for `sampled`.
+    """Sample a repeating texture of display-referred colors in linear light.
+
+    Interpolation is bilinear; what is transparent does not count. Arguments and result
+    are those of `sampled`.
     """
     return _in_display(sampled(_in_linear(colors), uvs))
 
 
 def _in_linear(colors: Floats) -> Floats:
-    """Return display-referred colours (..., 3 or 4) as linear ones, times their opacity
-    where there is one.
-    """
+    """Return display-referred colors (..., 3 or 4) as linear, premultiplied ones."""
     linear = srgb_to_linear(colors[..., :3])
-    return (
-        linear
-        if colors.shape[-1] == 3
-        else np.concatenate([linear * colors[..., 3:], colors[..., 3:]], axis=-1)
-    )
+    if colors.shape[-1] == 3:
+        return linear
+    opacity = colors[..., 3:]
+    return np.concatenate([linear * opacity, opacity], axis=-1)
 
 
 def _in_display(colors: Floats) -> Floats:
+    """Return linear, premultiplied colors (..., 3 or 4) as display-referred ones."""
     linear = colors[..., :3]
     opacity = colors[..., 3:]
     if opacity.size:
@@ -451,91 +494,107 @@ def _in_display(colors: Floats) -> Floats:
 
 
 def sampled(texture: Floats, uvs: Doubles) -> Floats:
-    """Look a repeating texture (H, W, C) float32 up at any finite UVs (T, 2), with
-    bilinear interpolation of its values, as they are: (T, C) float32.
+    """Sample a repeating texture with bilinear interpolation of its values.
+
+    Args:
+        texture: (H, W, C) float32.
+        uvs: (T, 2), finite.
+
+    Returns:
+        (T, C) float32.
     """
     height, width = texture.shape[:2]
-    u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite
+    # Modulo comes first, since a huge number times a width is infinite.
+    u, v = (uvs % 1.0).T
     return looked_up(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
 
 
-# ---- normal maps at other texture coordinates ---------------------------
+# ---- Normal maps at other texture coordinates ----
 #
-# In a file the bitangent runs up the picture; Mitsuba's is normal x tangent, which runs
-# down it where texture coordinates are mirrored.
+# In a file the bitangent points up the image; Mitsuba's is normal x tangent, which
+# points down it where texture coordinates are mirrored.
 
-# share of the surface whose texture coordinates may be mirrored without anything being
-# done about it
+# Fraction of the surface whose mirrored texture coordinates are ignored.
 FEW = 1e-3
 
 
 def _unmirrored(
     soup: Soup, uvs: Doubles, maps: SurfaceMaps
 ) -> tuple[Soup, SurfaceMaps]:
-    """Return a soup whose texture coordinates mirror no face, of such (F, 3, 2) in [0,
-    1], and the maps for them; no texel is resampled. Where some faces are mirrored, the
-    maps get a second half, which is the first one mirrored, and there these faces go.
+    """Return a soup whose UVs mirror no face, and the maps for it.
+
+    No texel is resampled. If some faces are mirrored, the maps get a second half, which
+    is the first one mirrored, and these faces are moved there.
+
+    Args:
+        soup: the object.
+        uvs: (F, 3, 2) in [0, 1].
+        maps: maps for these UVs.
     """
     soup = replace(soup, uvs=uvs)
     normals = maps.normals
-    over = doubled_areas(uvs) < 0.0
+    is_mirrored = doubled_areas(uvs) < 0.0
     area = np.linalg.norm(soup.face_vectors(), axis=1)
-    share = float(area[over].sum() / area.sum())
-    if normals is None or share < FEW:
+    mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
+    if normals is None or mirrored_fraction < FEW:
         return soup, maps
-    if 1.0 - share < FEW:
-        turned_over = normals * np.array([1, -1, 1], np.float32) + np.array(
+    if 1.0 - mirrored_fraction < FEW:
+        flipped = normals * np.array([1, -1, 1], np.float32) + np.array(
             [0, 1, 0], np.float32
         )
-        return soup, replace(maps, normals=turned_over)
-    placed = uvs.copy()
-    color = maps.color
-    glow = maps.emission
-    placed[over, :, 0] = 2.0 - placed[over, :, 0]
-    placed[:, :, 0] /= 2.0
-    other = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array(
+        return soup, replace(maps, normals=flipped)
+    new_uvs = uvs.copy()
+    new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
+    new_uvs[:, :, 0] /= 2.0
+    mirrored_normals = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array(
         [1, 0, 0], np.float32
     )
-    if glow is not None and glow.shape != (1, 1, 3):
-        glow = np.concatenate([glow, glow[:, ::-1]], axis=1)
-    color = np.concatenate([color, color[:, ::-1]], axis=1)
-    normals = np.concatenate([normals, other], axis=1)
-    return replace(soup, uvs=placed), SurfaceMaps(color, normals, glow)
+    emission = maps.emission
+    if emission is not None and emission.shape != (1, 1, 3):
+        emission = np.concatenate([emission, emission[:, ::-1]], axis=1)
+    color = np.concatenate([maps.color, maps.color[:, ::-1]], axis=1)
+    normals = np.concatenate([normals, mirrored_normals], axis=1)
+    return replace(soup, uvs=new_uvs), SurfaceMaps(color, normals, emission)
 
 
 def turned(
     texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles
 ) -> Floats:
-    """Return texels (T, 3) of a normal map, which lie on faces (T,) with these weights
-    (T, 3) of their corners, for other texture coordinates (F, 3, 2) than those of the
-    soup.
+    """Convert texels of a normal map from the tangents of old UVs to those of new UVs.
+
+    Args:
+        texels: (T, 3) of the normal map.
+        before: the object with the old UVs.
+        after: (F, 3, 2) the new UVs.
+        face: (T,) the face that each texel is on.
+        weights: (T, 3) barycentric weights of its corners.
     """
     normal = unit_vectors(np.einsum("tk,tkc->tc", weights, before.normals[face]))
-    old, new = (
-        _tangents(soup, normal, face) for soup in (before, replace(before, uvs=after))
-    )
-    up = np.cross(normal, old) * np.sign(doubled_areas(before.uvs[face]))[:, None]
+    old_tangent = _tangents(before, normal, face)
+    new_tangent = _tangents(replace(before, uvs=after), normal, face)
+    handedness = np.sign(doubled_areas(before.uvs[face]))[:, None]
+    old_bitangent = np.cross(normal, old_tangent) * handedness
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
-    way = x[:, None] * old + y[:, None] * up
-    bumps = np.stack(
-        [(way * new).sum(axis=1), (way * np.cross(normal, new)).sum(axis=1), z], axis=1
-    )
-    return texels_of(
-        np.where(np.isfinite(bumps).all(axis=1, keepdims=True), bumps, [0.0, 0.0, 1.0])
-    )
+    in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
+    new_x = (in_plane * new_tangent).sum(axis=1)
+    new_y = (in_plane * np.cross(normal, new_tangent)).sum(axis=1)
+    bumps = np.stack([new_x, new_y, z], axis=1)
+    is_valid = np.isfinite(bumps).all(axis=1, keepdims=True)
+    return texels_of(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
 
 
 def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:
-    """Unit directions (T, 3) along u in the plane across the normals (T, 3); NaN where
-    there is none.
+    """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
+
+    They are NaN where UVs have no area.
     """
-    used, at = np.unique(face, return_inverse=True)
+    used, index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))
     uvs = soup.uvs[used]
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
-    along = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * np.sign(
-        doubled_areas(uvs)
-    )[:, None]
-    along = along[at.reshape(-1)]
-    return unit_vectors(along - normal * (along * normal).sum(axis=1, keepdims=True))
+    handedness = np.sign(doubled_areas(uvs))[:, None]
+    tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * handedness
+    tangent = tangent[index.reshape(-1)]
+    along_normal = normal * (tangent * normal).sum(axis=1, keepdims=True)
+    return unit_vectors(tangent - along_normal)

@@ -1,8 +1,7 @@
-"""Values of a file by their keys: which keys were read is recorded, and the rest is
-named.
+"""Values of a file by key, with a record of which keys are read.
 
-Every reader of a format with keys uses this, so that nothing in a file is left out
-without a word.
+Every reader of a format with keys uses this, so that nothing in a file is silently
+ignored.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         within: str = "",
     ) -> None:
-        # keys, as spelled, that a later one of the same form hides
+        # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold
         self._within = within
@@ -52,11 +51,10 @@ class TrackedKeys(Generic[T]):
             self._spelling[folded] = key
 
     def get(self, *keys: str) -> T | None:
-        """Return the value of the first of these keys, in folded form, that has one, or
-        None.
+        """Return the value of the first of some keys, in folded form, that has one.
 
-        That key counts as read, and so do those of the others that have no value
-        (None).
+        None if none has. That key counts as read, and so do those of the others that
+        have no value.
         """
         present = [key for key in keys if self._values.get(key) is not None]
         self._read.update(key for key in keys if key not in present[1:])
@@ -71,18 +69,16 @@ class TrackedKeys(Generic[T]):
         self._read.update(keys)
 
     def nested(self, key: str) -> TrackedKeys[Any]:
-        """Return the keys within the value of a key; what is not read of them is not
-        read of this.
+        """Return the keys within the value of a key; they are tracked separately.
 
-        It has no keys where there is no such value. A value that is no mapping stays
-        unread.
+        Without such a value there are no keys. A value that is no mapping stays unread.
         """
         if key not in self._nested:
             value = self._values.get(key)
             inner: dict[str, Any] = {}
             if isinstance(value, Mapping):
                 self._read.add(key)
-                inner = {str(name): held for name, held in value.items()}
+                inner = {str(name): item for name, item in value.items()}
             spelled = self._spelling.get(key, key)
             self._nested[key] = TrackedKeys(
                 inner, fold=self._fold, within=f"{self._within}{spelled}."
@@ -90,12 +86,11 @@ class TrackedKeys(Generic[T]):
         return self._nested[key]
 
     def unread(self, is_quiet: Callable[[str, T], bool] | None = None) -> list[str]:
-        """Return the keys that were not read, as spelled, each with the keys that it is
-        within.
+        """Return the keys that were not read, as spelled, after those they are within.
 
         Args:
-            is_quiet: whether a key, in folded form, with its value needs no word,
-                because it changes nothing. It does not judge nested keys.
+            is_quiet: returns whether a key, in folded form, with its value needs no
+                note, because it changes nothing. Nested keys are not passed to it.
         """
         names = []
         for key, spelled in self._spelling.items():
@@ -107,9 +102,7 @@ class TrackedKeys(Generic[T]):
         return names
 
     def spelled(self, key: str) -> str:
-        """Return a key, in folded form, as the file spells it, or as it is if it has
-        none.
-        """
+        """Return a key, in folded form, as the file spells it; itself if it is absent."""
         return self._spelling.get(key, key)
 
     def items(self) -> Iterator[tuple[str, T]]:
@@ -124,10 +117,8 @@ class TrackedKeys(Generic[T]):
 
 
 def join_names(names: Iterable[str], max_named: int = MAX_NAMED) -> str:
-    """Return names out of a file for a message: quoted, cut in length, and the rest as
-    a number.
-    """
-    listed = list(dict.fromkeys(names))
-    text = ", ".join(shown(name) for name in listed[:max_named])
-    rest = len(listed) - max_named
-    return f"{text} and {rest:,} more" if rest > 0 else text
+    """Format names out of a file for a message: quoted, cut, and the rest counted."""
+    unique_names = list(dict.fromkeys(names))
+    text = ", ".join(shown(name) for name in unique_names[:max_named])
+    n_more = len(unique_names) - max_named
+    return f"{text} and {n_more:,} more" if n_more > 0 else text

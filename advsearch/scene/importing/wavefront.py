@@ -1,21 +1,22 @@
-"""Wavefront OBJ: statements as arrays, and the parts of geometry that they make up.
+"""Reader of Wavefront OBJ files.
 
-Statements of numbers are read as arrays, since a file may have millions of lines; the
-others one after the other.
+Statements of numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a file
+may have millions of lines; all other statements are parsed line by line.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints, face_vectors
+from advsearch.scene.assets import Bools, Doubles, Ints, face_vectors
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.files import (
@@ -43,7 +44,7 @@ from advsearch.scene.importing.parts import (
 )
 from advsearch.trust.named_files import References
 
-# statements that only name parts; all parts are joined
+# Statements that only name groups of faces; all groups are joined.
 GROUPING = frozenset(("g", "o"))
 FREE_FORM = (
     "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv "
@@ -54,189 +55,270 @@ WITHOUT_FACES = {
     "l": "lines",
     **dict.fromkeys(FREE_FORM, "curves and curved surfaces"),
 }
-# material files, and materials, that a file may name, before `scaled`
+# Limit of the material files, and of the materials, that a file may name; before
+# `scaled`.
 MOST_NAMED = 10_000
-# how far texture coordinates may lie outside of a texture before it matters how that
-# goes on
+# How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
 BEYOND = 0.01
+# First words of a smoothing group (``s``) that turn smoothing off.
+NOT_SMOOTH = ("off", "0", "")
 
 
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read an OBJ file, and the material files that it names, as one part for each
-    material, and another for its faces without texture coordinates. Raises
-    FileFormatError: it is of another kind, is cut short, refers to what is not in it,
-    or has no faces.
+    """Read an OBJ file and the material files that it names.
+
+    Each material becomes one part, and its faces without texture coordinates another.
+
+    Raises:
+        FileFormatError: the file is of another kind, is cut short, refers to geometry
+            that it does not contain, or has no faces.
     """
     lines = Lines(data, notes)
     tables = {kind: lines.table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise notes.damaged(EXPECTED, data)
-    corners, counts, rows = lines.faces(
-        {kind: len(table) for kind, table in tables.items()}
-    )
-    if (counts < 3).all():
+    table_sizes = {kind: len(table) for kind, table in tables.items()}
+    corners, corner_counts, face_rows = lines.faces(table_sizes)
+    if (corner_counts < 3).all():
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got points or "
             "lines only; export triangles"
         )
-    references = References(path)
 
-    def shown_on(name: str, number: int) -> tuple[Doubles, Doubles]:
-        mine = (
+    def find_mapped_faces(name: str, square_number: int) -> tuple[Doubles, Doubles]:
+        """Return UVs (F, 3, 2) and doubled areas (F,) of the faces with a material."""
+        # Called only after the arrays below exist.
+        is_selected = (
             (material == names.index(name))
-            & (square == number)
-            & (mapped >= 0).all(axis=1)
+            & (square == square_number)
+            & (uv.at >= 0).all(axis=1)
         )
-        return tables["vt"][mapped[mine]], np.linalg.norm(
-            face_vectors(points[position[mine]]), axis=1
-        )
+        selected_uvs = uv.values[uv.at[is_selected]]
+        vectors = face_vectors(position.values[position.at[is_selected]])
+        return selected_uvs, np.linalg.norm(vectors, axis=1)
 
-    reader = MtlReader(references, notes, shown_on)
-    named, materials, smoothing = _statements(lines, notes)
-    named = list(dict.fromkeys(named))
-    notes.check_most(
-        len(named), MOST_NAMED, "at most {} lines that name material files (mtllib)"
-    )
-    libraries = libraries_of(named, references)
-    notes.check_most(len(libraries), MOST_NAMED, "at most {} material files")
-    for name in libraries:
-        reader.read_library(name)
+    reader = MtlReader(References(path), notes, find_mapped_faces)
+    library_lines, material_changes, smoothing_changes = _statements(lines, notes)
+    _read_libraries(reader, library_lines, notes)
+
     points = tables["v"][:, :3]
-    triangles, face = cut_up(points[corners[:, 0]], counts, notes)
-    position, mapped, normal = (corners[triangles, place] for place in range(3))
-    names, material = _in_effect(materials, rows[face])
+    triangles, polygon = cut_up(points[corners[:, 0]], corner_counts, notes)
+    position = Looked(points, corners[triangles, 0])
+    uv = Looked(tables["vt"], corners[triangles, 1])
+    normal = Looked(tables["vn"], corners[triangles, 2])
+    rows = face_rows[polygon]
+    names, material = _in_effect(material_changes, rows)
     notes.check_most(len(names), MOST_NAMED, "at most {} materials")
-    smoothness, smooth = _in_effect(smoothing, rows[face])
-    off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
-    if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
-        notes.say(
-            "smoothing groups are left out: its normals are made, with creases "
-            "at sharp edges"
-        )
+    is_flat = _find_flat_faces(smoothing_changes, rows, normal, notes)
     colors = _colors(lines, tables["v"], notes)
-    colors = None if colors is None else colors[position]
+    if colors is not None:
+        colors = colors[position.at]
+    has_uvs = np.asarray((uv.at >= 0).all(axis=1))
+    square = _find_squares(reader, names, material, uv)
+
     parts = []
-    square = np.zeros(len(mapped), np.int64)  # of UDIM; 0: one picture for all
-    inside = (mapped >= 0).all(axis=1)
-    for number in np.unique(material[inside & (material >= 0)]):
-        mine = np.flatnonzero(inside & (material == number))
-        squares = mtl_surfaces.squares(tables["vt"][mapped[mine]])
-        several = reader.squares_of(names[number], np.unique(squares).tolist())
-        square[mine] = np.where(np.isin(squares, several), squares, 0)
-    for chosen in alike(material, inside, off, square):
-        first = chosen[0]
+    for group in alike(material, has_uvs, is_flat, square):
+        first = group[0]
         name = names[material[first]] if material[first] >= 0 else ""
-        number = int(square[first])
-        painted = reader.painted(name, number) if name else Painted(ImportedSurface())
-        if painted is None:
-            painted = Painted(ImportedSurface(name=without_comment(name)))
-            instead = f"{'neutral grey' if colors is None else 'the colour of its vertices'} is used instead"
-            if reader.libraries:
-                lacks = (
-                    "its .mtl file lacks"
-                    if reader.libraries == 1
-                    else "its .mtl files lack"
-                )
-                notes.say(f" uses the material {shown(name)}, which {lacks}; {instead}")
-            elif not named:  # else it is said already that none could be read
-                notes.say(
-                    f" uses materials and names no material file (mtllib); {instead}"
-                )
-        surface = painted.surface
-        tint = colors
-        color = surface.color
-        tinted = tint is not None and tint[chosen].min() < 1.0
-        if surface.texture is not None:
-            if tinted:
-                notes.say("colours of vertices are left out where there is a texture")
-            tint = None
-        elif tint is not None and color is None:
-            surface = replace(surface, color=np.ones(3, np.float32))
-        elif tinted and color is not None and color[:3].min() < 0.999:
-            notes.say("colours of vertices are multiplied by the Kd of their material")
-        uvs = (
-            tables["vt"] - mtl_surfaces.corner_of(number)
-        ) * painted.scale + painted.offset
-        used = uvs[mapped[chosen]] if inside[first] else np.zeros(0)
-        if (
-            painted.clamped
-            and len(used)
-            and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND)
-        ):
+        painted = _find_material(
+            reader, name, int(square[first]), colors is not None, bool(library_lines)
+        )
+        surface, tint = _combine_colors(painted.surface, colors, group, notes)
+        corner = mtl_surfaces.corner_of(int(square[first]))
+        uvs = (tables["vt"] - corner) * painted.scale + painted.offset
+        if painted.clamped and has_uvs[first] and _repeats(uvs[uv.at[group]]):
             notes.say(
                 " has textures that are not to repeat beyond their edges "
                 "(-clamp); here they do"
             )
-        looked_up = (
-            Looked(points, position),
-            Looked(tables["vn"], normal),
-            Looked(uvs, mapped),
-        )
         parts.append(
-            split_at_corners(chosen, *looked_up, tint, surface, flat=bool(off[first]))
+            split_at_corners(
+                group,
+                position,
+                normal,
+                Looked(uvs, uv.at),
+                tint,
+                surface,
+                flat=bool(is_flat[first]),
+            )
         )
     return parts
+
+
+def _read_libraries(
+    reader: MtlReader, library_lines: Sequence[str], notes: Notes
+) -> None:
+    """Read the material files that ``mtllib`` lines name."""
+    unique_lines = list(dict.fromkeys(library_lines))
+    notes.check_most(
+        len(unique_lines),
+        MOST_NAMED,
+        "at most {} lines that name material files (mtllib)",
+    )
+    libraries = libraries_of(unique_lines, reader.references)
+    notes.check_most(len(libraries), MOST_NAMED, "at most {} material files")
+    for name in libraries:
+        reader.read_library(name)
+
+
+def _find_flat_faces(
+    smoothing_changes: list[tuple[int, str]], rows: Ints, normal: Looked, notes: Notes
+) -> Bools:
+    """Return for each triangle whether its smoothing group is off, (T,)."""
+    values, group = _in_effect(smoothing_changes, rows)
+    is_off_by_group = [value in NOT_SMOOTH for value in values]
+    # Index -1, of triangles before the first statement, is the last entry.
+    is_off = np.array([*is_off_by_group, False])[group]
+    lacks_normals = (normal.at < 0).any(axis=1)
+    if ((group >= 0) & ~is_off & lacks_normals).any():
+        notes.say(
+            "smoothing groups are left out: its normals are made, with creases "
+            "at sharp edges"
+        )
+    return np.asarray(is_off)
+
+
+def _find_squares(
+    reader: MtlReader, names: Sequence[str], material: Ints, uv: Looked
+) -> Ints:
+    """Return the UDIM square of each triangle, (T,); 0 where one image is for all."""
+    square = np.zeros(len(material), np.int64)
+    has_uvs = (uv.at >= 0).all(axis=1)
+    for material_index in np.unique(material[has_uvs & (material >= 0)]):
+        faces = np.flatnonzero(has_uvs & (material == material_index))
+        face_squares = mtl_surfaces.squares(uv.values[uv.at[faces]])
+        candidates = np.unique(face_squares).tolist()
+        with_image = reader.squares_of(names[material_index], candidates)
+        square[faces] = np.where(np.isin(face_squares, with_image), face_squares, 0)
+    return square
+
+
+def _find_material(
+    reader: MtlReader,
+    name: str,
+    square_number: int,
+    has_colors: bool,
+    names_libraries: bool,
+) -> Painted:
+    """Return the material of a name, or a plain one and a note if there is none."""
+    if not name:
+        return Painted(ImportedSurface())
+    painted = reader.painted(name, square_number)
+    if painted is not None:
+        return painted
+    substitute = "the colour of its vertices" if has_colors else "neutral grey"
+    instead = f"{substitute} is used instead"
+    if reader.libraries:
+        lacks = (
+            "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
+        )
+        reader.notes.say(f" uses the material {shown(name)}, which {lacks}; {instead}")
+    elif not names_libraries:  # otherwise a note says that none could be read
+        reader.notes.say(
+            f" uses materials and names no material file (mtllib); {instead}"
+        )
+    return Painted(ImportedSurface(name=without_comment(name)))
+
+
+def _combine_colors(
+    surface: ImportedSurface, colors: Doubles | None, group: Ints, notes: Notes
+) -> tuple[ImportedSurface, Doubles | None]:
+    """Decide how vertex colors and a material's own color are combined.
+
+    Args:
+        surface: the material.
+        colors: (T, 3, 3) linear vertex colors of the corners of all triangles, or None.
+        group: the triangles that have the material.
+        notes: where it is reported what is left out.
+
+    Returns:
+        The surface, and the colors that multiply its color (None: nothing does).
+    """
+    if colors is None:
+        return surface, None
+    is_tinted = colors[group].min() < 1.0
+    if surface.texture is not None:
+        if is_tinted:
+            notes.say("colours of vertices are left out where there is a texture")
+        return surface, None
+    if surface.color is None:
+        return replace(surface, color=np.ones(3, np.float32)), colors
+    if is_tinted and surface.color[:3].min() < 0.999:
+        notes.say("colours of vertices are multiplied by the Kd of their material")
+    return surface, colors
+
+
+def _repeats(uvs: Doubles) -> bool:
+    """Return whether UVs reach beyond [0, 1], where a texture repeats; NaN counts."""
+    return not (uvs.min() >= -BEYOND and uvs.max() <= 1.0 + BEYOND)
 
 
 def _statements(
     lines: Lines, notes: Notes
 ) -> tuple[list[str], list[tuple[int, str]], list[tuple[int, str]]]:
-    """Return what stands after ``mtllib``, names after ``usemtl`` and words after
-    ``s``, with the rows that these are in; statements of which nothing becomes are
-    noted.
+    """Parse the statements that are no numbers, and note those that are left out.
+
+    Returns:
+        The texts after ``mtllib``; and with the row of each, the material names after
+        ``usemtl`` and the words after ``s`` (smoothing).
     """
-    libraries = list[str]()
-    materials = list[tuple[int, str]]()
-    smoothing = list[tuple[int, str]]()
-    for row, word, rest in lines.others():
-        key = word.lower()
-        plain = without_comment(rest).lower()
+    library_lines = list[str]()
+    material_changes = list[tuple[int, str]]()
+    smoothing_changes = list[tuple[int, str]]()
+    for row, keyword, rest in lines.others():
+        key = keyword.lower()
+        argument = without_comment(rest).lower()
         if key == "mtllib":
-            libraries.append(rest)
+            library_lines.append(rest)
         elif key == "usemtl":
-            materials.append((row, " ".join(rest.split())))
+            material_changes.append((row, " ".join(rest.split())))
         elif key == "s":
-            smoothing.append((row, plain))
+            smoothing_changes.append((row, argument))
         elif key in WITHOUT_FACES:
             notes.has(f"{WITHOUT_FACES[key]}, statement", key)
-        elif key not in GROUPING and plain not in ("off", "0"):
-            notes.has("statement", word)
-    return libraries, materials, smoothing
+        elif key not in GROUPING and argument not in ("off", "0"):
+            notes.has("statement", keyword)
+    return library_lines, material_changes, smoothing_changes
 
 
 def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], Ints]:
-    """Return the values that are said, and for each row the number of the last before
-    it; -1 where there is none.
+    """Find the value in effect on each row, given the rows at which it changes.
+
+    Returns:
+        The different values, and for each row the index of the last one set before it,
+        -1 if none was.
     """
-    numbers = {
-        value: number
-        for number, value in enumerate(dict.fromkeys(value for _, value in changes))
-    }
-    last = (
-        np.searchsorted(np.array([row for row, _ in changes], dtype=np.int64), rows) - 1
-    )
-    return list(numbers), np.array([*(numbers[value] for _, value in changes), -1])[
-        last
-    ]
+    values = list(dict.fromkeys(value for _, value in changes))
+    index_of_value = {value: index for index, value in enumerate(values)}
+    change_rows = np.array([row for row, _ in changes], dtype=np.int64)
+    last_change = np.searchsorted(change_rows, rows) - 1
+    # Position -1, of rows before the first change, is the last entry.
+    change_index = np.array([*(index_of_value[value] for _, value in changes), -1])
+    return values, change_index[last_change]
 
 
 def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
-    """Return the linear colour (V, 3) of every vertex; neutral grey where a file with
-    colours has none. A vertex is three coordinates, then perhaps a weight, or a colour,
-    or a colour and its opacity; or ZBrush has put colours into comments.
+    """Return the linear color (V, 3) of every vertex, or None if the file has none.
+
+    A ``v`` line has three coordinates, then perhaps a weight, or a color, or a color
+    and its opacity; ZBrush writes colors into comments. Vertices without a color are
+    neutral grey in a file with colors.
     """
-    if (np.isfinite(table[:, 3]) & np.isnan(table[:, 4]) & (table[:, 3] != 1.0)).any():
+    weight = table[:, 3]
+    opacity = table[:, 6]
+    if (np.isfinite(weight) & np.isnan(table[:, 4]) & (weight != 1.0)).any():
         notes.has("weights of vertices, the fourth number of", "v")
-    given: Doubles | None = table[:, 3:6]
-    if np.isfinite(table[:, 6]).any() and not np.isin(table[:, 6], (1.0, 255.0)).all():
+    if np.isfinite(opacity).any() and not np.isin(opacity, (1.0, 255.0)).all():
         notes.has("opacities of vertices, the seventh number of", "v")
+    stored: Doubles | None = table[:, 3:6]
     if np.isnan(table[:, 5]).all():
-        given = lines.zbrush_colors(len(table))
-    if given is None:
+        stored = lines.zbrush_colors(len(table))
+    if stored is None:
         return None
-    known = np.asarray(np.isfinite(given).all(axis=1))
-    scale = 255.0 if known.any() and given[known].max() > 2.0 else 1.0
-    colors = np.where(known[:, None], given / scale, NEUTRAL)
+    has_color = np.asarray(np.isfinite(stored).all(axis=1))
+    is_of_bytes = has_color.any() and stored[has_color].max() > 2.0
+    scale = 255.0 if is_of_bytes else 1.0
+    colors = np.where(has_color[:, None], stored / scale, NEUTRAL)
     return np.asarray(
         srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64
     )
@@ -244,177 +326,142 @@ def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
 
 Bytes = npt.NDArray[np.uint8]
 TABLES = {"v": (3, 7), "vt": (1, 2), "vn": (3, 3)}
-"""Statements of numbers with the fewest that they have, and how many are read."""
+"""Statements of numbers: how many each has at least, and how many are read."""
 KINDS = (*TABLES, "f")
 EXPECTED = "a Wavefront OBJ file (text with 'v' and 'f' lines)"
 _CONTINUED = re.compile(rb"\\[ \t]*\n")
 _COMMENTED = re.compile(rb"^([ \t]*#[^\n]*?)\\[ \t]*\n", re.MULTILINE)
 _CORNER = re.compile(r"[-+]?\d+(?:/(?:[-+]?\d+)?){0,2}")
 _NEWLINE, _HASH, _SLASH = b"\n#/"
+# Tables over all bytes: which are blank, and which may stand in the corners of faces.
 _BLANK, _IN_CORNERS = (
-    np.isin(np.arange(256), np.frombuffer(some, np.uint8))
-    for some in (b" \t\n\v\f", b"+-/0123456789 \t\n\v\f")
+    np.isin(np.arange(256), np.frombuffer(characters, np.uint8))
+    for characters in (b" \t\n\v\f", b"+-/0123456789 \t\n\v\f")
 )
 
 
 class Lines:
-    """The lines of a file, each of its kind: ``v``, ``vt``, ``vn``, ``f``, or another.
-    Raises FileFormatError: it is no text.
+    """The lines of an OBJ file, sorted into ``v``, ``vt``, ``vn``, ``f`` and others.
+
+    Raises:
+        FileFormatError: the file is not text.
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
-        text = (
-            data.removeprefix(b"\xef\xbb\xbf")
-            .replace(b"\r\n", b"\n")
-            .replace(b"\r", b"\n")
-            + b"\n"
-        )
-        if _CONTINUED.search(text):  # which a comment is not
-            text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
-        if b"\n " in text or b"\n\t" in text or text[:1] in b" \t":
-            text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
-        if b"\nfo" in text:  # the old word for a face
-            text = re.sub(rb"\nfo(?=[ \t])", b"\nf", text)
+        text = _normalize_lines(data)
         self.notes = notes
         self.text = text
-        # as files are that were cut short
+        # Files that were cut short do not end in a line break.
         self.unended = not data.endswith((b"\n", b"\r"))
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
         padded = np.concatenate([self.bytes, np.full(3, _NEWLINE, np.uint8)])
-        first, second, third = (padded[self.starts + place] for place in range(3))
+        first, second, third = (padded[self.starts + offset] for offset in range(3))
+        # Index into `KINDS` of each line; the length of `KINDS` means another.
         self.kind = np.full(len(self.starts), len(KINDS), dtype=np.int8)
-        for number, kind in enumerate(KINDS):
-            longer = len(kind) == 2
-            same = (first == ord(kind[0])) & (
-                (second == ord(kind[1])) if longer else True
-            )
-            self.kind[same & _BLANK[third if longer else second]] = number
+        for index, kind in enumerate(KINDS):
+            if len(kind) == 2:
+                matches = (first == ord(kind[0])) & (second == ord(kind[1]))
+                after_keyword = third
+            else:
+                matches = first == ord(kind[0])
+                after_keyword = second
+            self.kind[matches & _BLANK[after_keyword]] = index
 
     def others(self) -> Iterator[tuple[int, str, str]]:
-        other = (
-            (self.kind == len(KINDS))
-            & (self.bytes[self.starts] != _NEWLINE)
-            & (self.bytes[self.starts] != _HASH)
+        """Yield the row, keyword and rest of every line that is no table or comment."""
+        first_byte = self.bytes[self.starts]
+        is_other = (
+            (self.kind == len(KINDS)) & (first_byte != _NEWLINE) & (first_byte != _HASH)
         )
-        for row in np.flatnonzero(other):
-            line = (
-                text_of(self.text[self.starts[row] : self.ends[row]])
-                .strip()
-                .replace("\t", " ")
-            )
-            key, _, rest = line.partition(" ")
-            yield int(row), key, rest.strip()
+        for row in np.flatnonzero(is_other):
+            line = text_of(self.text[self.starts[row] : self.ends[row]])
+            keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
+            yield int(row), keyword, rest.strip()
 
     def table(self, kind: str) -> Doubles:
-        """Return the numbers of all lines of a kind in a table; where one has fewer, 0
-        for ``vt``, else NaN. Raises FileFormatError: a line has too few, or something
-        else.
+        """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
+
+        Numbers that a line does not have are 0 for ``vt`` and NaN for the others.
+
+        Raises:
+            FileFormatError: a line has too few numbers, or other words.
         """
-        (fewest, most) = TABLES[kind]
-        rest = 0.0 if kind == "vt" else np.nan
-        rows, data = self._of(kind)
+        min_count, columns = TABLES[kind]
+        fill = 0.0 if kind == "vt" else np.nan
+        rows, data = self._select_lines(kind)
         if not len(rows):
-            return np.zeros((0, most))
-        blank = _BLANK[data]
-        begins = ~blank
-        begins[1:] &= blank[:-1]
-        ends = np.flatnonzero(data == _NEWLINE)
-        counts = np.add.reduceat(
-            begins, np.concatenate([[0], ends[:-1] + 1]), dtype=np.int64
-        )
+            return np.zeros((0, columns))
+        counts = _count_words(data)
         values: Doubles = numbers_in(data.tobytes(), np.float64).astype(
             np.float64, copy=False
         )
-        if counts.min() < fewest or len(values) != counts.sum():
-            for number, words in self._words(rows):
-                where = f"after {kind!r} on line {number}"
-                got = shown(" ".join(words))
-                if len(words) < fewest:
-                    what = "3 numbers" if fewest == 3 else "numbers"
-                    raise self.notes.damaged(
-                        f"{what} {where}", f"{got} (is the file cut short?)"
-                    )
-                if not all(map(is_number, words)):
-                    raise self.notes.damaged(f"numbers {where}", got)
-            raise self.notes.damaged(f"numbers after {kind!r}", "something else")
+        if counts.min() < min_count or len(values) != counts.sum():
+            self._raise_for_numbers(kind, rows)
         if (counts == counts[0]).all():
-            table = values.reshape(len(rows), -1)[:, :most]
-            return np.pad(
-                table, ((0, 0), (0, most - table.shape[1])), constant_values=rest
-            )
-        place = np.arange(len(values)) - np.repeat(np.cumsum(counts) - counts, counts)
-        kept = place < most
-        table = np.full((len(rows), most), rest)
-        table[np.repeat(np.arange(len(rows)), counts)[kept], place[kept]] = values[kept]
+            table = values.reshape(len(rows), -1)[:, :columns]
+            missing = columns - table.shape[1]
+            return np.pad(table, ((0, 0), (0, missing)), constant_values=fill)
+        first_of_line = np.cumsum(counts) - counts
+        column = np.arange(len(values)) - np.repeat(first_of_line, counts)
+        row = np.repeat(np.arange(len(rows)), counts)
+        is_read = column < columns
+        table = np.full((len(rows), columns), fill)
+        table[row[is_read], column[is_read]] = values[is_read]
         return table
 
+    def _raise_for_numbers(self, kind: str, rows: Ints) -> NoReturn:
+        """Raise FileFormatError for the first line whose numbers are wrong."""
+        min_count = TABLES[kind][0]
+        for line_number, words in self._iterate_words(rows):
+            where = f"after {kind!r} on line {line_number}"
+            got = shown(" ".join(words))
+            if len(words) < min_count:
+                expected = "3 numbers" if min_count == 3 else "numbers"
+                raise self.notes.damaged(
+                    f"{expected} {where}", f"{got} (is the file cut short?)"
+                )
+            if not all(map(is_number, words)):
+                raise self.notes.damaged(f"numbers {where}", got)
+        raise self.notes.damaged(f"numbers after {kind!r}", "something else")
+
     def faces(self, counts: dict[str, int]) -> tuple[Ints, Ints, Ints]:
-        """Return the corners of all faces: (C, 3) rows of the tables of points, texture
-        coordinates and normals, -1 where there is none; (P,) how many corners each face
-        has; and (P,) the rows that they are in. Raises FileFormatError: a face is
-        damaged, is too large, or refers to what is not there; or they are too many.
+        """Return the corners of all faces.
+
+        Args:
+            counts: how many rows the tables of points, UVs and normals have.
+
+        Returns:
+            (C, 3) for each corner the rows of the three tables, -1 for none; (P,) the
+            number of corners of each face; and (P,) the row of each face's line.
+
+        Raises:
+            FileFormatError: a face is malformed, is too large, or refers to what is not
+                in the file; or there are too many.
         """
-        rows, data = self._of("f")
+        rows, data = self._select_lines("f")
         if not len(rows):
             return np.zeros((0, 3), np.int64), rows, rows
-        blank = _BLANK[data]
-        slash = data == _SLASH
-        number = ~(blank | slash)
-        begins = np.flatnonzero(number[1:] & ~number[:-1]) + 1
-        first = blank[begins - 1]
-        step = np.where(first, 0, np.where(slash[begins - 2], 2, 1))
-        place = step.copy()  # of a number in its corner; it has three at most
-        place[1:] += np.where(first[1:], 0, step[:-1])
-        place[2:] += np.where(first[2:] | first[1:-1], 0, step[:-2])
-        longer = ~(first[3:] | first[2:-1] | first[1:-2])
-        odd = (
-            (slash[1:] & blank[:-1]).any()
-            or not _IN_CORNERS[data].all()
-            or longer.any()
-            or (place > 2).any()
-        )
-        values = numbers_in(
-            np.where(slash, np.uint8(ord(" ")), data).tobytes(), np.int64
-        )
-        if odd or len(values) != len(begins) or (values == 0).any():
-            self._blame_faces(rows)
-        at = np.flatnonzero(first)
-        sizes = np.diff(
-            np.searchsorted(begins[at], np.flatnonzero(data == _NEWLINE)), prepend=0
-        )
-        if sizes[-1] < 3 and self.unended and rows[-1] == len(self.starts) - 1:
-            ((number, words),) = self._words(rows[-1:])
-            got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
-            raise self.notes.damaged(f"3 or more corners on line {number}", got)
-        where = f"in the face on line {rows[sizes.argmax()] + 1}"
-        self.notes.check_most(
-            int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}"
-        )
-        self.notes.check_faces(int((sizes - 2).clip(0).sum()))
-        corners = np.zeros((len(at), 3), dtype=np.int64)
-        corners[np.cumsum(first) - 1, place] = values
+        parsed = _parse_corners(data)
+        if parsed is None:
+            self._raise_for_faces(rows)
+        corners, sizes = parsed
+        self._check_sizes(rows, sizes)
         for column, kind in enumerate(TABLES):
+            # A view: relative indices are replaced in `corners`.
             index = corners[:, column]
             if not len(index):
                 continue
-            if (index < 0).any():
-                before = np.repeat(
-                    np.cumsum(self.kind == KINDS.index(kind))[rows], sizes
-                )
-                if (index < -before).any():
-                    self._blame_faces(rows)
-                index[index < 0] += (before + 1)[index < 0]
+            self._resolve_relative(index, kind, rows, sizes)
             if index.max() > counts[kind]:
-                row = rows[
-                    np.searchsorted(np.cumsum(sizes), int(index.argmax()), side="right")
-                ]
+                corner_ends = np.cumsum(sizes)
+                face = np.searchsorted(corner_ends, int(index.argmax()), side="right")
                 got = (
-                    f"{counts[kind]}, and a face on line {row + 1} that refers to "
-                    f"number {index.max()}"
+                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
+                    f"to number {index.max()}"
                 )
                 raise self.notes.damaged(
                     f"at least {index.max()} {kind!r} lines",
@@ -422,9 +469,36 @@ class Lines:
                 )
         return corners - 1, sizes, rows
 
+    def _check_sizes(self, rows: Ints, sizes: Ints) -> None:
+        """Raise FileFormatError for a last face cut short, or faces over a limit."""
+        is_last_line = rows[-1] == len(self.starts) - 1
+        if sizes[-1] < 3 and self.unended and is_last_line:
+            ((line_number, words),) = self._iterate_words(rows[-1:])
+            got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
+            raise self.notes.damaged(f"3 or more corners on line {line_number}", got)
+        where = f"in the face on line {rows[sizes.argmax()] + 1}"
+        self.notes.check_most(
+            int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}"
+        )
+        self.notes.check_faces(int((sizes - 2).clip(0).sum()))
+
+    def _resolve_relative(
+        self, index: Ints, kind: str, rows: Ints, sizes: Ints
+    ) -> None:
+        """Replace negative indices (C,), which count back from a face's line."""
+        is_relative = index < 0
+        if not is_relative.any():
+            return
+        count_before_line = np.cumsum(self.kind == KINDS.index(kind))
+        count_before = np.repeat(count_before_line[rows], sizes)
+        if (index < -count_before).any():
+            self._raise_for_faces(rows)
+        index[is_relative] += (count_before + 1)[is_relative]
+
     def zbrush_colors(self, count: int) -> Doubles | None:
-        """Return the colours (N, 3) in [0, 255] that ZBrush writes into comments
-        (``#MRGB``), or None.
+        """Return the colors (N, 3) in [0, 255] of ZBrush's comments, or None.
+
+        ZBrush writes them after ``#MRGB``, eight hexadecimal digits for each vertex.
         """
         if b"#MRGB" not in self.text:
             return None
@@ -433,48 +507,117 @@ class Lines:
         )
         if len(digits) != 8 * count:
             return None
-        return (
-            np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
-            .reshape(-1, 4)[:, 1:]
-            .astype(np.float64)
-        )
+        channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
+        return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
-    def _of(self, kind: str) -> tuple[Ints, Bytes]:
-        mine = self.kind == KINDS.index(kind)
+    def _select_lines(self, kind: str) -> tuple[Ints, Bytes]:
+        """Return the rows of the lines of a kind, and their bytes.
+
+        Keywords and comments are blanked out or removed, so that only the arguments
+        and one line break for each row are left.
+        """
+        is_selected = self.kind == KINDS.index(kind)
         lengths = self.ends - self.starts + 1
-        rows = np.flatnonzero(mine)
-        data = self.bytes[np.repeat(mine, lengths)]
+        rows = np.flatnonzero(is_selected)
+        data = self.bytes[np.repeat(is_selected, lengths)]
         starts = np.cumsum(lengths[rows]) - lengths[rows]
-        for place in range(len(kind)):
-            data[starts + place] = ord(" ")
+        for offset in range(len(kind)):
+            data[starts + offset] = ord(" ")
         if (data == _HASH).any():
-            data = np.frombuffer(
-                re.sub(rb"#[^\n]*", b"", data.tobytes()), dtype=np.uint8
-            )
+            without_comments = re.sub(rb"#[^\n]*", b"", data.tobytes())
+            data = np.frombuffer(without_comments, dtype=np.uint8)
         return rows, data
 
-    def _words(self, rows: Ints) -> Iterator[tuple[int, list[str]]]:
+    def _iterate_words(self, rows: Ints) -> Iterator[tuple[int, list[str]]]:
+        """Yield the line number, from 1, and the arguments of each of some lines."""
         for row in rows:
             line = text_of(self.text[self.starts[row] : self.ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
-    def _blame_faces(self, rows: Ints) -> None:
-        counts = np.stack(
+    def _raise_for_faces(self, rows: Ints) -> NoReturn:
+        """Raise FileFormatError for the first face that has a wrong index."""
+        counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
         )
-        for number, words in self._words(rows):
+        for line_number, words in self._iterate_words(rows):
+            counts = counts_before_line[line_number - 1]
             for word in words:
                 if not _CORNER.fullmatch(word):
                     raise self.notes.damaged(
-                        f"whole numbers in the face on line {number}", shown(word)
+                        f"whole numbers in the face on line {line_number}", shown(word)
                     )
-                indices = [int(part or "1") for part in word.split("/")]
-                if any(
-                    not index or index < -most
-                    for index, most in zip(indices, counts[number - 1], strict=False)
-                ):
+                indices = [int(text or "1") for text in word.split("/")]
+                is_wrong = any(
+                    not index or index < -count
+                    for index, count in zip(indices, counts, strict=False)
+                )
+                if is_wrong:
                     raise self.notes.damaged(
-                        f"indices that count from 1 in the face on line {number}",
+                        f"indices that count from 1 in the face on line {line_number}",
                         shown(word),
                     )
         raise self.notes.damaged("whole numbers in faces", "something else")
+
+
+def _normalize_lines(data: bytes) -> bytes:
+    """Return text whose lines end in a line feed and begin with their keyword."""
+    text = (
+        data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+        + b"\n"
+    )
+    # A backslash continues a line, but not a comment.
+    if _CONTINUED.search(text):
+        text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
+    if b"\n " in text or b"\n\t" in text or text[:1] in b" \t":
+        text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
+    # Old files have ``fo`` for a face.
+    if b"\nfo" in text:
+        text = re.sub(rb"\nfo(?=[ \t])", b"\nf", text)
+    return text
+
+
+def _count_words(data: Bytes) -> Ints:
+    """Return how many words each line of bytes has."""
+    is_blank = _BLANK[data]
+    begins_word = ~is_blank
+    begins_word[1:] &= is_blank[:-1]
+    ends = np.flatnonzero(data == _NEWLINE)
+    line_starts = np.concatenate([[0], ends[:-1] + 1])
+    return np.asarray(np.add.reduceat(begins_word, line_starts, dtype=np.int64))
+
+
+def _parse_corners(data: Bytes) -> tuple[Ints, Ints] | None:
+    """Parse the corners of face lines, such as ``1/2/3 4//5 6``.
+
+    Returns:
+        (C, 3) indices of points, UVs and normals as the file has them, 0 for none; and
+        (P,) the number of corners of each face. None if the text is malformed.
+    """
+    is_blank = _BLANK[data]
+    is_slash = data == _SLASH
+    is_digit = ~(is_blank | is_slash)
+    begins = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
+    is_first = is_blank[begins - 1]
+    # Column of each number in its corner, by the slashes before it. A corner has three
+    # numbers at most, so the steps of two predecessors are enough.
+    step = np.where(is_first, 0, np.where(is_slash[begins - 2], 2, 1))
+    column = step.copy()
+    column[1:] += np.where(is_first[1:], 0, step[:-1])
+    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, step[:-2])
+    has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
+    is_malformed = (
+        (is_slash[1:] & is_blank[:-1]).any()
+        or not _IN_CORNERS[data].all()
+        or has_fourth.any()
+        or (column > 2).any()
+    )
+    without_slashes = np.where(is_slash, np.uint8(ord(" ")), data)
+    values = numbers_in(without_slashes.tobytes(), np.int64)
+    if is_malformed or len(values) != len(begins) or (values == 0).any():
+        return None
+    first_begins = begins[is_first]
+    line_ends = np.flatnonzero(data == _NEWLINE)
+    sizes = np.diff(np.searchsorted(first_begins, line_ends), prepend=0)
+    corners = np.zeros((len(first_begins), 3), dtype=np.int64)
+    corners[np.cumsum(is_first) - 1, column] = values
+    return corners, sizes

@@ -1,7 +1,7 @@
-"""OpenUSD files through glTF, which a process of its own makes of them with `usd-core`.
+"""Converter of OpenUSD files to glTF, with `usd-core` in a separate process.
 
-Readers of binary formats are written in C++, and a file may make them crash or take all
-memory.
+Its readers of binary formats are written in C++, and a file may make them crash or use
+all memory.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from advsearch.extend import errors, reading, stored_files
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
-USD_LONGEST = 120  # seconds that it may take, before `scaled`
-MEMORY = 8 << 30  # bytes of memory that it may take, before `scaled`
+USD_LONGEST = 120  # timeout in seconds, before `scaled`
+MEMORY = 8 << 30  # limit of its memory in bytes, before `scaled`
 USD_BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REFUSED = "refused: "
 _LIMITED = f"""
@@ -35,12 +35,16 @@ runpy.run_module("advsearch.scene.importing.usd.stage", run_name="__main__", alt
 
 
 def is_installed() -> bool:
+    """Return whether usd-core is installed."""
     return importlib.util.find_spec("pxr") is not None
 
 
 def convert_usd(path: Path, data: bytes) -> bytes:
-    """Return an OpenUSD file as binary glTF. Raises FileFormatError: it is none, names
-    what lies outside its folder, is too large, or `usd-core` is missing.
+    """Convert an OpenUSD file to binary glTF.
+
+    Raises:
+        FileFormatError: it is no OpenUSD file, names files outside its folder, is too
+            large, or `usd-core` is not installed.
     """
     if not data.startswith(USD_BEGINNINGS):
         raise reading.damaged(path, "an OpenUSD file", reading.looks_like(data))
@@ -52,16 +56,16 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         )
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target = Path(folder) / "scene.glb"
-        inside = Path(folder) / "package"
-        inside.mkdir()
-        names = [
+        package_folder = Path(folder) / "package"
+        package_folder.mkdir()
+        arguments = [
             str(stored_files.scaled(MEMORY)),
             str(path.resolve()),
             str(target),
-            str(inside),
+            str(package_folder),
         ]
-        program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
-        done = reading.run_converter(
+        program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *arguments]
+        process = reading.run_converter(
             path,
             "usd-core",
             program,
@@ -69,29 +73,30 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             seconds=USD_LONGEST,
             env=None,
         )
-        if done.returncode or not target.is_file():
-            lines = [line for line in done.stderr.splitlines() if line.strip()] or [
-                "without a word"
-            ]
-            last = lines[-1]
-            if last.startswith(REFUSED):
-                text = last.removeprefix(REFUSED)
-                raise errors.FileFormatError(
-                    f"{path.parent / text}"
-                    if text.startswith(path.name)
-                    else f"{path}: {text}"
-                )
-            crashed = (
-                f"signal {-done.returncode}"
-                if done.returncode < 0
-                else reading.shown(last.strip(), quoted=False)
-            )
-            raise errors.FileFormatError(
-                f"{path}: usd-core could not read it "
-                f"({crashed}); export or download it again"
-            )
-        for name in json.loads(done.stdout.splitlines()[-1]):
+        if process.returncode or not target.is_file():
+            raise _conversion_error(path, process.stderr, process.returncode)
+        for name in json.loads(process.stdout.splitlines()[-1]):
             stored_files.note_opened(name)
         return stored_files.read_bytes(
             target, "a glTF file", 4 * stored_files.LARGEST_FILE
         )
+
+
+def _conversion_error(
+    path: Path, stderr: str, returncode: int
+) -> errors.FileFormatError:
+    """Return the error of a conversion that failed, by the last line of its output."""
+    lines = [line for line in stderr.splitlines() if line.strip()]
+    last = lines[-1] if lines else "without a word"
+    if last.startswith(REFUSED):
+        # The process names the file without its folder.
+        message = last.removeprefix(REFUSED)
+        if message.startswith(path.name):
+            return errors.FileFormatError(f"{path.parent / message}")
+        return errors.FileFormatError(f"{path}: {message}")
+    reason = f"signal {-returncode}"
+    if returncode >= 0:
+        reason = reading.shown(last.strip(), quoted=False)
+    return errors.FileFormatError(
+        f"{path}: usd-core could not read it ({reason}); export or download it again"
+    )

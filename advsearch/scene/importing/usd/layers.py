@@ -1,5 +1,4 @@
-"""The layers and packages of OpenUSD that a file is made of, looked at before anything
-is composed of them.
+"""Checks of the layers and packages of an OpenUSD file, before they are composed.
 
 All that a layer names has to be a layer or a package (.usdz) in the folder of the first
 one or below; all that a layer in a package names has to be in that package.
@@ -23,55 +22,34 @@ from advsearch.scene.importing.usd import LAYERS, PACKAGE
 
 MOST_LAYERS = 1000
 MOST_ENTRIES = 10_000
-DEEPEST_PACKAGE = 4  # packages in one another
+DEEPEST_PACKAGE = 4  # limit of packages in packages
 
 
 def unpacked(package: Path, folder: Path) -> Path:
     """Unpack a .usdz file into a folder, and return its first layer.
 
-    Raises FileFormatError: as `open_package`.
+    Raises:
+        FileFormatError: as `open_package`.
     """
     with open_package(package.name, package.read_bytes()) as archive:
         for entry in archive.infolist():
             if not entry.is_dir():
-                goal = folder / PurePosixPath(entry.filename)
-                goal.parent.mkdir(parents=True, exist_ok=True)
-                goal.write_bytes(archive.read(entry))
+                target = folder / PurePosixPath(entry.filename)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(archive.read(entry))
         return folder / first_layer(archive)
 
 
 def open_package(name: str, content: bytes) -> zipfile.ZipFile:
-    """Open the content of a .usdz file, whose entries lie in it as they are.
+    """Open the content of a .usdz file, whose entries are not compressed.
 
-    Raises FileFormatError: it is damaged, too large, has packed entries or names that
-    lie elsewhere, or begins with no layer.
+    Raises:
+        FileFormatError: it is corrupt, too large, has compressed entries or names
+            outside of it, or its first entry is no layer.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
-        entries = archive.infolist()
-        size = sum(entry.file_size for entry in entries)
-        got = f"{len(entries):,} of {size:,}"
-        max_files, max_bytes = map(
-            stored_files.scaled, (MOST_ENTRIES, stored_files.LARGEST_FILE)
-        )
-        most = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
-        stored_files.check_most(name, len(entries), MOST_ENTRIES, most, got)
-        stored_files.check_most(name, size, stored_files.LARGEST_FILE, most, got)
-        for entry in entries:
-            place = PurePosixPath(entry.filename)
-            odd = (
-                place.is_absolute()
-                or ".." in place.parts
-                or re.search(r"[\\:\[\]]", entry.filename)
-            )
-            if odd or entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-                raise errors.FileFormatError(
-                    f"{name}: expected files that lie in it as they are, got "
-                    f"{entry.filename[:80]!r}, "
-                    "which is packed or lies elsewhere; make it again with usdzip"
-                )
-        for entry in entries:
-            archive.open(entry).close()  # local headers are there
+        _check_entries(name, archive)
     except (
         zipfile.BadZipFile,
         OSError,
@@ -90,38 +68,66 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
     return archive
 
 
+def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
+    """Check number, size, names and headers of the entries of a package."""
+    entries = archive.infolist()
+    size = sum(entry.file_size for entry in entries)
+    got = f"{len(entries):,} of {size:,}"
+    max_files = stored_files.scaled(MOST_ENTRIES)
+    max_bytes = stored_files.scaled(stored_files.LARGEST_FILE)
+    expected = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
+    stored_files.check_most(name, len(entries), MOST_ENTRIES, expected, got)
+    stored_files.check_most(name, size, stored_files.LARGEST_FILE, expected, got)
+    for entry in entries:
+        path = PurePosixPath(entry.filename)
+        is_outside = path.is_absolute() or ".." in path.parts
+        has_odd_name = re.search(r"[\\:\[\]]", entry.filename)
+        is_packed = entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1
+        if is_outside or has_odd_name or is_packed:
+            raise errors.FileFormatError(
+                f"{name}: expected files that lie in it as they are, got "
+                f"{entry.filename[:80]!r}, "
+                "which is packed or lies elsewhere; make it again with usdzip"
+            )
+    for entry in entries:
+        archive.open(entry).close()  # this checks local headers
+
+
 def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> None:
-    """Refuse a package with bytes between its files: USD reads those in a row, and not
-    by the index.
+    """Reject a package with bytes between its files.
+
+    USD reads files one after the other, and not by the index of the archive.
     """
     position = 0
     for entry in sorted(archive.infolist(), key=lambda entry: entry.header_offset):
-        lengths = content[entry.header_offset + 26 : entry.header_offset + 30]
-        header_size = (
-            30
-            + int.from_bytes(lengths[:2], "little")
-            + int.from_bytes(lengths[2:], "little")
-        )
         if entry.header_offset != position:
             raise errors.FileFormatError(
                 f"{name}: expected a .usdz archive with one file after the other, got "
                 "bytes in between; "
                 "make it again with usdzip"
             )
+        # Lengths of the name and of the extra field in the local header.
+        lengths = content[entry.header_offset + 26 : entry.header_offset + 30]
+        name_size = int.from_bytes(lengths[:2], "little")
+        extra_size = int.from_bytes(lengths[2:], "little")
+        header_size = 30 + name_size + extra_size
         position = entry.header_offset + header_size + entry.file_size
 
 
 def first_layer(archive: zipfile.ZipFile) -> str:
-    """Return the name of the first file in a package, which is its layer."""
-    return next(
-        (entry.filename for entry in archive.infolist() if not entry.is_dir()), ""
-    )
+    """Return the name of the first file in a package, which is its layer, or ""."""
+    for entry in archive.infolist():
+        if not entry.is_dir():
+            return entry.filename
+    return ""
 
 
 def read_packaged(path: str) -> bytes:
     """Return a file by its path in packages, as in ``/folder/a.usdz[b.usdz[c.png]]``.
 
-    Raises FileFormatError: as `open_package`. Raises KeyError: there is no such file.
+    Raises:
+        FileFormatError: as `open_package`.
+        KeyError: there is no such file.
     """
     outer, inner = Ar.SplitPackageRelativePathOuter(path)
     content = stored_files.read_bytes(
@@ -138,23 +144,27 @@ def read_packaged(path: str) -> bytes:
 def check_layers(file: Path) -> list[str]:
     """Return the files of all layers and packages that a file is made of, itself first.
 
-    Raises FileFormatError: one of them is damaged, names what lies elsewhere, or is
-    over a limit.
+    Raises:
+        FileFormatError: one of them is corrupt, names files elsewhere, or is over a
+            limit.
     """
     return [str(path) for path in _LayerCheck(file).run()]
 
 
 @dataclass
 class _LayerCheck:
+    """Checks the layers and packages that a file is made of."""
+
     file: Path
-    _size: int = 0
-    _count: int = 0
+    _size: int = 0  # bytes so far
+    _count: int = 0  # layers so far
     _folder: Path = field(init=False)
 
     def __post_init__(self) -> None:
         self._folder = self.file.parent.resolve()
 
     def run(self) -> list[Path]:
+        """Return the files of all layers and packages, the file itself first."""
         waiting = [self.file.resolve()]
         known = dict[Path, None]()
         while waiting:
@@ -177,30 +187,27 @@ class _LayerCheck:
         """Count a layer of a size in bytes against the limits."""
         self._count += 1
         self._size += size
-        most = f"at most {stored_files.scaled(MOST_LAYERS):,} layers"
+        expected = f"at most {stored_files.scaled(MOST_LAYERS):,} layers"
+        got = "more, or larger ones"
+        stored_files.check_most(self.file.name, self._count, MOST_LAYERS, expected, got)
         stored_files.check_most(
-            self.file.name, self._count, MOST_LAYERS, most, "more, or larger ones"
-        )
-        stored_files.check_most(
-            self.file.name,
-            self._size,
-            stored_files.LARGEST_FILE,
-            most,
-            "more, or larger ones",
+            self.file.name, self._size, stored_files.LARGEST_FILE, expected, got
         )
 
     def _find(self, path: Path, name: str) -> Path:
-        """Return the file that a layer names, of a file in a package the package."""
+        """Return the file that a layer names; of a file in a package, the package.
+
+        Raises:
+            FileFormatError: it is missing, or not in the folder.
+        """
         outer, inner = Ar.SplitPackageRelativePathOuter(name)
         suffix = Path(outer).suffix.lower()
-        is_plain = not any(sign in outer for sign in "`[]:\0") and suffix in (
-            *LAYERS,
-            PACKAGE,
-        )
-        is_plain = is_plain and (not inner or suffix == PACKAGE)
-        target = (
-            Path(os.path.realpath(path.parent / outer)) if is_plain else self._folder
-        )
+        has_odd_name = any(sign in outer for sign in "`[]:\0")
+        is_layer = suffix == PACKAGE or (suffix in LAYERS and not inner)
+        is_plain = is_layer and not has_odd_name
+        target = self._folder
+        if is_plain:
+            target = Path(os.path.realpath(path.parent / outer))
         if not is_plain or not reading.is_inside(target, self._folder):
             raise errors.FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
@@ -223,7 +230,14 @@ class _LayerCheck:
         return target
 
     def _check_package(self, name: str, path: str, content: bytes, depth: int) -> None:
-        """Check all layers in a package; `path` is what USD calls it."""
+        """Check all layers in a package.
+
+        Args:
+            name: the package, for messages.
+            path: its path as USD writes it.
+            content: its bytes.
+            depth: in how many packages it is, plus 1.
+        """
         stored_files.check_most(
             self.file.name,
             depth,
@@ -246,31 +260,31 @@ class _LayerCheck:
                     )
                 elif suffix in LAYERS:
                     self._take(0)  # its bytes are those of the package
-                    for named in self._named_in(
-                        inner_path, f"{name}[{reading.shown(entry, quoted=False)}]"
-                    ):
-                        self._check_packaged(name, entry, named, entries)
+                    label = f"{name}[{reading.shown(entry, quoted=False)}]"
+                    for layer in self._named_in(inner_path, label):
+                        self._check_packaged(name, entry, layer, entries)
 
     def _check_packaged(
-        self, package: str, entry: str, named: str, entries: set[str]
+        self, package: str, entry: str, layer: str, entries: set[str]
     ) -> None:
-        """Refuse what a layer in a package names outside of it."""
-        outer, _ = Ar.SplitPackageRelativePathOuter(named)
-        near = os.path.normpath(PurePosixPath(entry).parent / outer)
-        from_root = os.path.normpath(outer)  # not anchored: of the package's root
-        is_inside = near in entries or (
+        """Raise FileFormatError if a layer in a package names one outside of it."""
+        outer, _ = Ar.SplitPackageRelativePathOuter(layer)
+        from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
+        # A path that does not begin with a dot may be relative to the package.
+        from_root = os.path.normpath(outer)
+        is_inside = from_entry in entries or (
             not outer.startswith(".") and from_root in entries
         )
         if not is_inside or Path(outer).suffix.lower() not in (*LAYERS, PACKAGE):
             raise errors.FileFormatError(
-                f"{self.file.name}: {package} names the layer {named[:100]!r}, which "
+                f"{self.file.name}: {package} names the layer {layer[:100]!r}, which "
                 "is no USD file in that package "
                 "and is not read; make the package again with usdzip, or one file of "
                 "all with usdcat --flatten"
             )
 
     def _named_in(self, path: str, name: str) -> Iterator[str]:
-        """Yield the layers that a layer names, and refuse value clips."""
+        """Yield the layers that a layer names, and reject value clips."""
         try:
             layer = Sdf.Layer.FindOrOpen(path)
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
@@ -283,24 +297,26 @@ class _LayerCheck:
             )
         yield from filter(None, layer.GetCompositionAssetDependencies())
 
-        def check(at: Any) -> None:
-            spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
+        def check_clips(spec_path: Any) -> None:
+            if not spec_path.IsPrimPath():
+                return
+            spec = layer.GetObjectAtPath(spec_path)
             if spec is not None and "clips" in spec.ListInfoKeys():
-                what = f"has value clips ({at}), which are not read"
                 raise errors.FileFormatError(
-                    f"{self.file.name}: {what}; make one file "
-                    "of all with usdcat --flatten"
+                    f"{self.file.name}: has value clips ({spec_path}), which are not "
+                    "read; make one file of all with usdcat --flatten"
                 )
 
-        layer.Traverse(Sdf.Path.absoluteRootPath, check)
+        layer.Traverse(Sdf.Path.absoluteRootPath, check_clips)
 
 
 def shorten(error: Exception) -> str:
-    """Return what an error of usd-core says, in one line."""
-    said = re.findall(r":(\d+:\d+: .+)", str(error)) or re.findall(
-        r" : '(.+)", str(error)
+    """Return the message of an error of usd-core in one line."""
+    text = str(error)
+    lines = (
+        re.findall(r":(\d+:\d+: .+)", text)
+        or re.findall(r" : '(.+)", text)
+        or [line.strip() for line in text.splitlines() if len(line.strip()) > 3]
     )
-    lines = said or [
-        line.strip() for line in str(error).splitlines() if len(line.strip()) > 3
-    ]
-    return (lines[-1] if lines else type(error).__name__)[:200]
+    message: str = lines[-1] if lines else type(error).__name__
+    return message[:200]

@@ -1,6 +1,4 @@
-"""Picture files as textures of OpenUSD show them: in linear values, by the color space
-that holds for them.
-"""
+"""Decoding of image files to linear values, as textures of OpenUSD use them."""
 
 from __future__ import annotations
 
@@ -16,10 +14,11 @@ from PIL import Image
 from advsearch.extend import color, reading
 
 Array = npt.NDArray[Any]
-EXR = b"\x76\x2f\x31\x01"  # how files begin
+# First bytes of files.
+EXR = b"\x76\x2f\x31\x01"
 RADIANCE = b"#?"
 PNG = b"\x89PNG"
-LONGEST_SIDE = 1024  # texels of a picture that is computed anew
+LONGEST_SIDE = 1024  # limit of the sides of an image that is computed anew, texels
 MODES_OF_8_BITS = ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr")
 GREY_MODES = ("1", "L", "LA")
 GAMMA_OF_SRGB = 0.45455
@@ -27,7 +26,7 @@ CHANNELS_OF_PNG = {0: 1, 2: 3, 4: 2, 6: 4}  # by the color type
 
 
 def is_of_8_bits(data: bytes) -> bool:
-    """Whether a file is a picture with 8 bits a channel."""
+    """Return whether a file is an image with 8 bits a channel."""
     try:
         with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
             return image.mode in MODES_OF_8_BITS and not _is_png_of_16_bits(data)
@@ -36,7 +35,7 @@ def is_of_8_bits(data: bytes) -> bool:
 
 
 def has_colors_of_8_bits(data: bytes) -> bool:
-    """Whether a file is a picture with 8 bits a channel, and three channels or four."""
+    """Return whether a file is an image with 8 bits a channel that is not grey."""
     if not is_of_8_bits(data):
         return False
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
@@ -44,8 +43,9 @@ def has_colors_of_8_bits(data: bytes) -> bool:
 
 
 def is_marked_srgb(data: bytes) -> bool:
-    """Whether a picture is in sRGB for the sourceColorSpace auto: its file says so, or
-    else it has colors of 8 bits.
+    """Return whether an image is sRGB for the sourceColorSpace auto.
+
+    It is if its file says so, or else if it has colors of 8 bits.
     """
     try:
         with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
@@ -61,35 +61,26 @@ def is_marked_srgb(data: bytes) -> bool:
 
 
 def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
-    """Return the linear values (H, W, 4) float32 of a picture file; large ones are
-    averaged down.
+    """Return the linear values (H, W, 4) float32 of an image file.
 
-    Raises OSError, ValueError, SyntaxError, EOFError, FileFormatError: it is no
-    picture, damaged or too large.
+    Large images are averaged down.
+
+    Args:
+        data: the file.
+        path: its path, for messages.
+        is_srgb: whether its values are sRGB, and not linear.
+
+    Raises:
+        OSError, ValueError, SyntaxError, EOFError, FileFormatError: it is no image,
+            corrupt or too large.
     """
     if data.startswith((EXR, RADIANCE)):
         texels = _decode_radiance(data, path)
     else:
-        with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
-            reading.check_decodable(image, path)
-            if image.mode == "F" or image.mode.startswith("I"):
-                grey = np.nan_to_num(np.asarray(image, np.float32))
-                grey = grey if image.mode == "F" else grey / np.float32(65535.0)
-                texels = np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
-            elif _is_png_of_16_bits(data):
-                texels = _decode_png_of_16_bits(data, image.size)
-            else:
-                texels = reading.pictures.display_image(
-                    image,
-                    LONGEST_SIDE if is_srgb else None,
-                    path,
-                    alpha=True,
-                    raw=not is_srgb,
-                )
+        texels = _decode_image(data, path, is_srgb)
     if is_srgb:
-        texels = np.concatenate(
-            [color.srgb_to_linear(texels[:, :, :3]), texels[:, :, 3:]], axis=2
-        )
+        linear = color.srgb_to_linear(texels[:, :, :3])
+        texels = np.concatenate([linear, texels[:, :, 3:]], axis=2)
     height, width = texels.shape[:2]
     shrink = LONGEST_SIDE / max(height, width)
     if shrink >= 1.0:
@@ -101,7 +92,28 @@ def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
     )
 
 
+def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
+    """Return the stored values (H, W, 4) in [0, 1] of an image file."""
+    with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
+        reading.check_decodable(image, path)
+        if image.mode == "F" or image.mode.startswith("I"):
+            grey = np.nan_to_num(np.asarray(image, np.float32))
+            if image.mode != "F":
+                grey = grey / np.float32(65535.0)
+            return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
+        if _is_png_of_16_bits(data):
+            return _decode_png_of_16_bits(data, image.size)
+        return reading.pictures.display_image(
+            image,
+            LONGEST_SIDE if is_srgb else None,
+            path,
+            alpha=True,
+            raw=not is_srgb,
+        )
+
+
 def _decode_radiance(data: bytes, path: str) -> Array:
+    """Return the linear values (H, W, 4) of an OpenEXR or Radiance file, opaque."""
     if data.startswith(EXR):
         planes, _ = reading.hdr.read_exr(Path(path), data)
         colors = np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2)
@@ -112,8 +124,7 @@ def _decode_radiance(data: bytes, path: str) -> Array:
     return np.concatenate([colors, np.ones_like(colors[:, :, :1])], axis=2)
 
 
-# ---- PNG with 16 bits a channel, of which Pillow keeps 8
-# -------------------------------------------------------------
+# ---- PNG with 16 bits a channel, of which Pillow reads 8 ----
 
 
 def _is_png_of_16_bits(data: bytes) -> bool:
@@ -123,7 +134,8 @@ def _is_png_of_16_bits(data: bytes) -> bool:
 def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     """Return the values (H, W, 4) in [0, 1] of a PNG file with 16 bits a channel.
 
-    Raises ValueError: it is interlaced or damaged.
+    Raises:
+        ValueError: it is interlaced or corrupt.
     """
     (width, height) = size
     color_type = data[25]
@@ -131,8 +143,31 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     channels = CHANNELS_OF_PNG.get(color_type)
     if channels is None or is_interlaced:
         raise ValueError("an interlaced PNG of 16 bits; save it without interlacing")
-    step = 2 * channels
-    row_size = 1 + width * step
+    pixel_size = 2 * channels
+    row_size = 1 + width * pixel_size
+    content = _png_data(data)
+    try:
+        raw = zlib.decompressobj().decompress(content, height * row_size)
+    except zlib.error as error:
+        raise ValueError(f"a damaged PNG ({error})") from None
+    if len(raw) != height * row_size:
+        raise ValueError("a PNG that is cut short")
+    rows = np.frombuffer(raw, np.uint8).reshape(height, row_size)
+    filtered = rows[:, 1:].reshape(height, width, pixel_size)
+    unfiltered = np.ascontiguousarray(_unfilter(rows[:, 0], filtered))
+    values = unfiltered.view(">u2").astype(np.float32) / np.float32(65535.0)
+    alpha = np.ones((height, width, 1), np.float32)
+    if channels in (2, 4):
+        alpha = values[:, :, channels - 1 :]
+    if channels >= 3:
+        colors = values[:, :, :3]
+    else:
+        colors = values[:, :, :1].repeat(3, axis=2)
+    return np.concatenate([colors, alpha], axis=2)
+
+
+def _png_data(data: bytes) -> bytes:
+    """Return the concatenated IDAT chunks of a PNG file."""
     content = bytearray()
     position = 8
     while position + 8 <= len(data):
@@ -140,54 +175,51 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
         if data[position + 4 : position + 8] == b"IDAT":
             content += data[position + 8 : position + 8 + length]
         position += 12 + length
-    try:
-        raw = zlib.decompressobj().decompress(bytes(content), height * row_size)
-    except zlib.error as error:
-        raise ValueError(f"a damaged PNG ({error})") from None
-    if len(raw) != height * row_size:
-        raise ValueError("a PNG that is cut short")
-    rows = np.frombuffer(raw, np.uint8).reshape(height, row_size)
-    unfiltered = _unfilter(rows[:, 0], rows[:, 1:].reshape(height, width, step))
-    values = np.ascontiguousarray(unfiltered).view(">u2").astype(
-        np.float32
-    ) / np.float32(65535.0)
-    alpha = (
-        values[:, :, channels - 1 :]
-        if channels in (2, 4)
-        else np.ones((height, width, 1), np.float32)
-    )
-    colors = values[:, :, :3] if channels >= 3 else values[:, :, :1].repeat(3, axis=2)
-    return np.concatenate([colors, alpha], axis=2)
+    return bytes(content)
 
 
 def _unfilter(filters: Array, filtered: Array) -> Array:
-    """Undo the filters (H,) of rows of pixels (H, W, bytes): PNG specification, section
-    9.
+    """Undo the filters of a PNG image (PNG specification, section 9).
 
-    A pixel depends on those to its left and above, so all on one diagonal are computed
-    at once.
+    A pixel depends on those to its left and above, so all pixels on a diagonal are
+    computed at once.
+
+    Args:
+        filters: (H,) the filter of each row.
+        filtered: (H, W, bytes) pixels.
+
+    Raises:
+        ValueError: a filter is unknown.
     """
-    height, width, step = filtered.shape
+    height, width, pixel_size = filtered.shape
     if filters.max(initial=0) > 4:
         raise ValueError("a PNG with an unknown filter")
-    # with zeros above and to the left
-    pixels = np.zeros((height + 1, width + 1, step), np.int16)
+    # With zeros above and to the left.
+    pixels = np.zeros((height + 1, width + 1, pixel_size), np.int16)
     for diagonal in range(height + width - 1):
         row = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
         column = diagonal - row
         left = pixels[row + 1, column]
         above = pixels[row, column + 1]
-        corner = pixels[row, column]
-        estimate = left + above - corner
-        to_left, to_above, to_corner = (
-            np.abs(estimate - near) for near in (left, above, corner)
-        )
-        is_left = (to_left <= to_above) & (to_left <= to_corner)
-        paeth = np.where(is_left, left, np.where(to_above <= to_corner, above, corner))
         kind = filters[row][:, None]
         predicted = np.select(
             [kind == 1, kind == 2, kind == 3, kind == 4],
-            [left, above, (left + above) // 2, paeth],
+            [
+                left,
+                above,
+                (left + above) // 2,
+                _paeth(left, above, pixels[row, column]),
+            ],
         )
         pixels[row + 1, column + 1] = (filtered[row, column] + predicted) & 255
     return pixels[1:, 1:].astype(np.uint8)
+
+
+def _paeth(left: Array, above: Array, corner: Array) -> Array:
+    """Return the Paeth predictor: the neighbour that is closest to their estimate."""
+    estimate = left + above - corner
+    to_left = np.abs(estimate - left)
+    to_above = np.abs(estimate - above)
+    to_corner = np.abs(estimate - corner)
+    is_left = (to_left <= to_above) & (to_left <= to_corner)
+    return np.where(is_left, left, np.where(to_above <= to_corner, above, corner))

@@ -1,9 +1,8 @@
-"""OpenUSD stages as binary glTF, by `usd-core`, in a process of its own that runs this
-module (`blender.converted`).
+"""Converter of OpenUSD stages to binary glTF, with `usd-core`.
 
-Layers are looked at before anything is composed of them: all that they name has to be a
-layer in the folder of the first one or below. What glTF as we read it has no place for
-is named in `asset.extras` of the file.
+This module runs in a separate process. Layers are checked before they are composed: all
+that they name has to be a layer in the folder of the first one or below. What our reader
+of glTF cannot represent is named in `asset.extras` of the file.
 """
 
 from __future__ import annotations
@@ -32,44 +31,46 @@ from advsearch.scene.importing.usd.surface import (
     UsdSurfaces,
 )
 
-# colours and opacities of faces that are materials of their own; of more, colours are
-# of vertices
+# Limit of the colors, and of the opacities, of faces that become materials.
 MOST_TINTS = 16
-PARTICLES = "ParticleField"  # how the types of Gaussian splats and their like begin
+PARTICLES = "ParticleField"  # prefix of the types of Gaussian splats
 PURPOSES = ("default", "render")
 Array = npt.NDArray[Any]
 
 
 def main(source: str, target: str, folder: str) -> None:
-    """Write a file as binary glTF, and print the files that it was read from; a package
-    is unpacked into a folder first. Raises FileFormatError, which tells the file by its
-    name.
+    """Write a USD file as binary glTF, and print the files that it was read from.
+
+    Args:
+        source: the USD file.
+        target: the glTF file.
+        folder: where a package is unpacked.
+
+    Raises:
+        FileFormatError: the file cannot be converted; the message begins with its name.
     """
     file = Path(source)
     if file.suffix.lower() == PACKAGE:
         file = unpacked(file, Path(folder))
     layers = check_layers(file)
     stage = Usd.Stage.Open(str(file))
-    made = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
-    Path(target).write_bytes(made.glb())
-    print(json.dumps(made.read if file == Path(source) else []))
+    conversion = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
+    Path(target).write_bytes(conversion.glb())
+    print(json.dumps(conversion.read if file == Path(source) else []))
 
 
-# ---- the stage
-# ------------------------------------------------------------------------------------------------------
+# ---- The stage ----
 
 
 @dataclass
 class Conversion:
-    """Makes glTF of a stage, whose files lie in a folder; `source` is what messages
-    call it.
-    """
+    """Converts a stage to glTF."""
 
     stage: Any
-    folder: Path
-    source: str
-    read: list[str]
-    left: Counter[str] = field(default_factory=Counter)
+    folder: Path  # where its files are
+    source: str  # name of the file, for messages
+    read: list[str]  # files that were read
+    left: Counter[str] = field(default_factory=Counter)  # notes on what is left out
     buffer: reading.GlbBuffer = field(default_factory=reading.GlbBuffer)
     triangles: int = 0
 
@@ -92,12 +93,12 @@ class Conversion:
                 self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
 
     def _prims(self) -> Iterator[Any]:
-        for number, prim in enumerate(
-            Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
-        ):
+        """Yield the prims of the stage, within limits."""
+        prims = Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
+        for index, prim in enumerate(prims):
             stored_files.check_most(
                 self.source,
-                number,
+                index,
                 reading.LARGEST_TREE,
                 "USD of at most {} prims",
                 "more",
@@ -113,93 +114,117 @@ class Conversion:
             yield prim
 
     def glb(self) -> bytes:
-        unit = UsdGeom.GetStageMetersPerUnit(self.stage)
+        """Return the stage as a binary glTF file."""
+        self.unit = self._read_unit()
+        if self.stage.HasAuthoredTimeCodeRange():
+            self._leave("is animated; what is there first is read")
+        to_y_up = _TO_Y_UP
+        if UsdGeom.GetStageUpAxis(self.stage) == "Y":
+            to_y_up = np.eye(4)
+        matrix = to_y_up @ np.diag([self.unit, self.unit, self.unit, 1.0])
+        header = self.header
+        nodes = header["nodes"]
+        nodes.append(
+            {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
+        )
+        name_counts = Counter(prim.GetName() for prim in self._prims())
+        node_of_path: dict[Any, int] = {}
+        has_splats = False
+        for prim in self._prims():
+            if str(prim.GetTypeName()).startswith(PARTICLES):
+                has_splats = True
+            self._note_left_out(prim)
+            if prim.IsA(UsdGeom.Imageable) and not prim.IsA(UsdGeom.Subset):
+                is_unique = name_counts[prim.GetName()] == 1
+                self._add_node(prim, is_unique, node_of_path)
+        for node in nodes:
+            if not node["children"]:
+                del node["children"]
+        header["scenes"] = [{"nodes": [0]}]
+        header["scene"] = 0
+        if has_splats and not header["meshes"]:
+            raise errors.FileFormatError(
+                f"{self.source}: expected a mesh with faces, got Gaussian splats, a "
+                f"model that {reading.SPLATS}"
+            )
+        if self.lights:
+            header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
+        header["asset"]["extras"] = {"left_out": self._notes(has_splats)}
+        return self.buffer.file(
+            {key: value for key, value in header.items() if value or key == "asset"}
+        )
+
+    def _read_unit(self) -> float:
+        """Return the unit of the stage in metres."""
+        unit = float(UsdGeom.GetStageMetersPerUnit(self.stage))
         if not 0.0 < unit < math.inf:
             raise errors.FileFormatError(
                 f"{self.source}: expected metersPerUnit greater than 0, got {unit}"
             )
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self.stage):
             self._leave("does not say its unit, which USD takes for centimetres")
-        if self.stage.HasAuthoredTimeCodeRange():
-            self._leave("is animated; what is there first is read")
-        self.unit = unit
-        upright = np.eye(4) if UsdGeom.GetStageUpAxis(self.stage) == "Y" else _TO_Y_UP
-        matrix = upright @ np.diag([unit, unit, unit, 1.0])
-        nodes = self.header["nodes"]
-        header = self.header
-        nodes.append(
-            {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
-        )
-        names = Counter(prim.GetName() for prim in self._prims())
-        places: dict[Any, int] = {}
-        has_splats = False
-        for prim in self._prims():
-            kind = str(prim.GetTypeName())
-            if kind.startswith(PARTICLES):
-                has_splats = True
-            elif (
-                prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
-            ) or kind == "PointInstancer":
+        return unit
+
+    def _note_left_out(self, prim: Any) -> None:
+        """Note what is left out of a prim."""
+        kind = str(prim.GetTypeName())
+        is_other_geometry = prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
+        if not kind.startswith(PARTICLES):
+            if is_other_geometry or kind == "PointInstancer":
                 self._leave(
                     f"has a {kind}, which is no mesh: left out; make meshes of "
                     "it where the file is from"
                 )
-            if (
-                prim.HasAPI(UsdSkel.BindingAPI)
-                and UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue()
-            ):
+        if prim.HasAPI(UsdSkel.BindingAPI):
+            blend_shapes = UsdSkel.BindingAPI(prim).GetBlendShapesAttr()
+            if blend_shapes.HasAuthoredValue():
                 self._leave("has a mesh with blend shapes, which are left out")
-            if kind == "SkelAnimation":
-                self._leave("has an animation of a skeleton, which is shown at rest")
-            if not prim.IsA(UsdGeom.Imageable) or prim.IsA(UsdGeom.Subset):
-                continue
-            name = (
-                prim.GetName()
-                if names[prim.GetName()] == 1
-                else str(prim.GetPath()).lstrip("/")
-            )
-            node: dict[str, Any] = {"name": name, "children": []}
-            parent = 0
-            moves = UsdGeom.Xformable(prim)
-            if moves:
-                # rows, as glTF's columns
-                local = np.array(moves.GetLocalTransformation(FIRST))
-                if not np.isfinite(local).all():
-                    raise errors.FileFormatError(
-                        f"{self.source}: expected finite transforms, got others at "
-                        f"{prim.GetPath()}"
-                    )
-                node["matrix"] = local.ravel().tolist()
-            if not (moves and moves.GetResetXformStack()):
-                parent = next(
-                    (
-                        places[at]
-                        for at in prim.GetPath().GetAncestorsRange()
-                        if at in places
-                    ),
-                    0,
+        if kind == "SkelAnimation":
+            self._leave("has an animation of a skeleton, which is shown at rest")
+
+    def _add_node(
+        self, prim: Any, is_unique: bool, node_of_path: dict[Any, int]
+    ) -> None:
+        """Add a prim as a node.
+
+        Args:
+            prim: the prim.
+            is_unique: whether its name is; otherwise the node is named by its path.
+            node_of_path: nodes of prims so far, by path; the prim is added.
+        """
+        nodes = self.header["nodes"]
+        path = prim.GetPath()
+        name = prim.GetName() if is_unique else str(path).lstrip("/")
+        node: dict[str, Any] = {"name": name, "children": []}
+        parent = 0
+        xformable = UsdGeom.Xformable(prim)
+        if xformable:
+            # USD's rows are glTF's columns.
+            local = np.array(xformable.GetLocalTransformation(FIRST))
+            if not np.isfinite(local).all():
+                raise errors.FileFormatError(
+                    f"{self.source}: expected finite transforms, got others at {path}"
                 )
-            self._fill(prim, node)
-            if "moved" in node:
-                node["matrix"], parent = node.pop("moved"), 0
-            places[prim.GetPath()] = len(nodes)
-            nodes[parent]["children"].append(len(nodes))
-            nodes.append(node)
-        for node in nodes:
-            if not node["children"]:
-                del node["children"]
-        header["scenes"], header["scene"] = [{"nodes": [0]}], 0
-        if has_splats and not header["meshes"]:
-            what = (
-                "expected a mesh with faces, got Gaussian splats, a model that "
-                f"{reading.SPLATS}"
+            node["matrix"] = local.ravel().tolist()
+        if not (xformable and xformable.GetResetXformStack()):
+            ancestors = path.GetAncestorsRange()
+            parent = next(
+                (node_of_path[at] for at in ancestors if at in node_of_path), 0
             )
-            raise errors.FileFormatError(f"{self.source}: {what}")
-        if self.lights:
-            header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
+        self._fill(prim, node)
+        if "moved" in node:
+            # The skeleton places it in the world.
+            node["matrix"] = node.pop("moved")
+            parent = 0
+        node_of_path[path] = len(nodes)
+        nodes[parent]["children"].append(len(nodes))
+        nodes.append(node)
+
+    def _notes(self, has_splats: bool) -> list[str]:
+        """Return the sentences about what is left out, at most 100."""
         notes = [
-            what if count == 1 else f"{what} ({count:,} times)"
-            for what, count in self.left.items()
+            sentence if count == 1 else f"{sentence} ({count:,} times)"
+            for sentence, count in self.left.items()
         ]
         if has_splats:
             notes.insert(
@@ -207,22 +232,19 @@ class Conversion:
                 "has Gaussian splats, which are left out: a model that "
                 f"{reading.SPLATS}",
             )
-        header["asset"]["extras"] = {"left_out": notes[:100]}
-        return self.buffer.file(
-            {key: value for key, value in header.items() if value or key == "asset"}
-        )
+        return notes[:100]
 
     def _leave(self, what: str) -> None:
+        """Note something that is left out."""
         self.left[what] += 1
 
     def _fill(self, prim: Any, node: dict[str, Any]) -> None:
-        imageable = UsdGeom.Imageable(prim)
-        if not (
-            prim.IsA(UsdGeom.Mesh)
-            or prim.IsA(UsdGeom.Camera)
-            or prim.HasAPI(UsdLux.LightAPI)
-        ):
+        """Add the mesh, camera or light of a prim to its node."""
+        is_mesh = prim.IsA(UsdGeom.Mesh)
+        is_camera = prim.IsA(UsdGeom.Camera)
+        if not (is_mesh or is_camera or prim.HasAPI(UsdLux.LightAPI)):
             return
+        imageable = UsdGeom.Imageable(prim)
         if imageable.ComputeVisibility(FIRST) == UsdGeom.Tokens.invisible:
             self._leave("has something invisible, which is left out")
         elif imageable.ComputePurpose() not in PURPOSES:
@@ -230,79 +252,66 @@ class Conversion:
                 "has something for the purpose "
                 f"{imageable.ComputePurpose()!r}, which is left out"
             )
-        elif prim.IsA(UsdGeom.Mesh):
+        elif is_mesh:
             self._mesh(prim, node)
-        elif prim.IsA(UsdGeom.Camera):
+        elif is_camera:
             self._camera(UsdGeom.Camera(prim), node)
         else:
             self._light(prim, node)
 
-    # ---- cameras and lights
-    # ------------------------------------------------------------------------------------------
+    # ---- Cameras and lights ----
 
     def _camera(self, camera: Any, node: dict[str, Any]) -> None:
-        wide, high, focal = (
-            _first(camera, name)
-            for name in ("HorizontalAperture", "VerticalAperture", "FocalLength")
+        """Add a camera to a node; one that is not perspective counts as left out."""
+        width = _first(camera, "HorizontalAperture")
+        height = _first(camera, "VerticalAperture")
+        focal_length = _first(camera, "FocalLength")
+        is_perspective = (
+            _first(camera, "Projection") == UsdGeom.Tokens.perspective
+            and min(width, height, focal_length) > 0.0
         )
         entry: dict[str, Any] = {"name": node["name"], "type": "orthographic"}
-        if (
-            _first(camera, "Projection") == UsdGeom.Tokens.perspective
-            and min(wide, high, focal) > 0.0
-        ):
+        if is_perspective:
             if _first(camera, "HorizontalApertureOffset") or _first(
                 camera, "VerticalApertureOffset"
             ):
                 self._leave(
                     "has a camera whose aperture is shifted; the shift is left out"
                 )
-            view = {
-                "yfov": 2.0 * math.atan(high / (2.0 * focal)),
-                "aspectRatio": wide / high,
+            perspective = {
+                "yfov": 2.0 * math.atan(height / (2.0 * focal_length)),
+                "aspectRatio": width / height,
                 "znear": 0.01,
             }
-            entry |= {"type": "perspective", "perspective": view}
+            entry |= {"type": "perspective", "perspective": perspective}
         node["camera"] = len(self.header["cameras"])
         self.header["cameras"].append(entry)
 
     def _light(self, prim: Any, node: dict[str, Any]) -> None:
+        """Add a distant or a spherical light to a node."""
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
         power = _first(light, "Intensity") * 2.0 ** _first(light, "Exposure")
-        normalised = _first(light, "Normalize")
+        is_normalized = _first(light, "Normalize")
         color = np.array(_first(light, "Color"), np.float64)
         if _first(light, "EnableColorTemperature"):
-            color *= np.array(
-                UsdLux.BlackbodyTemperatureAsRgb(_first(light, "ColorTemperature"))
-            )
+            temperature = _first(light, "ColorTemperature")
+            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(temperature))
         if kind == "DistantLight":
-            half = math.radians(_first(UsdLux.DistantLight(prim), "Angle")) / 2.0
+            angle = _first(UsdLux.DistantLight(prim), "Angle")
+            half_angle = math.radians(angle) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
-            power *= 1.0 if normalised or half <= 0.0 else math.pi * math.sin(half) ** 2
+            if not is_normalized and half_angle > 0.0:
+                power *= math.pi * math.sin(half_angle) ** 2
         elif kind == "SphereLight":
-            # radiance times the disk that is seen; normalised, what is emitted is
-            # divided by the area of the sphere
-            power *= (
-                0.25
-                if normalised
-                else math.pi * _first(UsdLux.SphereLight(prim), "Radius") ** 2
-            )
+            # Radiance times the visible disk. A normalised light is divided by the area
+            # of the sphere.
+            if is_normalized:
+                power *= 0.25
+            else:
+                power *= math.pi * _first(UsdLux.SphereLight(prim), "Radius") ** 2
             power *= self.unit**2
-            entry = {"type": "point"}
-            shaping = UsdLux.ShapingAPI(prim)
-            cone = (
-                _first(shaping, "ShapingConeAngle")
-                if prim.HasAPI(UsdLux.ShapingAPI)
-                else 90.0
-            )
-            if cone is not None and cone < 90.0:
-                soft = _first(shaping, "ShapingConeSoftness") or 0.0
-                outer = math.radians(max(cone, 0.1))
-                cone_angles = {
-                    "outerConeAngle": outer,
-                    "innerConeAngle": outer * (1.0 - min(soft, 1.0)),
-                }
-                entry = {"type": "spot", "spot": cone_angles}
+            entry = _shaped_light(prim)
             self._leave("has a SphereLight, which shines from its middle here")
         else:
             self._leave(
@@ -310,12 +319,9 @@ class Conversion:
                 "`controls=light` light a scene"
             )
             return
-        if not (
-            math.isfinite(power)
-            and power >= 0.0
-            and np.isfinite(color).all()
-            and (color >= 0.0).all()
-        ):
+        has_valid_power = math.isfinite(power) and power >= 0.0
+        has_valid_color = np.isfinite(color).all() and (color >= 0.0).all()
+        if not has_valid_power or not has_valid_color:
             raise errors.FileFormatError(
                 f"{self.source}: expected the light {node['name']} to have a power of "
                 "at least 0"
@@ -325,68 +331,46 @@ class Conversion:
             {**entry, "name": node["name"], "color": color.tolist(), "intensity": power}
         )
 
-    # ---- meshes
-    # ------------------------------------------------------------------------------------------------------
+    # ---- Meshes ----
 
     def _mesh(self, prim: Any, node: dict[str, Any]) -> None:
+        """Add a mesh to a node: one primitive for each material and tint."""
         mesh = UsdGeom.Mesh(prim)
-        path = str(prim.GetPath())
         points = _array(_first(mesh, "Points"), np.float64, 3)
-        counts, corners, holes = (
-            _array(_first(mesh, name), np.int64)
-            for name in ("FaceVertexCounts", "FaceVertexIndices", "HoleIndices")
-        )
+        counts = _array(_first(mesh, "FaceVertexCounts"), np.int64)
+        corners = _array(_first(mesh, "FaceVertexIndices"), np.int64)
         if not len(points) or not len(counts):
             return
-        if (
-            (counts < 0).any()
-            or counts.sum() != len(corners)
-            or corners.min() < 0
-            or corners.max() >= len(points)
-        ):
-            raise errors.FileFormatError(
-                f"{self.source}: expected faces of the points of {path}, got others; "
-                "export it again"
-            )
-        moved, points = self._at_rest(prim, points)
-        if moved is not None:
-            node["moved"] = moved.ravel().tolist()
-        self.triangles += int(np.maximum(counts - 2, 0).sum())
-        reading.check_faces(self.source, self.triangles, "more")
-        picked, face, _ = reading.triangulated(points[corners], counts)
-        keep = ~np.isin(face, holes)
-        picked = picked[keep]
-        face = face[keep]
-        if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
-            picked = picked[:, ::-1]
+        self._check_corners(prim, len(points), counts, corners)
+        rest_matrix, points = self._at_rest(prim, points)
+        if rest_matrix is not None:
+            node["moved"] = rest_matrix.ravel().tolist()
+        triangles, face = self._triangulate(mesh, points, counts, corners)
         primvars = UsdGeom.PrimvarsAPI(prim)
-        normals = _flattened(primvars.GetPrimvar("normals"), 3)
-        if normals is None and len(
-            own := _array(_first(mesh, "Normals"), np.float64, 3)
-        ):
-            normals = own, str(mesh.GetNormalsInterpolation())
-        if _first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
-            self._leave(
-                "has a mesh that is to be subdivided, which is shown as it is, "
-                "and smooth"
-            )
-            normals = _smooth(points, corners[picked]), "vertex"
+        normals = self._normals(mesh, primvars, points, corners[triangles])
         primitives = []
         for bound, faces in self._groups(prim, mesh, len(counts)):
-            for material, colors, tinted in self._tinted(
+            for material, colors, tinted_faces in self._tinted(
                 bound, primvars, faces, counts, corners
             ):
-                mine = np.isin(face, tinted)
-                at = picked[mine].reshape(-1)
-                if not len(at):
+                is_selected = np.isin(face, tinted_faces)
+                corner_rows = triangles[is_selected].reshape(-1)
+                if not len(corner_rows):
                     continue
-                held: dict[str, tuple[Array, str] | None] = {
+                attributes: dict[str, tuple[Array, str] | None] = {
                     "NORMAL": normals,
                     "COLOR_0": colors,
                 }
-                for number, layout in enumerate(bound.layouts):
-                    held[f"TEXCOORD_{number}"] = self._uvs(primvars, layout)
-                entry = self._primitive(path, points, corners, at, face[mine], held)
+                for index, layout in enumerate(bound.layouts):
+                    attributes[f"TEXCOORD_{index}"] = self._uvs(primvars, layout)
+                entry = self._primitive(
+                    str(prim.GetPath()),
+                    points,
+                    corners,
+                    corner_rows,
+                    face[is_selected],
+                    attributes,
+                )
                 primitives.append({**entry, "material": material})
         if primitives:
             node["mesh"] = len(self.header["meshes"])
@@ -394,49 +378,119 @@ class Conversion:
                 {"name": node["name"], "primitives": primitives}
             )
 
+    def _check_corners(
+        self, prim: Any, n_points: int, counts: Array, corners: Array
+    ) -> None:
+        """Raise FileFormatError if faces refer to points that are not there."""
+        if (
+            (counts < 0).any()
+            or counts.sum() != len(corners)
+            or corners.min() < 0
+            or corners.max() >= n_points
+        ):
+            raise errors.FileFormatError(
+                f"{self.source}: expected faces of the points of {prim.GetPath()}, got "
+                "others; export it again"
+            )
+
+    def _triangulate(
+        self, mesh: Any, points: Array, counts: Array, corners: Array
+    ) -> tuple[Array, Array]:
+        """Return the triangles (T, 3) of a mesh, as rows of `corners`, and their faces.
+
+        Holes are left out.
+        """
+        self.triangles += int(np.maximum(counts - 2, 0).sum())
+        reading.check_faces(self.source, self.triangles, "more")
+        triangles, face, _ = reading.triangulated(points[corners], counts)
+        holes = _array(_first(mesh, "HoleIndices"), np.int64)
+        is_solid = ~np.isin(face, holes)
+        triangles = triangles[is_solid]
+        if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
+            triangles = triangles[:, ::-1]
+        return triangles, face[is_solid]
+
+    def _normals(
+        self, mesh: Any, primvars: Any, points: Array, triangles: Array
+    ) -> tuple[Array, str] | None:
+        """Return the normals (N, 3) of a mesh and their interpolation, or None."""
+        normals = _flattened(primvars.GetPrimvar("normals"), 3)
+        if normals is None:
+            values = _array(_first(mesh, "Normals"), np.float64, 3)
+            if len(values):
+                normals = values, str(mesh.GetNormalsInterpolation())
+        if _first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
+            self._leave(
+                "has a mesh that is to be subdivided, which is shown as it is, "
+                "and smooth"
+            )
+            normals = _smooth(points, triangles), "vertex"
+        return normals
+
     def _primitive(
         self,
         path: str,
         points: Array,
         corners: Array,
-        at: Array,
+        corner_rows: Array,
         face: Array,
-        held: dict[str, tuple[Array, str] | None],
+        attributes: dict[str, tuple[Array, str] | None],
     ) -> dict[str, Any]:
-        """Return a primitive of some corners, `at`, of faces, with the values that it
-        has by what each belongs to.
+        """Return a primitive as an entry of the header.
+
+        Args:
+            path: path of the prim, for messages.
+            points: (P, 3).
+            corners: (C,) the point of each corner of the mesh.
+            corner_rows: (3 T,) the corners of the triangles, as rows of `corners`.
+            face: (T,) the face of each triangle.
+            attributes: values (N, width) and interpolation, by the names of glTF.
         """
-        by = {
-            "vertex": corners[at],
-            "varying": corners[at],
-            "faceVarying": at,
+        index_by_interpolation = {
+            "vertex": corners[corner_rows],
+            "varying": corners[corner_rows],
+            "faceVarying": corner_rows,
             "uniform": face.repeat(3),
         }
-        index = [corners[at]]
-        none = np.zeros(len(at), np.int64)
-        for values, per in (given or (None, "") for given in held.values()):
-            index.append(none if values is None else by.get(per, none))
-            if values is not None and index[-1].max() >= len(values):
-                raise errors.FileFormatError(
-                    f"{self.source}: expected as many values "
-                    f"as corners on {path}, got fewer"
-                )
-        rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
-        attributes = {
+        constant_index = np.zeros(len(corner_rows), np.int64)
+        indices = [corners[corner_rows]]
+        for attribute in attributes.values():
+            index = constant_index
+            if attribute is not None:
+                values, interpolation = attribute
+                index = index_by_interpolation.get(interpolation, constant_index)
+                if index.max() >= len(values):
+                    raise errors.FileFormatError(
+                        f"{self.source}: expected as many values "
+                        f"as corners on {path}, got fewer"
+                    )
+            indices.append(index)
+        # Corners with the same values become one vertex.
+        rows, inverse = np.unique(
+            np.stack(indices, axis=1), axis=0, return_inverse=True
+        )
+        accessors = {
             "POSITION": self.buffer.accessor(
                 points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True
             )
         }
-        for column, (name, given) in enumerate(held.items(), 1):
-            if given is not None:
-                values = given[0][rows[:, column]].astype(np.float32)
-                attributes[name] = self.buffer.accessor(values, f"VEC{values.shape[1]}")
-        indices = self.buffer.accessor(inverse.reshape(-1).astype(np.uint32), "SCALAR")
-        return {"attributes": attributes, "mode": 4, "indices": indices}
+        for column, (name, attribute) in enumerate(attributes.items(), 1):
+            if attribute is not None:
+                values = attribute[0][rows[:, column]].astype(np.float32)
+                kind = f"VEC{values.shape[1]}"
+                accessors[name] = self.buffer.accessor(values, kind)
+        index_accessor = self.buffer.accessor(
+            inverse.reshape(-1).astype(np.uint32), "SCALAR"
+        )
+        return {"attributes": accessors, "mode": 4, "indices": index_accessor}
 
     def _uvs(self, primvars: Any, layout: Layout) -> tuple[Array, str] | None:
-        """Return texture coordinates as glTF has them, v down, with the transform that
-        the material asks for.
+        """Return texture coordinates as glTF has them, v down, or None.
+
+        The transform of the material is applied.
+
+        Returns:
+            Values (N, 2), and their interpolation.
         """
         values = None
         if layout.primvar:
@@ -451,8 +505,10 @@ class Conversion:
                     "which one texel is shown"
                 )
             values = np.array([layout.fallback]), "constant"
-        moved = layout.moved(values[0])
-        return np.stack([moved[:, 0], 1.0 - moved[:, 1]], axis=1), values[1]
+        st, interpolation = values
+        transformed = layout.moved(st)
+        uvs = np.stack([transformed[:, 0], 1.0 - transformed[:, 1]], axis=1)
+        return uvs, interpolation
 
     def _tinted(
         self,
@@ -462,163 +518,215 @@ class Conversion:
         counts: Array,
         corners: Array,
     ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
-        """Yield materials, vertex colours and faces: by the primvars that a surface
-        takes colour and opacity from.
+        """Split faces with a material by their colors and opacities.
+
+        A material may take both from primvars. A few colors of faces become materials;
+        others are vertex colors.
+
+        Args:
+            bound: the material.
+            primvars: those of the mesh.
+            faces: (F,) faces with the material.
+            counts: (P,) corners of each face of the mesh.
+            corners: (C,) the point of each corner.
+
+        Yields:
+            Index of a glTF material, vertex colors or None, and faces.
         """
         if bound.color is None and bound.opacity is None:
             yield bound.number, None, faces
             return
         if bound.is_default:
             has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
-            color_words = (
-                ": of its displayColor"
-                if has_color
-                else " and displayColor: grey (0.18)"
-            )
+            color_words = " and displayColor: grey (0.18)"
+            if has_color:
+                color_words = ": of its displayColor"
             self._leave(
                 f"has a mesh without material{color_words}, with roughness 0.5 "
                 "and no metal, as USD's default"
             )
-        colors, shares = (
-            _primvar_values(primvars, use) for use in (bound.color, bound.opacity)
-        )
-        start = np.cumsum(counts) - counts
+        colors = _primvar_values(primvars, bound.color)
+        opacities = _primvar_values(primvars, bound.opacity)
+        opacity = self._face_opacities(opacities, faces, counts, corners)
+        tints = np.full((len(faces), 3), np.nan)
+        vertex_colors = colors
+        if colors is not None and colors[1] in ("constant", "uniform"):
+            face_colors = _values_of_faces(colors, faces, counts, corners)
+            if len(np.unique(face_colors, axis=0)) <= MOST_TINTS:
+                tints = face_colors
+                vertex_colors = None
+        keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
+        for key in np.unique(keys, axis=0):
+            is_selected = (keys == key).all(axis=1)
+            color = None if colors is None else key[:3]
+            if vertex_colors is not None:
+                color = np.ones(3)  # it is multiplied by vertex colors
+            key_opacity = None if key[3] < 0.0 else key[3]
+            material = self._surfaces.tinted(bound, color, key_opacity)
+            yield material, vertex_colors, faces[is_selected]
 
-        def per_face(given: tuple[Array, str]) -> Array:
-            """The values (F, C) of faces; of those of corners, the means."""
-            values, per = given
-            if per in ("constant", "uniform"):
-                index = faces if per == "uniform" else np.zeros(len(faces), np.int64)
-                return values[np.minimum(index, len(values) - 1)]
-            at = corners if per in ("vertex", "varying") else np.arange(len(corners))
-            all_values = values[np.minimum(at, len(values) - 1)]
-            sums = np.add.reduceat(
-                np.concatenate([all_values, np.zeros((1, values.shape[1]))]), start
-            )
-            return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
+    def _face_opacities(
+        self,
+        opacities: tuple[Array, str] | None,
+        faces: Array,
+        counts: Array,
+        corners: Array,
+    ) -> Array:
+        """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
-        opacity = np.full((len(faces), 1), np.nan)  # as the material has it
-        if shares is not None:
-            opacity = np.round(per_face(shares).clip(0.0, 1.0) * 255.0) / 255.0
-            if (
-                shares[1] not in ("constant", "uniform")
-                and len(np.unique(shares[0])) > 1
-            ):
-                self._leave("has an opacity of vertices, of which faces have the mean")
+        Arguments are those of `_values_of_faces`.
+        """
+        if opacities is None:
+            return np.full((len(faces), 1), np.nan)
+        face_values = _values_of_faces(opacities, faces, counts, corners)
+        opacity = np.round(face_values.clip(0.0, 1.0) * 255.0) / 255.0
+        values, interpolation = opacities
+        is_of_vertices = interpolation not in ("constant", "uniform")
+        if is_of_vertices and len(np.unique(values)) > 1:
+            self._leave("has an opacity of vertices, of which faces have the mean")
         if len(np.unique(opacity)) > MOST_TINTS:
             self._leave(
                 f"has more than {MOST_TINTS} opacities of faces, of which the "
                 "mean is read"
             )
             opacity = np.full_like(opacity, opacity.mean())
-        tints = np.full((len(faces), 3), np.nan)
-        vertex_colors = colors
-        if colors is not None and colors[1] in ("constant", "uniform"):
-            face_colors = per_face(colors)
-            if len(np.unique(face_colors, axis=0)) <= MOST_TINTS:
-                tints = face_colors
-                vertex_colors = None
-        keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
-        for key in np.unique(keys, axis=0):
-            chosen = (keys == key).all(axis=1)
-            color = None if colors is None else key[:3]
-            if vertex_colors is not None:
-                color = np.ones(3)  # which the vertices multiply
-            number = self._surfaces.tinted(
-                bound, color, None if key[3] < 0.0 else key[3]
-            )
-            yield number, vertex_colors, faces[chosen]
+        return opacity
 
     def _groups(
         self, prim: Any, mesh: Any, faces: int
     ) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces."""
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
-        rest = np.ones(faces, bool)
+        is_unbound = np.ones(faces, bool)
         for subset in subsets:
-            chosen = np.unique(_array(_first(subset, "Indices"), np.int64))
-            chosen = chosen[(chosen >= 0) & (chosen < faces)]
-            chosen = chosen[rest[chosen]]
-            rest[chosen] = False
-            yield self._surfaces.bound_to(subset.GetPrim()), chosen
-        if rest.any():
-            yield self._surfaces.bound_to(prim), np.flatnonzero(rest)
+            selected = np.unique(_array(_first(subset, "Indices"), np.int64))
+            selected = selected[(selected >= 0) & (selected < faces)]
+            selected = selected[is_unbound[selected]]
+            is_unbound[selected] = False
+            yield self._surfaces.bound_to(subset.GetPrim()), selected
+        if is_unbound.any():
+            yield self._surfaces.bound_to(prim), np.flatnonzero(is_unbound)
 
     def _at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
-        """Points of a mesh whose skeleton is at rest, and where they lie (4, 4), rows;
-        (None, points) without one.
+        """Pose the points of a mesh by its skeleton at rest.
+
+        Returns:
+            The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
+            (None, points) if the mesh has no skeleton.
         """
         skin = self._skins.GetSkinningQuery(prim)
         if not skin or not skin.HasJointInfluences():
             return None, points
-        bound = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
-        query = self._skins.GetSkelQuery(bound) if bound else None
+        skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
+        query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not query:
             return None, points
         rest = query.ComputeJointSkelTransforms(FIRST, atRest=True)
         binding = query.GetJointWorldBindTransforms()
         if not rest or len(rest) != len(binding):
             return None, points
-        moves = [
-            bind.GetInverse() * place for bind, place in zip(binding, rest, strict=True)
+        transforms = [
+            bind.GetInverse() * joint for bind, joint in zip(binding, rest, strict=True)
         ]
         mapper = skin.GetJointMapper()
         if mapper and not mapper.IsNull() and not mapper.IsIdentity():
-            moves = mapper.RemapTransforms(type(rest)(moves))
+            transforms = mapper.RemapTransforms(type(rest)(transforms))
         skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
-        if not skin.ComputeSkinnedPoints(Vt.Matrix4dArray(list(moves)), skinned, FIRST):
+        matrices = Vt.Matrix4dArray(list(transforms))
+        if not skin.ComputeSkinnedPoints(matrices, skinned, FIRST):
             return None, points
-        place = UsdGeom.Xformable(bound.GetPrim()).ComputeLocalToWorldTransform(FIRST)
-        return np.array(place), _array(skinned, np.float64, 3)
+        xformable = UsdGeom.Xformable(skeleton.GetPrim())
+        to_world = xformable.ComputeLocalToWorldTransform(FIRST)
+        return np.array(to_world), _array(skinned, np.float64, 3)
+
+
+def _shaped_light(prim: Any) -> dict[str, Any]:
+    """Return the entry of a point light, or of a spot light if the prim has a cone."""
+    if not prim.HasAPI(UsdLux.ShapingAPI):
+        return {"type": "point"}
+    shaping = UsdLux.ShapingAPI(prim)
+    cone = _first(shaping, "ShapingConeAngle")
+    if cone is None or cone >= 90.0:
+        return {"type": "point"}
+    softness = _first(shaping, "ShapingConeSoftness") or 0.0
+    outer = math.radians(max(cone, 0.1))
+    inner = outer * (1.0 - min(softness, 1.0))
+    return {"type": "spot", "spot": {"outerConeAngle": outer, "innerConeAngle": inner}}
+
+
+def _values_of_faces(
+    primvar: tuple[Array, str], faces: Array, counts: Array, corners: Array
+) -> Array:
+    """Return the values (F, C) of faces; those of corners are averaged.
+
+    Args:
+        primvar: values (N, C) and their interpolation.
+        faces: (F,) faces.
+        counts: (P,) corners of each face of the mesh.
+        corners: (C,) the point of each corner.
+    """
+    values, interpolation = primvar
+    if interpolation in ("constant", "uniform"):
+        index = np.zeros(len(faces), np.int64)
+        if interpolation == "uniform":
+            index = faces
+        return np.asarray(values[np.minimum(index, len(values) - 1)])
+    corner_index = np.arange(len(corners))
+    if interpolation in ("vertex", "varying"):
+        corner_index = corners
+    corner_values = values[np.minimum(corner_index, len(values) - 1)]
+    # A row of zeros, since the last faces may have no corners.
+    padded = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
+    starts = np.cumsum(counts) - counts
+    sums = np.add.reduceat(padded, starts)
+    return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
 
 
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 
 def _first(schema: Any, name: str) -> Any:
+    """Return the first value in time of an attribute."""
     return getattr(schema, f"Get{name}Attr")().Get(FIRST)
 
 
 def _flattened(primvar: Any, width: int) -> tuple[Array, str] | None:
-    """The values (N, width) of a primvar, and what each belongs to; None where there
-    are none.
-    """
+    """Return the values (N, width) of a primvar and their interpolation, or None."""
     if not primvar or not primvar.HasValue():
         return None
-    return _array(primvar.ComputeFlattened(FIRST), np.float64, width), str(
-        primvar.GetInterpolation()
-    )
+    values = _array(primvar.ComputeFlattened(FIRST), np.float64, width)
+    return values, str(primvar.GetInterpolation())
 
 
 def _primvar_values(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | None:
-    """Return the values (N, C) of a primvar that a surface uses, and what each belongs
-    to; else the fallback.
+    """Return the values (N, C) of a primvar that a surface uses, or of its fallback.
+
+    Returns:
+        The values and their interpolation; None if the surface uses none.
     """
     if use is None:
         return None
-    values = (
-        _flattened(primvars.FindPrimvarWithInheritance(use.name), len(use.fallback))
-        if use.name
-        else None
-    )
+    values = None
+    if use.name:
+        primvar = primvars.FindPrimvarWithInheritance(use.name)
+        values = _flattened(primvar, len(use.fallback))
     if values is None or not len(values[0]):
         return np.array([use.fallback]), "constant"
     return np.nan_to_num(values[0]), values[1]
 
 
 def _array(values: Any, kind: Any, width: int = 0) -> Array:
+    """Return values as an array (N,), or (N, width); empty for None."""
     array = np.asarray([] if values is None else values, dtype=kind)
     return array.reshape(-1, width) if width else array
 
 
 def _smooth(points: Array, faces: Array) -> Array:
-    """Normals (P, 3) of points: the mean of those of their triangles (T, 3), by
-    area.
-    """
-    across = reading.face_vectors(points[faces])
+    """Return normals (P, 3) of points: the area-weighted mean of their triangles'."""
+    vectors = reading.face_vectors(points[faces])
     normals = np.zeros_like(points)
     for corner in range(3):
-        np.add.at(normals, faces[:, corner], across)
+        np.add.at(normals, faces[:, corner], vectors)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(
         lengths > 0.0, normals / np.maximum(lengths, 1e-30), [0.0, 0.0, 1.0]

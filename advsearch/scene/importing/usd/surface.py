@@ -1,12 +1,12 @@
-"""Materials of OpenUSD as materials of glTF: preview surfaces, and the pictures that
-they show.
+"""Converter of OpenUSD materials (preview surfaces) to glTF materials.
 
-What each input means is in the UsdPreviewSurface specification, version 2.6
-(openusd.org). An input that is not read is named.
+Inputs are those of the UsdPreviewSurface specification, version 2.6 (openusd.org). An
+input that is not read is noted.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import os
@@ -39,9 +39,9 @@ TRANSFORM = "UsdTransform2d"
 READERS_OF_COORDINATES = ("UsdPrimvarReader_float2", "UsdPrimvarReader_vector")
 READERS_OF_COLORS = ("UsdPrimvarReader_float3", "UsdPrimvarReader_float4")
 READER_OF_NUMBERS = "UsdPrimvarReader_float"
-# the linear diffuse colour of a preview surface that says none
+# Defaults of a preview surface; the color is linear.
 GREY = (0.18, 0.18, 0.18)
-ROUGHNESS = 0.5  # the same
+ROUGHNESS = 0.5
 WRAPS = {
     "repeat": reading.gltf_entries.REPEAT,
     "mirror": reading.gltf_entries.MIRRORED,
@@ -53,43 +53,39 @@ CHANNELS: Mapping[str, Sequence[int]] = {
     **{"rgb": (0, 1, 2), "rgba": (0, 1, 2), "xyz": (0, 1, 2)},
     **{"r": (0,), "g": (1,), "b": (2,), "a": (3,)},
 }
-"""Channels of a picture by the names of outputs."""
+"""Channels of an image by the names of outputs."""
 NO_SCALE = (1.0, 1.0, 1.0, 1.0)
 NO_BIAS = (0.0, 0.0, 0.0, 0.0)
 NORMAL_SCALE = (2.0, 2.0, 2.0, 1.0)
 NORMAL_BIAS = (-1.0, -1.0, -1.0, 0.0)
-"""What makes normals of the texels of 8 bits."""
-UPRIGHT = (0.0, 0.0, 1.0)  # the normal of a surface that says none
+"""Scale and bias that convert texels of 8 bits to normals."""
+UPRIGHT = (0.0, 0.0, 1.0)  # default normal of a surface
 WITHOUT_EFFECT: Mapping[str, float | tuple[float, ...]] = {
     **{"clearcoat": 0.0, "displacement": 0.0, "occlusion": 1.0, "ior": 1.5},
     **{"specularColor": (0.0, 0.0, 0.0)},
 }
-"""Values of inputs that change nothing; those of inputs that are not read are not
-named.
-"""
-MOST_NODES = 32  # shaders from an input to what it shows
+"""Values of inputs that change nothing: they need no note if they are not read."""
+MOST_NODES = 32  # limit of the shaders in a row
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a picture is looked up: by which primvar, and how that is moved."""
+    """The texture coordinates of an image: a primvar and its transform."""
 
-    primvar: str = "st"  # empty: everywhere at the same texture coordinates
-    # texture coordinates where a mesh has no such primvar
+    primvar: str = "st"  # empty: the same texture coordinates everywhere
+    # Texture coordinates if a mesh has no such primvar.
     fallback: tuple[float, float] | None = None
     matrix: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # two rows for (s, t, 1)
 
     def moved(self, st: Array) -> Array:
-        """Return texture coordinates (N, 2) as this looks pictures up."""
+        """Return texture coordinates (N, 2) after the transform."""
         rows = np.array(self.matrix).reshape(2, 3)
         return np.asarray(st @ rows[:, :2].T + rows[:, 2])
 
 
 @dataclass(frozen=True)
 class PrimvarUse:
-    """A primvar that a surface has in the place of a number or a colour, and what holds
-    where there is none.
-    """
+    """A primvar that replaces a number or a color, and the fallback if it is missing."""
 
     name: str
     fallback: tuple[float, ...]
@@ -99,76 +95,88 @@ class PrimvarUse:
 class BoundMaterial:
     """The material of some faces."""
 
-    number: int  # of the glTF material
-    # texture coordinates by their numbers in glTF
+    number: int  # index of the glTF material
+    # Texture coordinates by their index in glTF.
     layouts: tuple[Layout, ...] = (Layout(),)
     color: PrimvarUse | None = None
     opacity: PrimvarUse | None = None
-    is_default: bool = False  # whether it stands in for no material
+    is_default: bool = False  # whether the prim has no material
 
 
 @dataclass
 class Shader:
-    """A shader whose inputs are tracked."""
+    """A shader, with a record of which inputs are read."""
 
     prim: Any
     inputs: reading.TrackedKeys[Any]
 
     @classmethod
     def of(cls, prim: Any) -> Shader:
-        inputs = {given.GetBaseName(): given for given in prim.GetInputs()}
+        """Return the shader of a prim."""
+        inputs = {
+            shader_input.GetBaseName(): shader_input
+            for shader_input in prim.GetInputs()
+        }
         return cls(prim, reading.TrackedKeys(inputs))
 
     @property
     def kind(self) -> str:
+        """The id of the shader, such as UsdUVTexture."""
         return str(self.prim.GetIdAttr().Get() or "a shader without an id")
 
     def _producers(self, name: str) -> Sequence[Any]:
-        given = self.inputs.get(name)
-        return UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
+        """Return the attributes that produce the value of an input."""
+        shader_input = self.inputs.get(name)
+        if not shader_input:
+            return ()
+        producers: Sequence[Any] = UsdShade.Utils.GetValueProducingAttributes(
+            shader_input
+        )
+        return producers
 
     def source(self, name: str) -> tuple[Shader, str] | None:
-        """Return the shader, and its output, that an input has in the place of its own
-        value.
-        """
+        """Return the shader, and its output, that an input is connected to, or None."""
         for attribute in self._producers(name):
             prim = UsdShade.Shader(attribute.GetPrim())
-            is_output = (
-                UsdShade.Utils.GetType(attribute.GetName())
-                == UsdShade.AttributeType.Output
-            )
-            if prim and is_output:
-                return Shader.of(prim), UsdShade.Utils.GetBaseNameAndType(
-                    attribute.GetName()
-                )[0]
+            if prim and _is_output(attribute):
+                output, _ = UsdShade.Utils.GetBaseNameAndType(attribute.GetName())
+                return Shader.of(prim), output
         return None
 
     def value(self, name: str) -> Any:
-        """Return the value of an input that no shader has; None where there is none."""
+        """Return the value of an input; None if it has none, or is connected."""
         if self.source(name) is not None:
             return None
         return next((attribute.Get(FIRST) for attribute in self._producers(name)), None)
 
     def numbers(self, name: str, otherwise: Sequence[float]) -> tuple[float, ...]:
-        """Return as many finite numbers as there are otherwise."""
+        """Return the finite numbers of an input, or `otherwise`, which has as many."""
         value = self.value(name)
+        if value is None:
+            return tuple(otherwise)
         try:
-            given = np.array(value, np.float64).reshape(-1)[: len(otherwise)]
+            numbers = np.array(value, np.float64).reshape(-1)[: len(otherwise)]
         except (TypeError, ValueError):
             return tuple(otherwise)
-        if value is None or len(given) < len(otherwise) or not np.isfinite(given).all():
+        if len(numbers) < len(otherwise) or not np.isfinite(numbers).all():
             return tuple(otherwise)
-        return tuple(map(float, given))
+        return tuple(map(float, numbers))
 
     def number(self, name: str, otherwise: float) -> float:
+        """Return the finite number of an input, or `otherwise`."""
         return self.numbers(name, (otherwise,))[0]
+
+
+def _is_output(attribute: Any) -> bool:
+    kind = UsdShade.Utils.GetType(attribute.GetName())
+    return bool(kind == UsdShade.AttributeType.Output)
 
 
 @dataclass(frozen=True, eq=False)
 class UsdTextureUse:
-    """A picture that an input shows."""
+    """An image that an input is connected to."""
 
-    path: str  # what the file calls it
+    path: str  # as the file has it
     data: bytes
     is_srgb: bool
     channels: Sequence[int]
@@ -179,7 +187,7 @@ class UsdTextureUse:
 
     @property
     def is_plain(self) -> bool:
-        """Whether values are those of the picture."""
+        """Whether values are those of the image."""
         return self.bias == NO_BIAS and self.scale == NO_SCALE
 
     @property
@@ -189,14 +197,12 @@ class UsdTextureUse:
 
 @dataclass
 class UsdSurfaces:
-    """Writes the materials of a stage, whose files lie in a folder, into the header of
-    a glTF file.
-    """
+    """Writes the materials of a stage to the header of a glTF file."""
 
     folder: Path
     header: dict[str, Any]
     buffer: reading.GlbBuffer
-    left: Counter[str]  # sentences about what is left out
+    left: Counter[str]  # notes on what is left out
     read: list[str]  # files that were read
     _bound: dict[str, BoundMaterial] = field(default_factory=dict)
     _texels: dict[tuple[bytes, bool], Array] = field(default_factory=dict)
@@ -205,7 +211,7 @@ class UsdSurfaces:
         self.left[what] += 1
 
     def bound_to(self, prim: Any) -> BoundMaterial:
-        """Return what a prim is made of: a material, or its display colour."""
+        """Return the material of a prim, or its display color."""
         binding = UsdShade.MaterialBindingAPI(prim)
         material = (
             binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0]
@@ -242,8 +248,9 @@ class UsdSurfaces:
     def tinted(
         self, bound: BoundMaterial, color: Sequence[float] | None, opacity: float | None
     ) -> int:
-        """Return the number of a material with another colour and opacity, linear
-        values in [0, 1].
+        """Return the index of a material with another color and opacity.
+
+        Both are linear values, clipped to [0, 1]; None leaves them as they are.
         """
         entry = dict(self.header["materials"][bound.number])
         surface = dict(entry["pbrMetallicRoughness"])
@@ -276,41 +283,41 @@ class UsdSurfaces:
             )
         return PreviewSurface(self, Shader.of(shader), name).convert()
 
-    # ---- pictures
-    # ----------------------------------------------------------------------------------------------------
+    # ---- Images ----
 
     def image(self, asset: Any, name: str) -> bytes | None:
-        """Return the bytes of a picture in the folder; None, and a note, of one that is
-        not there.
+        """Return the bytes of an image in the folder; None, and a note, if it is missing.
+
+        Args:
+            asset: the asset path.
+            name: the material that uses it, for the note.
         """
         path = str(asset.path)
         resolved = str(asset.resolvedPath) or str(self.folder / path)
         outer, inner = Ar.SplitPackageRelativePathOuter(resolved)
         outer = os.path.realpath(outer)
-        is_own = reading.is_inside(outer, self.folder)
+        is_in_folder = reading.is_inside(outer, self.folder)
         data = None
-        if is_own and os.path.isfile(outer):
-            try:
-                packaged = Ar.JoinPackageRelativePath(outer, inner) if inner else ""
-                data = (
-                    read_packaged(packaged)
-                    if inner
-                    else stored_files.read_bytes(
-                        Path(outer), "a picture", stored_files.LARGEST_FILE
-                    )
+        if is_in_folder and os.path.isfile(outer):
+            if inner:
+                packaged = Ar.JoinPackageRelativePath(outer, inner)
+                with contextlib.suppress(KeyError):  # it is not in the package
+                    data = read_packaged(packaged)
+            else:
+                data = stored_files.read_bytes(
+                    Path(outer), "a picture", stored_files.LARGEST_FILE
                 )
-            except KeyError:
-                data = None
         if data is None:
-            why = reading.MISSING if is_own else reading.OUTSIDE
-            self.leave(f"the texture {path[:100]!r} of {name} {why}")
+            reason = reading.MISSING if is_in_folder else reading.OUTSIDE
+            self.leave(f"the texture {path[:100]!r} of {name} {reason}")
             return None
         self.read.append(outer)
         return data
 
     def texels(self, use: UsdTextureUse) -> Array | None:
-        """Return a picture (H, W, 4) in linear values, before scale and bias; None, and
-        a note, of none.
+        """Return an image (H, W, 4) in linear values, before scale and bias.
+
+        None, and a note, if it cannot be decoded.
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -332,36 +339,38 @@ class UsdSurfaces:
         return self._texels[key]
 
     def values(self, use: UsdTextureUse) -> Array | None:
-        """Return what a picture yields, (H, W, C) for its channels."""
+        """Return what an image yields after scale and bias, (H, W, C), or None."""
         texels = self.texels(use)
         if texels is None:
             return None
-        values = texels * np.array(use.scale, np.float32) + np.array(
-            use.bias, np.float32
-        )
-        return np.asarray(values[:, :, list(use.channels)])
+        scale = np.array(use.scale, np.float32)
+        bias = np.array(use.bias, np.float32)
+        return np.asarray((texels * scale + bias)[:, :, list(use.channels)])
 
     def add_picture(self, levels: Array, sampler: Mapping[str, int]) -> int:
-        """Add a picture of display values in [0, 1], (H, W, 3 or 4), and return the
-        number of its texture.
+        """Add an image of display values in [0, 1], (H, W, 3 or 4).
+
+        Returns the index of its texture.
         """
+        clipped = np.clip(np.nan_to_num(levels), 0.0, 1.0)
         file = io.BytesIO()
-        Image.fromarray(
-            np.uint8(np.clip(np.nan_to_num(levels), 0.0, 1.0) * 255.0 + 0.5)
-        ).save(file, "PNG")
+        Image.fromarray(np.uint8(clipped * 255.0 + 0.5)).save(file, "PNG")
         return self.add_texture(file.getvalue(), sampler)
 
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
-        image = self._numbered(
-            "images",
-            {"mimeType": reading.mime_type(data), "bufferView": self.buffer.view(data)},
-        )
+        """Add an image file with a sampler, and return the index of its texture."""
+        entry = {
+            "mimeType": reading.mime_type(data),
+            "bufferView": self.buffer.view(data),
+        }
+        image = self._numbered("images", entry)
         return self._numbered(
             "textures",
             {"source": image, "sampler": self._numbered("samplers", sampler)},
         )
 
     def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
+        """Return the index of an entry of the header, which is added if it is new."""
         entries: list[Mapping[str, Any]] = self.header[kind]
         if entry not in entries:
             entries.append(entry)
@@ -370,17 +379,17 @@ class UsdSurfaces:
 
 @dataclass
 class PreviewSurface:
-    """Makes a glTF material of a preview surface."""
+    """Converts one preview surface to a glTF material."""
 
     surfaces: UsdSurfaces
     shader: Shader
     name: str
     layouts: list[Layout] = field(default_factory=list)
-    # shaders that are read, by their paths
+    # Shaders that are read, by path.
     nodes: dict[str, Shader] = field(default_factory=dict)
 
     def convert(self) -> BoundMaterial:
-        """Write the material, and name the inputs that are not read."""
+        """Write the material, and note the inputs that are not read."""
         shader = self.shader
         is_specular = bool(shader.number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
@@ -408,45 +417,50 @@ class PreviewSurface:
         return BoundMaterial(number, tuple(self.layouts) or (Layout(),), color, opacity)
 
     def _name_unread(self, *, is_specular: bool) -> None:
-        def is_quiet(name: str, given: Any) -> bool:
+        """Note the inputs that are not read, of the surface and of its shaders."""
+
+        def is_quiet(name: str, shader_input: Any) -> bool:
             if name == "specularColor" and not is_specular:
                 return True
-            usual = WITHOUT_EFFECT.get(name)
-            for attribute in UsdShade.Utils.GetValueProducingAttributes(given):
-                is_output = (
-                    UsdShade.Utils.GetType(attribute.GetName())
-                    == UsdShade.AttributeType.Output
-                )
-                value = attribute.Get(FIRST)
-                if is_output or usual is None:
+            neutral = WITHOUT_EFFECT.get(name)
+            for attribute in UsdShade.Utils.GetValueProducingAttributes(shader_input):
+                if _is_output(attribute) or neutral is None:
                     return False
+                value = attribute.Get(FIRST)
                 if value is not None and not np.allclose(
-                    np.array(value, np.float64), usual, atol=1e-3
+                    np.array(value, np.float64), neutral, atol=1e-3
                 ):
                     return False
             return True
 
         for name in self.shader.inputs.unread(is_quiet):
-            what = "an ior other than 1.5" if name == "ior" else name
-            self.surfaces.leave(f"has materials with {what[:100]}, which is left out")
+            label = "an ior other than 1.5" if name == "ior" else name
+            self.surfaces.leave(f"has materials with {label[:100]}, which is left out")
         for node in self.nodes.values():
-            if unread := node.inputs.unread():
+            unread = node.inputs.unread()
+            if unread:
                 self.surfaces.leave(
                     f"has a {node.kind[:50]} with "
                     f"{reading.join_names(unread, 5)}, which is not "
                     "read"
                 )
 
-    # ---- what inputs show
-    # --------------------------------------------------------------------------------------------
+    # ---- Connections of inputs ----
 
     def _node(self, source: Shader) -> Shader:
+        """Return the shader that stands for a prim, the same one each time."""
         return self.nodes.setdefault(str(source.prim.GetPath()), source)
 
     def _primvar(
         self, name: str, kinds: Sequence[str], otherwise: tuple[float, ...]
     ) -> PrimvarUse | None:
-        """Return the primvar that an input shows; None where it shows none."""
+        """Return the primvar that an input is connected to, or None.
+
+        Args:
+            name: the input.
+            kinds: ids of the readers of primvars that count.
+            otherwise: the default of the input, for its number of channels.
+        """
         source = self.shader.source(name)
         if source is None or source[0].kind not in kinds:
             return None
@@ -455,8 +469,11 @@ class PreviewSurface:
         return PrimvarUse(primvar, reader.numbers("fallback", [0.0] * len(otherwise)))
 
     def _texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
-        """Return the picture that an input shows, or the four numbers in its place;
-        None where it shows none.
+        """Return the texture that an input is connected to.
+
+        Returns:
+            The texture; or the numbers, one for each channel, that stand in for an image
+            that is missing; or None.
         """
         source = self.shader.source(name)
         if source is None:
@@ -467,16 +484,14 @@ class PreviewSurface:
         if node.kind != UV_TEXTURE:
             leave(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
-        fallback = (
-            None
-            if node.value("fallback") is None
-            else node.numbers("fallback", NO_SCALE)
-        )
+        fallback = None
+        if node.value("fallback") is not None:
+            fallback = node.numbers("fallback", NO_SCALE)
         scale = node.numbers("scale", NO_SCALE)
         bias = node.numbers("bias", NO_BIAS)
         layout = self._layout(node)
         wraps = self._wraps(node)
-        space = str(node.value("sourceColorSpace") or "auto")
+        color_space = str(node.value("sourceColorSpace") or "auto")
         asset = node.value("file")
         if output not in CHANNELS:
             leave(
@@ -485,50 +500,53 @@ class PreviewSurface:
             )
             return None
         channels = CHANNELS[output]
-        data = None
         path = "" if asset is None else str(asset.path)
-        if "<UDIM>" in path:
-            leave(
-                "has UDIM textures, which are left out; make .obj or one texture of "
-                "them"
-            )
-        elif path:
-            data = self.surfaces.image(asset, self.name)
-        else:
-            leave(f"has a {name} of a picture without a file")
+        data = self._image(asset, path, name)
         if data is None:
-            return (
-                None
-                if fallback is None
-                else tuple(fallback[channel] for channel in channels)
-            )
+            if fallback is None:
+                return None
+            return tuple(fallback[channel] for channel in channels)
         if channels == CHANNELS["a"] and data.startswith(EXR):
             leave(f"has a {name} of the alpha of an .exr picture, which is left out")
             return None
-        if space not in ("auto", "raw", "sRGB"):
+        if color_space not in ("auto", "raw", "sRGB"):
             leave(
-                f"has a texture with the sourceColorSpace {space[:50]!r}, which is "
-                "taken for auto"
+                f"has a texture with the sourceColorSpace {color_space[:50]!r}, which "
+                "is taken for auto"
             )
-        is_srgb = space == "sRGB" or (space != "raw" and is_marked_srgb(data))
+        is_srgb = color_space == "sRGB"
+        if not is_srgb and color_space != "raw":
+            is_srgb = is_marked_srgb(data)
         return UsdTextureUse(path, data, is_srgb, channels, scale, bias, layout, wraps)
 
+    def _image(self, asset: Any, path: str, name: str) -> bytes | None:
+        """Return the bytes of the image of an input; None, and a note, if there is none."""
+        if "<UDIM>" in path:
+            self.surfaces.leave(
+                "has UDIM textures, which are left out; make .obj or one texture of "
+                "them"
+            )
+            return None
+        if not path:
+            self.surfaces.leave(f"has a {name} of a picture without a file")
+            return None
+        return self.surfaces.image(asset, self.name)
+
     def _wraps(self, node: Shader) -> tuple[int, int]:
+        """Return the wrap modes of a texture along s and t, as in glTF."""
         wraps = []
         for axis in ("wrapS", "wrapT"):
-            word = str(node.value(axis) or "useMetadata")
-            if word not in WRAPS:
+            mode = str(node.value(axis) or "useMetadata")
+            if mode not in WRAPS:
                 self.surfaces.leave(
-                    f"has a texture with the {axis} {word[:50]!r}, "
+                    f"has a texture with the {axis} {mode[:50]!r}, "
                     "which is taken for repeat"
                 )
-            wraps.append(WRAPS.get(word, reading.gltf_entries.REPEAT))
+            wraps.append(WRAPS.get(mode, reading.gltf_entries.REPEAT))
         return wraps[0], wraps[1]
 
     def _layout(self, node: Shader) -> Layout:
-        """Return how a picture is looked up: through transforms, by a reader of a
-        primvar.
-        """
+        """Return the texture coordinates of a texture: a primvar and its transforms."""
         matrix = np.eye(3)
         name = "st"
         for _ in range(MOST_NODES):
@@ -569,105 +587,126 @@ class PreviewSurface:
             self.layouts.append(layout)
         return {"index": texture, "texCoord": self.layouts.index(layout)}
 
-    # ---- the parts of the material
-    # -----------------------------------------------------------------------------------
+    # ---- Properties of the material ----
 
     def _base(
         self, entry: dict[str, Any], surface: dict[str, Any]
     ) -> tuple[PrimvarUse | None, PrimvarUse | None]:
-        """Fill in colour and opacity; return the primvars that are in their places."""
+        """Fill in color and opacity.
+
+        Args:
+            entry: the glTF material.
+            surface: its pbrMetallicRoughness.
+
+        Returns:
+            The primvars that replace color and opacity.
+        """
         shader = self.shader
-        surfaces = self.surfaces
         color_primvar = self._primvar("diffuseColor", READERS_OF_COLORS, GREY)
         opacity_primvar = self._primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
-        shown = None if color_primvar else self._texture("diffuseColor")
-        cut = None if opacity_primvar else self._texture("opacity")
+        color_use = None if color_primvar else self._texture("diffuseColor")
+        opacity_use = None if opacity_primvar else self._texture("opacity")
         threshold = shader.number("opacityThreshold", 0.0)
         color = list(shader.numbers("diffuseColor", GREY))
         opacity = shader.number("opacity", 1.0)
-        if isinstance(shown, tuple):
-            color = list(np.broadcast_to(shown, 3))
-            shown = None
-        if isinstance(cut, tuple):
-            opacity = cut[0]
-            cut = None
-        if cut is not None and shown is not None and cut.layout != shown.layout:
-            surfaces.leave(
+        if isinstance(color_use, tuple):
+            color = list(np.broadcast_to(color_use, 3))
+            color_use = None
+        if isinstance(opacity_use, tuple):
+            opacity = opacity_use[0]
+            opacity_use = None
+        if (
+            opacity_use is not None
+            and color_use is not None
+            and opacity_use.layout != color_use.layout
+        ):
+            self.surfaces.leave(
                 "has an opacity with other texture coordinates than the "
                 "colour's, which is left out"
             )
-            cut = None
-        texture = None
-        if (
-            shown is not None
-            and _is_factor(shown)
-            and (cut is None or _is_its_alpha(cut, shown))
-        ):
-            texture = surfaces.add_texture(shown.data, shown.sampler)
-            color = list(shown.scale[:3])
-        elif shown is not None or cut is not None:
-            levels = self._baked(shown, cut, color)
-            if levels is not None:
-                sampler = (shown or cut).sampler  # type: ignore[union-attr]
-                texture = surfaces.add_picture(levels, sampler)
-                color = [1.0, 1.0, 1.0]
+            opacity_use = None
+        texture, color = self._base_texture(color_use, opacity_use, color)
         if texture is not None:
-            surface["baseColorTexture"] = self._slot(texture, (shown or cut).layout)  # type: ignore[union-attr]
-        is_cut = texture is not None and cut is not None
-        factor = [
-            min(max(channel, 0.0), 1.0)
-            for channel in (*color, 1.0 if is_cut else opacity)
-        ]
+            first_use = color_use or opacity_use
+            assert first_use is not None
+            surface["baseColorTexture"] = self._slot(texture, first_use.layout)
+        has_opacity_map = texture is not None and opacity_use is not None
+        alpha = 1.0 if has_opacity_map else opacity
+        factor = [min(max(channel, 0.0), 1.0) for channel in (*color, alpha)]
         surface["baseColorFactor"] = factor
-        if is_cut or factor[3] < 1.0 or opacity_primvar is not None:
-            masked = {"alphaMode": "MASK", "alphaCutoff": threshold}
-            entry.update(masked if threshold > 0.0 else {"alphaMode": "BLEND"})
+        if has_opacity_map or factor[3] < 1.0 or opacity_primvar is not None:
+            if threshold > 0.0:
+                entry.update({"alphaMode": "MASK", "alphaCutoff": threshold})
+            else:
+                entry["alphaMode"] = "BLEND"
         return color_primvar, opacity_primvar
+
+    def _base_texture(
+        self,
+        color_use: UsdTextureUse | None,
+        opacity_use: UsdTextureUse | None,
+        color: list[float],
+    ) -> tuple[int | None, list[float]]:
+        """Add the texture of color and opacity: the image itself, or a baked one.
+
+        Returns:
+            The index of the texture, or None; and the color that it is multiplied by.
+        """
+        first_use = color_use or opacity_use
+        if first_use is None:
+            return None, color
+        is_alpha_of_color = opacity_use is None or (
+            color_use is not None and _is_its_alpha(opacity_use, color_use)
+        )
+        if color_use is not None and _is_factor(color_use) and is_alpha_of_color:
+            texture = self.surfaces.add_texture(color_use.data, color_use.sampler)
+            return texture, list(color_use.scale[:3])
+        levels = self._baked(color_use, opacity_use, color)
+        if levels is None:
+            return None, color
+        texture = self.surfaces.add_picture(levels, first_use.sampler)
+        return texture, [1.0, 1.0, 1.0]
 
     def _baked(
         self,
-        shown: UsdTextureUse | None,
-        cut: UsdTextureUse | None,
+        color_use: UsdTextureUse | None,
+        opacity_use: UsdTextureUse | None,
         factor: Sequence[float],
     ) -> Array | None:
-        """Return display values (H, W, 3 or 4) of colour and opacity; None where
-        neither picture can be read.
+        """Return display values (H, W, 3 or 4) of color and opacity.
+
+        None if neither image can be read. `factor` is the color if it has no image.
         """
-        colors = None if shown is None else self.surfaces.values(shown)
-        shares = None if cut is None else self.surfaces.values(cut)
-        if colors is None and shares is None:
-            return None
-        if colors is None and shares is not None:
+        colors = None if color_use is None else self.surfaces.values(color_use)
+        opacities = None if opacity_use is None else self.surfaces.values(opacity_use)
+        if colors is None:
+            if opacities is None:
+                return None
             colors = np.broadcast_to(
-                np.array(factor, np.float32), (*shares.shape[:2], 3)
+                np.array(factor, np.float32), (*opacities.shape[:2], 3)
             )
-        assert colors is not None
         levels = color.linear_to_srgb(
             np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32)
         )
-        if shares is None:
+        if opacities is None:
             return levels
-        if shares.shape[:2] != levels.shape[:2]:
-            size = (
-                max(shares.shape[1], levels.shape[1]),
-                max(shares.shape[0], levels.shape[0]),
-            )
-            shares = _resized(shares, size)
-            levels = _resized(levels, size)
-        return np.concatenate([levels, shares[:, :, :1]], axis=2)
+        if opacities.shape[:2] != levels.shape[:2]:
+            width = max(opacities.shape[1], levels.shape[1])
+            height = max(opacities.shape[0], levels.shape[0])
+            opacities = _resized(opacities, (width, height))
+            levels = _resized(levels, (width, height))
+        return np.concatenate([levels, opacities[:, :, :1]], axis=2)
 
     def _numbers(self, surface: dict[str, Any], *, is_specular: bool) -> None:
-        """Fill in roughness and metallic; pictures of them are put into one."""
-        shader = self.shader
+        """Fill in roughness and metallic; their images are packed into one."""
         factors = {
-            "roughness": shader.number("roughness", ROUGHNESS),
-            "metallic": shader.number("metallic", 0.0),
+            "roughness": self.shader.number("roughness", ROUGHNESS),
+            "metallic": self.shader.number("metallic", 0.0),
         }
         planes: dict[str, Array] = {}
-        first: UsdTextureUse | None = None
+        first_use: UsdTextureUse | None = None
         for name in factors:
             primvar = self._primvar(name, (READER_OF_NUMBERS,), (0.0,))
-            use = None if primvar is not None else self._texture(name)
             if primvar is not None:
                 factors[name] = primvar.fallback[0]
                 self.surfaces.leave(
@@ -675,46 +714,38 @@ class PreviewSurface:
                     f"{primvar.name[:50]!r}, of which the fallback is "
                     "read"
                 )
-            elif isinstance(use, tuple):
+                continue
+            use = self._texture(name)
+            if isinstance(use, tuple):
                 factors[name] = use[0]
-            elif use is not None and (values := self.surfaces.values(use)) is not None:
-                self._name_srgb(name, use)
-                plane = np.clip(values[:, :, 0], 0.0, 1.0)
-                if first is not None and use.layout != first.layout:
-                    factors[name] = float(plane.mean())
-                    self.surfaces.leave(
-                        f"has a {name} with other texture coordinates, "
-                        "of which the mean is read"
-                    )
-                    continue
+                continue
+            values = None if use is None else self.surfaces.values(use)
+            if use is None or values is None:
+                continue
+            self._name_srgb(name, use)
+            plane = np.clip(values[:, :, 0], 0.0, 1.0)
+            if first_use is not None and use.layout != first_use.layout:
+                factors[name] = float(plane.mean())
+                self.surfaces.leave(
+                    f"has a {name} with other texture coordinates, "
+                    "of which the mean is read"
+                )
+            else:
                 planes[name] = plane
-                first = use
-        if is_specular:  # which has no metals
+                first_use = use
+        if is_specular:  # this workflow has no metals
             factors["metallic"] = 0.0
             planes.pop("metallic", None)
-        if not planes or first is None:
-            surface.update(
-                {
-                    "metallicFactor": factors["metallic"],
-                    "roughnessFactor": factors["roughness"],
-                }
-            )
+        if not planes or first_use is None:
+            surface["metallicFactor"] = factors["metallic"]
+            surface["roughnessFactor"] = factors["roughness"]
             return
-        size = max((plane.shape[1], plane.shape[0]) for plane in planes.values())
-        packed = np.ones((size[1], size[0], 3), np.float32)
-        for channel, name in ((1, "roughness"), (2, "metallic")):
-            packed[:, :, channel] = min(max(factors[name], 0.0), 1.0)
-            if name in planes:
-                packed[:, :, channel] = _resized(planes[name], size)
-        texture = self.surfaces.add_picture(packed, first.sampler)
-        slot = self._slot(texture, first.layout)
-        surface.update(
-            {
-                "metallicFactor": 1.0,
-                "roughnessFactor": 1.0,
-                "metallicRoughnessTexture": slot,
-            }
+        texture = self.surfaces.add_picture(
+            _pack_planes(planes, factors), first_use.sampler
         )
+        surface["metallicFactor"] = 1.0
+        surface["roughnessFactor"] = 1.0
+        surface["metallicRoughnessTexture"] = self._slot(texture, first_use.layout)
 
     def _name_srgb(self, name: str, use: UsdTextureUse) -> None:
         if use.is_srgb and use.channels != CHANNELS["a"]:
@@ -740,7 +771,7 @@ class PreviewSurface:
                 "has a normal of one channel of a picture, which is left out"
             )
             return
-        # USD asks for both, which many exporters leave out
+        # USD requires scale and bias, which many exporters leave out.
         if use.is_plain and is_of_8_bits(use.data):
             texels = self.surfaces.texels(replace(use, is_srgb=False))
             if texels is not None and reading.holds_normals(texels[:, :, :3]):
@@ -766,16 +797,15 @@ class PreviewSurface:
             entry["normalTexture"] = self._slot(texture, use.layout)
 
     def _emission(self, entry: dict[str, Any]) -> None:
-        glow: Sequence[float] = self.shader.numbers("emissiveColor", (0.0, 0.0, 0.0))
+        """Fill in the emission, whose factor may be larger than 1."""
+        factor: Sequence[float] = self.shader.numbers("emissiveColor", (0.0, 0.0, 0.0))
         use = self._texture("emissiveColor")
         if isinstance(use, tuple):
-            glow = list(np.broadcast_to(use, 3))
-            use = None
-        if use is not None and _is_factor(use, most=math.inf):
-            entry["emissiveTexture"] = self._slot(
-                self.surfaces.add_texture(use.data, use.sampler), use.layout
-            )
-            glow = use.scale[:3]
+            factor = list(np.broadcast_to(use, 3))
+        elif use is not None and _is_factor(use, most=math.inf):
+            texture = self.surfaces.add_texture(use.data, use.sampler)
+            entry["emissiveTexture"] = self._slot(texture, use.layout)
+            factor = use.scale[:3]
         elif use is not None:
             values = self.surfaces.values(use)
             if values is None:
@@ -783,39 +813,53 @@ class PreviewSurface:
             values = np.broadcast_to(
                 np.maximum(np.nan_to_num(values), 0.0), (*values.shape[:2], 3)
             )
-            most = max(float(values.max()), 1e-6)
-            texture = self.surfaces.add_picture(
-                color.linear_to_srgb((values / most).astype(np.float32)), use.sampler
-            )
+            largest = max(float(values.max()), 1e-6)
+            levels = color.linear_to_srgb((values / largest).astype(np.float32))
+            texture = self.surfaces.add_picture(levels, use.sampler)
             entry["emissiveTexture"] = self._slot(texture, use.layout)
-            glow = [most] * 3
-        glow = [max(channel, 0.0) for channel in glow]
-        if (most := max(glow)) > 0.0:
-            entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
-            if most > 1.0:
+            factor = [largest] * 3
+        factor = [max(channel, 0.0) for channel in factor]
+        strength = max(factor)
+        if strength > 0.0:
+            entry["emissiveFactor"] = [
+                channel / max(strength, 1.0) for channel in factor
+            ]
+            if strength > 1.0:
                 entry["extensions"] = {
-                    "KHR_materials_emissive_strength": {"emissiveStrength": most}
+                    "KHR_materials_emissive_strength": {"emissiveStrength": strength}
                 }
 
 
-def _transform_of(node: Shader) -> Array:
-    """Return the matrix (3, 3) of a transform: scaled, then turned counter-clockwise,
-    then moved.
+def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> Array:
+    """Return an image (H, W, 3) of roughness (green) and metallic (blue).
+
+    A plane that is missing is filled with its factor.
     """
+    width, height = max((plane.shape[1], plane.shape[0]) for plane in planes.values())
+    packed = np.ones((height, width, 3), np.float32)
+    for channel, name in ((1, "roughness"), (2, "metallic")):
+        packed[:, :, channel] = min(max(factors[name], 0.0), 1.0)
+        if name in planes:
+            packed[:, :, channel] = _resized(planes[name], (width, height))
+    return packed
+
+
+def _transform_of(node: Shader) -> Array:
+    """Return the matrix (3, 3) of a UsdTransform2d: scale, then rotate, then translate."""
     scale = node.numbers("scale", (1.0, 1.0))
     shift = node.numbers("translation", (0.0, 0.0))
     angle = math.radians(node.number("rotation", 0.0))
-    turn = np.array(
+    rotation = np.array(
         [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     )
     matrix = np.eye(3)
-    matrix[:2, :2] = turn @ np.diag(scale)
+    matrix[:2, :2] = rotation @ np.diag(scale)
     matrix[:2, 2] = shift
     return matrix
 
 
 def _is_factor(use: UsdTextureUse, most: float = 1.0) -> bool:
-    """Whether the colours of a picture are its texels in sRGB, times a factor."""
+    """Return whether colors are sRGB texels of 8 bits times factors up to a limit."""
     is_color = use.is_srgb and len(use.channels) == 3 and use.bias[:3] == NO_BIAS[:3]
     return (
         is_color
@@ -824,28 +868,24 @@ def _is_factor(use: UsdTextureUse, most: float = 1.0) -> bool:
     )
 
 
-def _is_its_alpha(cut: UsdTextureUse, shown: UsdTextureUse) -> bool:
-    """Whether an opacity is the alpha of the picture of the colour."""
-    is_alpha = (
-        cut.channels == CHANNELS["a"] and cut.scale[3] == 1.0 and cut.bias[3] == 0.0
+def _is_its_alpha(opacity_use: UsdTextureUse, color_use: UsdTextureUse) -> bool:
+    """Return whether an opacity is the alpha of the image of the color."""
+    is_unchanged_alpha = (
+        opacity_use.channels == CHANNELS["a"]
+        and opacity_use.scale[3] == 1.0
+        and opacity_use.bias[3] == 0.0
     )
-    return is_alpha and cut.data == shown.data
+    return is_unchanged_alpha and opacity_use.data == color_use.data
 
 
 def _resized(values: Array, size: tuple[int, int]) -> Array:
-    """Return a picture (H, W) or (H, W, C) in another size (width, height)."""
+    """Return an image (H, W) or (H, W, C) resized to (width, height), bilinearly."""
     if values.ndim == 3:
-        return np.stack(
-            [
-                _resized(values[:, :, channel], size)
-                for channel in range(values.shape[2])
-            ],
-            axis=2,
-        )
+        channels = [
+            _resized(values[:, :, channel], size) for channel in range(values.shape[2])
+        ]
+        return np.stack(channels, axis=2)
     if (values.shape[1], values.shape[0]) == size:
         return values
-    return np.asarray(
-        Image.fromarray(values.astype(np.float32)).resize(
-            size, Image.Resampling.BILINEAR
-        )
-    )
+    image = Image.fromarray(values.astype(np.float32))
+    return np.asarray(image.resize(size, Image.Resampling.BILINEAR))
