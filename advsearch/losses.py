@@ -22,10 +22,20 @@ from advsearch.engine import judging
 from advsearch.errors import InputError
 
 __all__ = [
-    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "nps",
-    "targeted_carlini_wagner", "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin",
+    "carlini_wagner",
+    "cross_entropy",
+    "dlr",
+    "log_odds",
+    "margin",
+    "non_printability",
+    "nps",
+    "targeted_carlini_wagner",
+    "targeted_cross_entropy",
+    "targeted_dlr",
+    "targeted_log_odds",
+    "targeted_margin",
     "total_variation",
-]  # fmt: skip
+]
 
 # (N,) int64, the right label of each picture; or indices, all of which are right
 Labels = Tensor | Sequence[int]

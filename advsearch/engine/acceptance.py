@@ -118,9 +118,14 @@ def compared(view: Callable[[int], ComparedView]) -> Deviation:
 
 
 def view_of(
-    renderer: Renderer, predicted: Tensor, u: Tensor, seed: int, spp: int, margin: MarginOf,
+    renderer: Renderer,
+    predicted: Tensor,
+    u: Tensor,
+    seed: int,
+    spp: int,
+    margin: MarginOf,
     before: Tensor | None = None,
-) -> ComparedView:  # fmt: skip
+) -> ComparedView:
     """Compare a predicted picture (H, W, 3) of a configuration u (d,) of the whole
     space with traced ones. The search renders with `spp` samples a pixel; `before` was
     predicted in its place before the search, if anything was.

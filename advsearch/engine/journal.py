@@ -458,16 +458,26 @@ class Journal:
         gradient = evaluation.gradient
         picture = evaluation.picture
         row = Row(
-            query.kind, query.number, query.seed, None if evaluation.predicted else problem.spp * query.samples,
-            objective=evaluation.objective if finite else math.nan, success=evaluation.success and finite,
-            values=problem.describe(query.u), seconds=evaluation.seconds, phase=query.phase,
-            renders=0 if evaluation.predicted else evaluation.cost * problem.draws, machine=evaluation.machine,
-        )  # fmt: skip
+            query.kind,
+            query.number,
+            query.seed,
+            None if evaluation.predicted else problem.spp * query.samples,
+            objective=evaluation.objective if finite else math.nan,
+            success=evaluation.success and finite,
+            values=problem.describe(query.u),
+            seconds=evaluation.seconds,
+            phase=query.phase,
+            renders=0 if evaluation.predicted else evaluation.cost * problem.draws,
+            machine=evaluation.machine,
+        )
         told = Told(
-            query.number, digest(query.u), evaluation.non_finite, evaluation.cost,
+            query.number,
+            digest(query.u),
+            evaluation.non_finite,
+            evaluation.cost,
             None if gradient is None else gradient.detach().numpy(),
             None if picture is None else levels_of(picture).numpy(),
-        )  # fmt: skip
+        )
         return row if evaluation.judgement is None else judged(
             row, evaluation.judgement
         ), told

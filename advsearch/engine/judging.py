@@ -277,9 +277,14 @@ def calibrate_task(
         return task
     for scene in scenes:
         rendering = render(
-            scene, model, task=task, label=label, judge=OBJECT if judge == ALL else judge, spp=LOOK_SPP,
+            scene,
+            model,
+            task=task,
+            label=label,
+            judge=OBJECT if judge == ALL else judge,
+            spp=LOOK_SPP,
             **image_settings,
-        )  # fmt: skip
+        )
         view = rendering.views[0]
         task = task.after_calibration(view.output, view.truth)
         if not task.ambiguities:
@@ -378,12 +383,16 @@ def domain_of(
     """
     blocks = tuple(
         Block(
-            group.size, group.budget.norm, group.budget.epsilon,  # type: ignore[arg-type]
-            periodic=group.periodic, name=f"{control.name}.{group.parameter}", options=group.options,
+            group.size,
+            group.budget.norm,
+            group.budget.epsilon,  # type: ignore[arg-type]
+            periodic=group.periodic,
+            name=f"{control.name}.{group.parameter}",
+            options=group.options,
         )
         for control in controls
         for group in control.groups
-    )  # fmt: skip
+    )
     if start is None:
         start = (
             torch.cat([control.start for control in controls])

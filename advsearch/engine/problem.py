@@ -546,10 +546,14 @@ class Problem:
         image, output = seen[0]
         (judgement,) = self._judged(output, image[None], [truth], [whole])
         evaluation = Evaluation(
-            float(value), derivative, judgement.success, renderer.non_finite - before,
-            cost=max(1, renderer.renders - renders) * samples, judgement=judgement,
+            float(value),
+            derivative,
+            judgement.success,
+            renderer.non_finite - before,
+            cost=max(1, renderer.renders - renders) * samples,
+            judgement=judgement,
             picture=to_8_bit(image) if query.keep else None,
-        )  # fmt: skip
+        )
         return evaluation, output
 
     def judged(
@@ -601,9 +605,13 @@ class Problem:
         return evaluations, derivative
 
     def mean_under(
-        self, render: Callable[[slice, Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient,
+        self,
+        render: Callable[[slice, Tensor], Tensor],
+        wholes: Sequence[Tensor],
+        u: Tensor,
+        gradient: WhichGradient,
         at_once: int,
-    ) -> Evaluation:  # fmt: skip
+    ) -> Evaluation:
         """Return the mean over conditions whose pictures are predicted: `render` goes
         from some of them and u to pictures (N, H, W, 3), with a graph. The model is
         asked about `at_once` of them at once.
@@ -654,10 +662,12 @@ class Problem:
         return Evaluation(
             sum(evaluation.objective for evaluation in each) / len(each),
             torch.stack(gradients).mean(dim=0) if gradients else gradient,
-            sum(evaluation.success for evaluation in each) >= OVER_CONDITIONS.share(len(each)),
-            non_finite=sum(evaluation.non_finite for evaluation in each), cost=max(one.cost for one in each),
+            sum(evaluation.success for evaluation in each)
+            >= OVER_CONDITIONS.share(len(each)),
+            non_finite=sum(evaluation.non_finite for evaluation in each),
+            cost=max(one.cost for one in each),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
-        )  # fmt: skip
+        )
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a

@@ -113,9 +113,15 @@ def lost_remarks(lost: int) -> list[str]:
 
 
 def trial_row(
-    kind: str, number: int, seed: int | None, spp: int, trial: Judgement, values: Mapping[str, Value] | None = None, *,
+    kind: str,
+    number: int,
+    seed: int | None,
+    spp: int,
+    trial: Judgement,
+    values: Mapping[str, Value] | None = None,
+    *,
     sought: bool = True,
-) -> Row:  # fmt: skip
+) -> Row:
     """Return what the store keeps of a trial; the seed is None of a picture that was
     predicted. There is a success only where a search sought some prediction.
     """
@@ -137,10 +143,16 @@ def trial_row(
 def judged(row: Row, judgement: Judgement) -> Row:
     prediction = judgement.prediction
     return replace(
-        row, score=_number(judgement.score), correct=judgement.right, margin=_number(judgement.margin),
-        label=None if judgement.not_a_number else prediction.label, label_index=prediction.index,
-        probability=prediction.probability, payload=judgement.payload, metrics=judgement.metrics or {},
-    )  # fmt: skip
+        row,
+        score=_number(judgement.score),
+        correct=judgement.right,
+        margin=_number(judgement.margin),
+        label=None if judgement.not_a_number else prediction.label,
+        label_index=prediction.index,
+        probability=prediction.probability,
+        payload=judgement.payload,
+        metrics=judgement.metrics or {},
+    )
 
 
 def _number(value: float | None) -> float | None:

@@ -212,21 +212,41 @@ class Rendering:
         scene = self.scene
         up = self.scene.object.up
         return RenderResult(
-            out=str(out), answered=None if answered is None else str(answered), size=size, object=scene.object_name,
-            environment=scene.environment_name, model=self.model, task=self.task, spp=self.spp,
-            image_formation=Formation.of(self.formation), up=None if up is None else MeshUp.of(up),
-            views=[ViewPredictions.of(view) for view in self.views], warnings=list(warnings),
-        )  # fmt: skip
+            out=str(out),
+            answered=None if answered is None else str(answered),
+            size=size,
+            object=scene.object_name,
+            environment=scene.environment_name,
+            model=self.model,
+            task=self.task,
+            spp=self.spp,
+            image_formation=Formation.of(self.formation),
+            up=None if up is None else MeshUp.of(up),
+            views=[ViewPredictions.of(view) for view in self.views],
+            warnings=list(warnings),
+        )
 
 
 @plainly()
 def render(
-    scene: Scene | str | Path, model: Model | nn.Module | str | Path = "reference", *, task: AnyTask = "classification",
-    label: str | None = None, judge: str = OBJECT, controls: Controls = (), around: int | None = None,
-    texture: Texture | None = None, resolution: int | tuple[int, int] | None = None, spp: int = PICTURE_SPP,
-    denoise: str = "oidn", sampler: str = SAMPLER, seed: int = 0, aov: bool = False, at: Tensor | None = None,
+    scene: Scene | str | Path,
+    model: Model | nn.Module | str | Path = "reference",
+    *,
+    task: AnyTask = "classification",
+    label: str | None = None,
+    judge: str = OBJECT,
+    controls: Controls = (),
+    around: int | None = None,
+    texture: Texture | None = None,
+    resolution: int | tuple[int, int] | None = None,
+    spp: int = PICTURE_SPP,
+    denoise: str = "oidn",
+    sampler: str = SAMPLER,
+    seed: int = 0,
+    aov: bool = False,
+    at: Tensor | None = None,
     progress: Watched = None,
-) -> Rendering:  # fmt: skip
+) -> Rendering:
     """Render a scene and ask the model what it sees.
 
     Args:
@@ -373,9 +393,13 @@ def looks_at(
 
 
 def facts_about(
-    description: SceneDescription, name: str, label: str | None, values: Callable[[], Mapping[str, Value]],
-    look: Callable[[], Surfaces] | None = None, judge: str = OBJECT,
-) -> Facts:  # fmt: skip
+    description: SceneDescription,
+    name: str,
+    label: str | None,
+    values: Callable[[], Mapping[str, Value]],
+    look: Callable[[], Surfaces] | None = None,
+    judge: str = OBJECT,
+) -> Facts:
     """Return what a scene, whose object is called `name`, gives a task to judge by.
 
     Args:

@@ -200,10 +200,16 @@ class PredictedSearch(ABC):
     def summary(self) -> LinearTransport:
         entries, size = self.size()
         return LinearTransport(
-            used=True, way=self.way, reason=self.given_up, conditions=self.conditions(), entries=entries, bytes=size,
-            seconds=self.seconds, renewed=self.renewed,
+            used=True,
+            way=self.way,
+            reason=self.given_up,
+            conditions=self.conditions(),
+            entries=entries,
+            bytes=size,
+            seconds=self.seconds,
+            renewed=self.renewed,
             error=PredictionError.of(self.deviations[-1]) if self.deviations else None,
-        )  # fmt: skip
+        )
 
 
 @dataclass

@@ -182,9 +182,14 @@ class Verifier:
             "first control" if self.findings.search is None else "control"
         )
         self.findings.clean = run_trials(
-            self.evaluate_all, self.problem.domain.start, spp=self._clean_spp, seed=self.problem.seed,
-            trials=self.looks[0], kind=self._clean_kind, keep=KEPT,
-        )  # fmt: skip
+            self.evaluate_all,
+            self.problem.domain.start,
+            spp=self._clean_spp,
+            seed=self.problem.seed,
+            trials=self.looks[0],
+            kind=self._clean_kind,
+            keep=KEPT,
+        )
 
     @property
     def clean_tried(self) -> bool:
@@ -203,19 +208,33 @@ class Verifier:
         `again`: in trials after all others, both groups anew.
         """
         checked = verify(
-            self.evaluate_all, self.problem.domain, found.best_u, claim=found.ending, spp=self.findings.spp,
-            seed=self.problem.seed, trials=self.looks, clean=() if again else self.findings.clean,
-            rule=self.problem.rule, kind=kind, control=self._clean_kind, keep=KEPT, curtailed=curtailed,
+            self.evaluate_all,
+            self.problem.domain,
+            found.best_u,
+            claim=found.ending,
+            spp=self.findings.spp,
+            seed=self.problem.seed,
+            trials=self.looks,
+            clean=() if again else self.findings.clean,
+            rule=self.problem.rule,
+            kind=kind,
+            control=self._clean_kind,
+            keep=KEPT,
+            curtailed=curtailed,
             begin=self.count if again else 0,
-        )  # fmt: skip
+        )
         if not again:
             self.findings.clean = checked.clean_trials
         return checked
 
     def trials(
-        self, kind: str, configurations: Mapping[int, Tensor], *, sought: bool = True,
+        self,
+        kind: str,
+        configurations: Mapping[int, Tensor],
+        *,
+        sought: bool = True,
         predictor: PredictedSearch | None = None,
-    ) -> Iterator[Judgement]:  # fmt: skip
+    ) -> Iterator[Judgement]:
         """Try configurations once each, every one with a seed of its own, by their
         numbers among those of a kind; a `predictor` as for `evaluate_all`.
         """
@@ -239,9 +258,14 @@ class Verifier:
             yield evaluation.said
 
     def trials_of(
-        self, kind: str, count: int, find_configuration: Callable[[int], Tensor], *, sought: bool = True,
+        self,
+        kind: str,
+        count: int,
+        find_configuration: Callable[[int], Tensor],
+        *,
+        sought: bool = True,
         predictor: PredictedSearch | None = None,
-    ) -> Iterator[Judgement]:  # fmt: skip
+    ) -> Iterator[Judgement]:
         """Try configurations of a kind, numbered from 0, in batches that fit into
         memory; see `trials`.
         """
@@ -269,9 +293,14 @@ class Verifier:
         self.findings.average = tuple(self.trials_of("average", count, draw))
 
     def begin(
-        self, title: str, trials: int, *, name: str = "verification", flags: str = "`trials` or `verify_spp`",
+        self,
+        title: str,
+        trials: int,
+        *,
+        name: str = "verification",
+        flags: str = "`trials` or `verify_spp`",
         at_most: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         most = "at most " if at_most else ""
         hint = (
             f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a "
@@ -305,9 +334,15 @@ class Retrials:
     """
 
     def __init__(
-        self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int,
+        self,
+        conditions: Sequence[RetrialCondition],
+        run: RunDirectory,
+        progress: Progress,
+        *,
+        trials: int,
+        seed: int,
         executor: Workers | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._progress = progress
         self._count = trials
         self._seed = seed
@@ -329,9 +364,13 @@ class Retrials:
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
-                partial(self._evaluations, "clean", condition), condition.problem.domain.start, spp=condition.spp,
-                seed=self._seed, trials=self._count, kind=f"clean under {condition.name}",
-            )  # fmt: skip
+                partial(self._evaluations, "clean", condition),
+                condition.problem.domain.start,
+                spp=condition.spp,
+                seed=self._seed,
+                trials=self._count,
+                kind=f"clean under {condition.name}",
+            )
         return self._clean[condition.name]
 
     def adversarial(
@@ -341,10 +380,17 @@ class Retrials:
         of nothing is never confirmed. Its rows are called "KIND under CONDITION".
         """
         return verify(
-            partial(self._evaluations, kind, condition), condition.problem.domain, u, claim=Ending.NOT_VERIFIED,
-            spp=condition.spp, seed=self._seed, trials=self._count, clean=self.clean(condition),
-            rule=condition.problem.rule, kind=f"{kind} under {condition.name}",
-        )  # fmt: skip
+            partial(self._evaluations, kind, condition),
+            condition.problem.domain,
+            u,
+            claim=Ending.NOT_VERIFIED,
+            spp=condition.spp,
+            seed=self._seed,
+            trials=self._count,
+            clean=self.clean(condition),
+            rule=condition.problem.rule,
+            kind=f"{kind} under {condition.name}",
+        )
 
     def _evaluations(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]

@@ -214,11 +214,21 @@ class MapElites(Policy[ArchiveState]):
         from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
-            solution_dim=domain.dim, dims=dims, seed=seeds.stream(seed, "archive"),
-            ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
-            solution_dtype=np.float32, objective_dtype=np.float64, measures_dtype=np.float64,
+            solution_dim=domain.dim,
+            dims=dims,
+            seed=seeds.stream(seed, "archive"),
+            ranges=list(
+                zip(
+                    domain.lower[spanned].tolist(),
+                    domain.upper[spanned].tolist(),
+                    strict=True,
+                )
+            ),
+            solution_dtype=np.float32,
+            objective_dtype=np.float64,
+            measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
-        )  # fmt: skip
+        )
         first = [
             domain.begin[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),

@@ -249,9 +249,17 @@ def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measure
             )
             mean = statistics.fmean(_cosine(gradient, truth) for gradient in several)
             yield Measured(
-                quantity="gradient", control=control, estimator=estimators, factor=factor, spp=spp, repeats=REPEATS,
-                cosine=mean, reference_cosine=agreement, seconds=seconds, status=status_of(mean, agreement),
-            )  # fmt: skip
+                quantity="gradient",
+                control=control,
+                estimator=estimators,
+                factor=factor,
+                spp=spp,
+                repeats=REPEATS,
+                cosine=mean,
+                reference_cosine=agreement,
+                seconds=seconds,
+                status=status_of(mean, agreement),
+            )
             if mean >= GOAL:
                 break
 
@@ -334,9 +342,14 @@ BOUND = 0.5
 
 
 def measured_bounces(
-    renderer: Renderer, configurations: Sequence[Tensor], *, seed: int, spp: int, bound: float = BOUND,
+    renderer: Renderer,
+    configurations: Sequence[Tensor],
+    *,
+    seed: int,
+    spp: int,
+    bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
-) -> PathLength:  # fmt: skip
+) -> PathLength:
     """Return the shortest paths whose pictures agree with those of the full length to
     within a bound, all with the same noise; and what was measured, from the full length
     downwards to the first that misses the bound.
