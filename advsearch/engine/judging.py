@@ -458,8 +458,8 @@ def domain_of(
         for group in control.groups:
             block = Block(
                 group.size,
-                group.budget.norm,
-                group.budget.epsilon,  # type: ignore[arg-type]
+                group.budget.norm,  # type: ignore[arg-type]
+                group.budget.epsilon,
                 periodic=group.periodic,
                 name=f"{control.name}.{group.parameter}",
                 options=group.options,
