@@ -42,7 +42,6 @@ Labels = Tensor | Sequence[int]
 
 
 # ---- of logits (N, C), to be maximised
-# ------------------------------------------------------------------------------
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:
@@ -112,7 +111,6 @@ def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
 
 
 # ---- of colours (N, h, w, 3), a cost
-# --------------------------------------------------------------------------------
 
 
 def total_variation(colors: Tensor) -> Tensor:
@@ -148,7 +146,6 @@ nps = non_printability  # its usual short name
 
 
 # ---- as objectives
-# --------------------------------------------------------------------------------------------------
 
 
 def check_aim(objective: object, *, targeted: bool) -> None:
@@ -182,7 +179,6 @@ def check_aim(objective: object, *, targeted: bool) -> None:
 
 
 # ---- parts
-# ----------------------------------------------------------------------------------------------------------
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:

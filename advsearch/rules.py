@@ -81,7 +81,6 @@ IntArray = npt.NDArray[np.int64]
 
 
 # ---- tables
-# ---------------------------------------------------------------------------------------------------------
 
 
 def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
@@ -209,7 +208,6 @@ def split_in_halves(
 
 
 # ---- rules
-# ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -398,7 +396,6 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
 
 
 # ---- the best conditions
-# --------------------------------------------------------------------------------------------
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
@@ -510,7 +507,6 @@ def list_adjusted(
 
 
 # ---- candidates from trees
-# ------------------------------------------------------------------------------------------
 
 
 class TreeColumn(NamedTuple):

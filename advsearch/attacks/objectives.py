@@ -494,7 +494,6 @@ def objective_summaries() -> dict[str, str]:
 
 
 # ---- from names and functions to objectives
-# -------------------------------------------------------------------------
 
 
 def get_objective(

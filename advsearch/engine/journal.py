@@ -302,7 +302,6 @@ class Journal:
             self._opened = True
 
     # ---- queries
-    # ----------------------------------------------------------------------------------------------------
 
     def evaluate_all(
         self,
@@ -527,7 +526,6 @@ class Journal:
         ]
 
     # ---- notes
-    # ------------------------------------------------------------------------------------------------------
 
     def note(self, key: str) -> Any:
         return None if self.run is None else self.run.store.noted(key)
