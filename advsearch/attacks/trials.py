@@ -75,15 +75,15 @@ def margins_of(
     rows of all sample counts are numbered together, and the first `keep` pictures of
     each are wanted.
     """
-    made = Counter[int]()
+    n_made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        numbers = range(made[spp], made[spp] + len(seeds))
-        asked = enumerate(zip(seeds, numbers, strict=True), made.total())
-        made[spp] += len(seeds)
+        numbers = range(n_made[spp], n_made[spp] + len(seeds))
+        rows = enumerate(zip(seeds, numbers, strict=True), n_made.total())
+        n_made[spp] += len(seeds)
         queries = [
             Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep)
-            for row, (seed, number) in asked
+            for row, (seed, number) in rows
         ]
         return [-evaluation.said.score for evaluation in evaluate(queries)]
 
@@ -177,16 +177,16 @@ def choose_spp(
     for name, render in margins.items():
         values = _climbed(render, seed, ladder, looks, trials)
         below: list[float] = []
-        for spp, here in zip(ladder, values, strict=False):
+        for spp, margins_here in zip(ladder, values, strict=False):
             half_width = (
-                _quantile(len(here), len(looks))
-                * _deviation(here)
-                / math.sqrt(len(here))
+                _quantile(len(margins_here), len(looks))
+                * _deviation(margins_here)
+                / math.sqrt(len(margins_here))
             )
-            drift = fmean(here) - fmean(below) if below else math.nan
-            settled = bool(below) and _settled(here, below, len(looks), trials)
-            table.append(Rung(name, spp, fmean(here), half_width, drift, settled))
-            below = here
+            drift = fmean(margins_here) - fmean(below) if below else math.nan
+            settled = bool(below) and _settled(margins_here, below, len(looks), trials)
+            table.append(Rung(name, spp, fmean(margins_here), half_width, drift, settled))
+            below = margins_here
         renders = renders + sum(map(len, values))
         reached = max(reached, len(values) - 1)
         if not table[-1].settled:

@@ -321,8 +321,8 @@ class Problem:
                 start[:dim][drawn] = whole[:dim][drawn]
             predicted_start = None if torch.equal(start, whole) else predict(start)
 
-        def measure_margin(image: Tensor, full_u: Tensor) -> float:
-            return self.judge(image, full_u).margin
+        def measure_margin(image: Tensor, u: Tensor) -> float:
+            return self.judge(image, u).margin
 
         return view_of(
             self.renderer, predicted, whole, seed, spp, measure_margin, predicted_start
