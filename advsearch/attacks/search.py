@@ -190,11 +190,11 @@ def search(
         raise InputError(f"close: expected at least 0, got {close}")
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
-    begun = time.perf_counter()
+    started = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates), kind, noise)
     try:
         with interruptible():
-            deadline = math.inf if seconds is None else begun + seconds
+            deadline = math.inf if seconds is None else started + seconds
             stopped = _explore(
                 log,
                 policy,
@@ -208,14 +208,22 @@ def search(
                 _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
-    best_candidate = best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
+    best_candidate = (
+        best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
+    )
     claimed = best_candidate.rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    started, state = (log.policy, log.state) if log.state is not None else (None, None)
-    if started is not None and log.told:  # a batch that was cut
-        state = started.update(state, log.told)
+    final_policy = None
+    state = None
+    if log.state is not None:
+        final_policy = log.policy
+        state = log.state
+        if final_policy is not None and log.evaluated_batch:  # a batch that was cut
+            state = final_policy.update(state, log.evaluated_batch)
     return SearchResult(
         best_u=best_candidate.u,
-        best_objective=best_candidate.believed if math.isfinite(best_candidate.believed) else math.nan,
+        best_objective=best_candidate.believed
+        if math.isfinite(best_candidate.believed)
+        else math.nan,
         claimed_objective=best_candidate.objective,
         success_rate=best_candidate.rate,
         ending=Ending.FOUND if claimed else stopped,
@@ -226,11 +234,13 @@ def search(
         gradients=log.gradients,
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(record.non_finite for record in log.records),
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - started,
         agreement=tuple(log.agreement),
-        counts=Counts() if started is None else started.counts(state),
-        distribution=None if started is None else started.distribution(state),
-        failures=None if started is None else started.failures(state),
+        counts=Counts() if final_policy is None else final_policy.counts(state),
+        distribution=(
+            None if final_policy is None else final_policy.distribution(state)
+        ),
+        failures=None if final_policy is None else final_policy.failures(state),
     )
 
 
@@ -257,7 +267,7 @@ class _Log:
     agreement: list[float] = field(default_factory=list)
     policy: Policy[Any] | None = None
     state: Any = None
-    told: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
+    evaluated_batch: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
 
     def evaluated(
         self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
@@ -274,7 +284,15 @@ class _Log:
             seed = stream(self.noise, self.kind, index)
             gradient_request = proposal.gradient
             queries.append(
-                Query(u, seed, self.kind, number, phase, gradient_request, proposal.samples)
+                Query(
+                    u,
+                    seed,
+                    self.kind,
+                    number,
+                    phase,
+                    gradient_request,
+                    proposal.samples,
+                )
             )
         for proposal, query, raw in zip(
             proposals, queries, self.evaluate(queries), strict=True
@@ -364,12 +382,12 @@ def _explore(
                 batch.append(proposal_copy.affordable(log.domain, renders_left))
                 renders_left -= batch[-1].cost(log.domain)
         log.state = state
-        log.told = []
+        log.evaluated_batch = []
         is_out_of_time = False
         first = len(log.records)
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
-            log.told.append((proposal.u, evaluation))
+            log.evaluated_batch.append((proposal.u, evaluation))
             n_non_finite = 0 if evaluation.finite else n_non_finite + 1
             if n_non_finite == NON_FINITE_LIMIT:
                 return Ending.NON_FINITE
@@ -377,8 +395,8 @@ def _explore(
                 break
         if is_out_of_time:
             break
-        state = log.state = policy.update(state, log.told)
-        log.told = []
+        state = log.state = policy.update(state, log.evaluated_batch)
+        log.evaluated_batch = []
     return Ending.BUDGET_SPENT
 
 

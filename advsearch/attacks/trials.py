@@ -185,7 +185,9 @@ def choose_spp(
             )
             drift = fmean(margins_here) - fmean(below) if below else math.nan
             settled = bool(below) and _settled(margins_here, below, len(looks), trials)
-            table.append(Rung(name, spp, fmean(margins_here), half_width, drift, settled))
+            table.append(
+                Rung(name, spp, fmean(margins_here), half_width, drift, settled)
+            )
             below = margins_here
         renders = renders + sum(map(len, values))
         reached = max(reached, len(values) - 1)

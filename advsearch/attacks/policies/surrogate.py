@@ -214,7 +214,10 @@ class Observed:
         return replace(
             self,
             points=points,
-            values=(*self.values, *(evaluation.objective for _, evaluation in evaluated)),
+            values=(
+                *self.values,
+                *(evaluation.objective for _, evaluation in evaluated),
+            ),
         )
 
     def surrogate(self) -> tuple[Surrogate, Observed]:
