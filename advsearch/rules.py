@@ -546,7 +546,7 @@ def find_candidates(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> Iterator[RuleConditions]:
     """Yield the conditions of all nodes of trees, each once."""
-    seen_conditions: set[RuleConditions] = {()}
+    yielded_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
         for node in walk_tree(tree, columns):
             conditions_of_factor: dict[str, list[RuleCondition]] = {
@@ -559,8 +559,8 @@ def find_candidates(
             # of several parts of one angle, each in turn: their bounds are adjusted
             # later
             for conditions in product(*filter(None, conditions_of_factor.values())):
-                if conditions not in seen_conditions:
-                    seen_conditions.add(conditions)
+                if conditions not in yielded_conditions:
+                    yielded_conditions.add(conditions)
                     yield conditions
 
 

@@ -536,7 +536,8 @@ def get_objective(
             raise InputError(
                 f"objective {kind.name!r}: expected the model's features and a clean "
                 "picture, got none; use "
-                "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
+                "get_objective(name, "
+                "features=advsearch.models.features.features_of(model), clean=picture)"
             )
         function = _plain(kind.of_features(features, clean))
         function = function if ours else _handed(function)
