@@ -207,10 +207,11 @@ def _climbed(
     settles or none above can.
     """
     values: list[list[float]] = [[] for _ in ladder]
-    places = list(product(range(1, len(ladder)), looks))
-    for number, (level, count) in enumerate(places):
+    looks_at_rungs = list(product(range(1, len(ladder)), looks))
+    for number, (level, count) in enumerate(looks_at_rungs):
         if not any(
-            _may_settle(values, ladder, *later, len(looks)) for later in places[number:]
+            _may_settle(values, ladder, *later, len(looks))
+            for later in looks_at_rungs[number:]
         ):
             break
         if not _may_settle(values, ladder, level, count, len(looks)):
@@ -227,7 +228,7 @@ def _climbed(
 
 
 def _settled(
-    here: Sequence[float], below: Sequence[float], looks: int, trials: int
+    at_rung: Sequence[float], below: Sequence[float], looks: int, trials: int
 ) -> bool:
     """Return whether more samples would not change the sign of the margin.
 
@@ -239,9 +240,9 @@ def _settled(
         looks: how often one looks, which share the 5 %.
         trials: that will follow; 0 where other trials follow.
     """
-    mean = fmean(here)
-    count = min(len(here), len(below))
-    deviation = _deviation(here)
+    mean = fmean(at_rung)
+    count = min(len(at_rung), len(below))
+    deviation = _deviation(at_rung)
     # the mean if the rest of the noise changed it as much as the step from below did
     extrapolated = 2.0 * mean - fmean(below)
     extrapolated_error = math.hypot(2.0 * deviation, _deviation(below)) / math.sqrt(
@@ -252,7 +253,7 @@ def _settled(
     error = deviation / math.sqrt(count) if count == trials else deviation
     is_mean_sure = sign * mean > quantile * error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
-    has_one_sign = all(sign * value > 0.0 for value in here)
+    has_one_sign = all(sign * value > 0.0 for value in at_rung)
     return is_mean_sure and is_extrapolated_sure and has_one_sign
 
 
@@ -365,23 +366,37 @@ def choose_rate_spp(
     reached = 1
     seeds = [stream(seed, "sample count", number) for number in range(CONDITIONS)]
     for name, render in margins.items():
-        below: Floats | None = None
-        for place, spp in enumerate(ladder):
-            here = np.array(render(spp, seeds), dtype=np.float64)
-            half = (
-                stdtrit(len(here) - 1, CONFIDENCE)
-                * here.std(ddof=1)
-                / math.sqrt(len(here))
+        margins_below: Floats | None = None
+        for index, spp in enumerate(ladder):
+            margins_at_rung = np.array(render(spp, seeds), dtype=np.float64)
+            half_width = (
+                stdtrit(len(margins_at_rung) - 1, CONFIDENCE)
+                * margins_at_rung.std(ddof=1)
+                / math.sqrt(len(margins_at_rung))
             )
-            drift = math.nan if below is None else float(here.mean() - below.mean())
-            settled = below is not None and moved(here, below) <= MOVED
+            drift = (
+                math.nan
+                if margins_below is None
+                else float(margins_at_rung.mean() - margins_below.mean())
+            )
+            settled = (
+                margins_below is not None
+                and moved(margins_at_rung, margins_below) <= MOVED
+            )
             table.append(
-                Rung(name, spp, float(here.mean()), float(half), drift, settled)
+                Rung(
+                    name,
+                    spp,
+                    float(margins_at_rung.mean()),
+                    float(half_width),
+                    drift,
+                    settled,
+                )
             )
             if settled:
-                reached = max(reached, place)
+                reached = max(reached, index)
                 break
-            below = here
+            margins_below = margins_at_rung
         else:
             return SampleCount(ladder[-1], False, tuple(table), CONDITIONS * len(table))
     return SampleCount(ladder[reached], True, tuple(table), CONDITIONS * len(table))

@@ -208,12 +208,14 @@ class Raced(Policy[Racing]):
             if batch or all(runner.over for runner in runners):
                 return batch, state
             ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
-            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+            continuing = [
+                k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over
+            ]
             # nobody left who can go on: the rest is for whoever can
-            if state.round + 1 >= state.rounds or not able:
-                left = (k for k, runner in enumerate(runners) if not runner.over)
-                able = sorted(left, key=lambda k: -runners[k].best)[:1]
-            state = state.begun(able, min(state.round + 1, state.rounds - 1))
+            if state.round + 1 >= state.rounds or not continuing:
+                remaining = (k for k, runner in enumerate(runners) if not runner.over)
+                continuing = sorted(remaining, key=lambda k: -runners[k].best)[:1]
+            state = state.begun(continuing, min(state.round + 1, state.rounds - 1))
 
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
         """Update each search with the evaluations of its proposals.
