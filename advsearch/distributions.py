@@ -1,6 +1,7 @@
-"""Distributions of a parameter's values, as settings have them: those of `scipy.stats`
-by name, such as `{distribution: norm, loc: 30, scale: 10}`, choices with weights, and
-functions that only this session has.
+"""Distributions of a parameter's values as settings.
+
+These are distributions of `scipy.stats` by name, such as `{distribution: norm, loc: 30,
+scale: 10}`, choices with weights, and functions that only this Python session has.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ DISTRIBUTION = "distribution"
 CHOICES = "choices"
 WEIGHTS = "weights"
 FROM_PYTHON = "from Python"  # the name of one that no file can hold
-# shares at which settings tell one function from another of its name
+# probabilities at which settings distinguish functions of one name
 QUANTILES = (0.05, 0.5, 0.95)
 
 
 class OwnQuantiles(dict[str, object]):
-    """What settings say of an inverse CDF from Python, from shares in [0, 1] to values,
-    which it still has.
+    """The setting of an inverse CDF from Python, with the function itself.
+
+    Attributes:
+        function: from probabilities in [0, 1] to values.
     """
 
     def __init__(self, name: str, function: Callable[[float], float]) -> None:
         try:
-            seen = [float(f"{float(function(share)):.6g}") for share in QUANTILES]
+            quantiles = [float(f"{float(function(p)):.6g}") for p in QUANTILES]
         except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"distribution {name}: expected a function from a share in [0, 1] to a "
@@ -35,7 +38,9 @@ class OwnQuantiles(dict[str, object]):
                 "object with such an `icdf` or `ppf`; it raised "
                 f"{type(error).__name__}: {error}"
             ) from error
-        super().__init__({DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": seen})
+        super().__init__(
+            {DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": quantiles}
+        )
         self.function = function
 
 
@@ -45,8 +50,12 @@ def _loc_scale(d: Any) -> dict[str, Any]:
 
 TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
     **{
-        of: (to, _loc_scale)
-        for of, to in (("Normal", "norm"), ("Laplace", "laplace"), ("Cauchy", "cauchy"))
+        torch_name: (scipy_name, _loc_scale)
+        for torch_name, scipy_name in (
+            ("Normal", "norm"),
+            ("Laplace", "laplace"),
+            ("Cauchy", "cauchy"),
+        )
     },
     "Gumbel": ("gumbel_r", _loc_scale),
     "Uniform": ("uniform", lambda d: {"loc": d.low, "scale": d.high - d.low}),
@@ -58,15 +67,21 @@ TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
     "StudentT": ("t", lambda d: {"df": d.df, **_loc_scale(d)}),
     "Weibull": ("weibull_min", lambda d: {"c": d.concentration, "scale": d.scale}),
 }
-"""Of `torch.distributions`: what each is called in scipy, and its parameters there."""
+"""Name in scipy and parameters there of each class of `torch.distributions`."""
 
 
 def as_setting(given: object) -> object:
-    """Return what a file says of a parameter's distribution: one of torch, a frozen one
-    of scipy, anything else with an `icdf` or a `ppf`, a function from a share in [0, 1]
-    to a value (an inverse CDF), or a mapping from choices to their weights; anything
-    else as it is. Raises InputError: it is of several numbers, or of whole ones, or a
-    function that is no inverse CDF.
+    """Return a parameter's distribution as a setting that a file can hold.
+
+    Args:
+        given: a distribution of torch, a frozen one of scipy, anything else with an
+            `icdf` or a `ppf`, an inverse CDF (a function from a probability to a
+            value), or a mapping from choices to their weights. Anything else is
+            returned as it is.
+
+    Raises:
+        InputError: it is of several numbers, or of integers, or a function that is no
+            inverse CDF.
     """
     if isinstance(given, Mapping):
         # numpy's, torch's
@@ -123,6 +138,7 @@ def as_setting(given: object) -> object:
 
 
 def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
+    """Return the setting of a distribution of scipy with its parameters."""
     try:
         return {
             DISTRIBUTION: name,

@@ -1,5 +1,4 @@
-"""Losses for an objective or a loop of one's own, ready to be added up:
-`advsearch.losses`.
+"""Losses for an objective or a loop of the user, `advsearch.losses`.
 
     def smooth(logits, images, labels, texture):
         return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
@@ -22,29 +21,40 @@ from advsearch.engine import judging
 from advsearch.errors import InputError
 
 __all__ = [
-    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "nps",
-    "targeted_carlini_wagner", "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin",
+    "carlini_wagner",
+    "cross_entropy",
+    "dlr",
+    "log_odds",
+    "margin",
+    "non_printability",
+    "nps",
+    "targeted_carlini_wagner",
+    "targeted_cross_entropy",
+    "targeted_dlr",
+    "targeted_log_odds",
+    "targeted_margin",
     "total_variation",
-]  # fmt: skip
+]
 
 # (N,) int64, the right label of each picture; or indices, all of which are right
 Labels = Tensor | Sequence[int]
 
 
 # ---- of logits (N, C), to be maximised
-# ------------------------------------------------------------------------------
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:
-    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where
-    the prediction is wrong.
+    """Return the largest wrong logit minus the largest right one, (N,).
+
+    It is over 0 exactly where the prediction is wrong.
     """
     return _by_label(of_logits.margin, logits, labels)
 
 
 def targeted_margin(logits: Tensor, target: Labels) -> Tensor:
-    """The largest logit of the target minus the largest other one, (N,): over 0 exactly
-    where the prediction is there.
+    """Return the largest logit of the target minus the largest other one, (N,).
+
+    It is over 0 exactly where the prediction is the target.
     """
     return _by_label(of_logits.targeted_margin, logits, target)
 
@@ -52,8 +62,9 @@ def targeted_margin(logits: Tensor, target: Labels) -> Tensor:
 def carlini_wagner(
     logits: Tensor, labels: Labels, *, confidence: float = 0.0
 ) -> Tensor:
-    """`margin`, but no more than a confidence: beyond it, other terms alone are
-    followed (Carlini and Wagner 2017, f_6 with its hinge).
+    """Return `margin`, clipped at a confidence (Carlini and Wagner 2017, f_6).
+
+    Beyond it, only other terms have a gradient.
     """
     return margin(logits, labels).clamp(max=confidence)
 
@@ -61,53 +72,55 @@ def carlini_wagner(
 def targeted_carlini_wagner(
     logits: Tensor, target: Labels, *, confidence: float = 0.0
 ) -> Tensor:
-    """`targeted_margin`, but no more than a confidence; see `carlini_wagner`."""
+    """Return `targeted_margin`, clipped at a confidence; see `carlini_wagner`."""
     return targeted_margin(logits, target).clamp(max=confidence)
 
 
 def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
-    """Minus the logarithm of the probability of the right labels, (N,), in nats; that
-    of torch for one right label, but with a gradient where the model is sure.
+    """Return minus the logarithm of the probability of the right labels, (N,), in nats.
+
+    It is that of torch for one right label, but with a gradient where the model is sure.
     """
     return _by_label(of_logits.cross_entropy, logits, labels)
 
 
 def targeted_cross_entropy(logits: Tensor, target: Labels) -> Tensor:
-    """The logarithm of the probability of the target, (N,), in nats."""
+    """Return the logarithm of the probability of the target, (N,), in nats."""
     return _by_label(of_logits.targeted_cross_entropy, logits, target)
 
 
 def log_odds(logits: Tensor, labels: Labels) -> Tensor:
-    """The log-odds of a wrong prediction over all classes, (N,)."""
+    """Return the log-odds of a wrong prediction over all classes, (N,)."""
     return _by_label(of_logits.log_odds, logits, labels)
 
 
 def targeted_log_odds(logits: Tensor, target: Labels) -> Tensor:
-    """The log-odds of the target, (N,)."""
+    """Return the log-odds of the target, (N,)."""
     return _by_label(of_logits.targeted_log_odds, logits, target)
 
 
 def dlr(logits: Tensor, labels: Labels) -> Tensor:
-    """`margin` over a distance between logits, (N,): difference of logits ratio (Croce
-    and Hein 2020, section 4).
+    """Return the difference of logits ratio, (N,) (Croce and Hein 2020, section 4).
+
+    It is `margin` over a distance between logits.
     """
     return _by_label(of_logits.dlr, logits, labels)
 
 
 def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
-    """`targeted_margin` over a distance between logits, (N,) (Croce and Hein 2020,
-    section 4).
+    """Return the targeted difference of logits ratio, (N,).
+
+    It is `targeted_margin` over a distance between logits (Croce and Hein 2020, section
+    4).
     """
     return _by_label(of_logits.targeted_dlr, logits, target)
 
 
 # ---- of colours (N, h, w, 3), a cost
-# --------------------------------------------------------------------------------
 
 
 def total_variation(colors: Tensor) -> Tensor:
-    """Mean length of the step from a pixel to its right and lower neighbours, by
-    channel, (N,), in sRGB.
+    """Return the mean step from a pixel to its right and lower neighbors, (N,), in sRGB.
 
     After Sharif et al. 2016, section 5.2.2, whose sum over pixels is a mean here, so
     that a weight means the same at every resolution.
@@ -116,12 +129,11 @@ def total_variation(colors: Tensor) -> Tensor:
         colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of
             which only pixels with a last channel over 0 count.
     """
-    return torch.stack([judging.variation(one) for one in _pictures(colors)])
+    return torch.stack([judging.variation(image) for image in _to_batch(colors)])
 
 
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
-    """Mean Euclidean distance in sRGB of the pixels from the nearest colour that can be
-    printed, (N,).
+    """Return the mean sRGB distance of pixels from the nearest printable color, (N,).
 
     After the non-printability score of Sharif et al. 2016, section 5.2.3, which is a
     product of distances to all printable colours: it is zero at the same colours.
@@ -131,20 +143,24 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the
             125 of `printable`.
     """
-    return torch.stack([judging.off_print(one, palette) for one in _pictures(colors)])
+    return torch.stack(
+        [judging.off_print(image, palette) for image in _to_batch(colors)]
+    )
 
 
 nps = non_printability  # its usual short name
 
 
 # ---- as objectives
-# --------------------------------------------------------------------------------------------------
 
 
 def check_aim(objective: object, *, targeted: bool) -> None:
-    """Check that one of these losses, or of torch's, leads where a search is to go; any
-    other objective passes. Raises InputError: it needs a target that is not there, or
-    would lead away from the one that is.
+    """Check that a loss of this module, or of torch, rises where a search is to go.
+
+    Any other objective passes.
+
+    Raises:
+        InputError: it needs a target and there is none, or falls towards the target.
     """
     function = getattr(objective, "func", objective)  # of functools.partial
     module = str(getattr(function, "__module__", None) or type(function).__module__)
@@ -158,7 +174,9 @@ def check_aim(objective: object, *, targeted: bool) -> None:
             "losses.targeted_cross_entropy, or negate it: lambda logits, labels: "
             "-loss(logits, labels)"
         )
-    for name in (one for one in __all__ if f"targeted_{one}" in __all__):
+    for name in __all__:
+        if f"targeted_{name}" not in __all__:
+            continue
         if function is globals()[name] and targeted:
             raise InputError(
                 f"objective: losses.{name} leads away from the `target`; "
@@ -172,10 +190,10 @@ def check_aim(objective: object, *, targeted: bool) -> None:
 
 
 # ---- parts
-# ----------------------------------------------------------------------------------------------------------
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
+    """Return a loss (N,) of logits (N, C) and their labels, of which one may serve all."""
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             "labels: expected (N,) int64 or the indices of a label set, got "
@@ -184,23 +202,24 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
         )
     if not isinstance(labels, Tensor):
         return loss(logits, logits, tuple(labels))
-    each = [(int(one),) for one in labels.flatten()]
-    if len(each) not in (1, len(logits)):
+    label_sets = [(int(label),) for label in labels.flatten()]
+    if len(label_sets) not in (1, len(logits)):
         raise InputError(
             f"labels: expected {len(logits)}, one for each row of logits, "
-            f"got {len(each)}"
+            f"got {len(label_sets)}"
         )
-    if len(set(each)) == 1:
-        return loss(logits, logits, each[0])
+    if len(set(label_sets)) == 1:
+        return loss(logits, logits, label_sets[0])
     return torch.cat(
         [
-            loss(row[None], row[None], label)
-            for row, label in zip(logits, each, strict=True)
+            loss(row[None], row[None], label_set)
+            for row, label_set in zip(logits, label_sets, strict=True)
         ]
     )
 
 
-def _pictures(colors: Tensor) -> Tensor:
+def _to_batch(colors: Tensor) -> Tensor:
+    """Return colors (h, w, c) or (N, h, w, c) as (N, h, w, c)."""
     if colors.ndim == 3:
         return colors[None]
     if colors.ndim != 4 or colors.shape[-1] not in (3, 4):

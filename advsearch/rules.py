@@ -81,7 +81,6 @@ IntArray = npt.NDArray[np.int64]
 
 
 # ---- tables
-# ---------------------------------------------------------------------------------------------------------
 
 
 def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
@@ -209,7 +208,6 @@ def split_in_halves(
 
 
 # ---- rules
-# ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -398,7 +396,6 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
 
 
 # ---- the best conditions
-# --------------------------------------------------------------------------------------------
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
@@ -510,7 +507,6 @@ def list_adjusted(
 
 
 # ---- candidates from trees
-# ------------------------------------------------------------------------------------------
 
 
 class TreeColumn(NamedTuple):
@@ -550,7 +546,7 @@ def find_candidates(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> Iterator[RuleConditions]:
     """Yield the conditions of all nodes of trees, each once."""
-    seen_conditions: set[RuleConditions] = {()}
+    yielded_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
         for node in walk_tree(tree, columns):
             conditions_of_factor: dict[str, list[RuleCondition]] = {
@@ -563,8 +559,8 @@ def find_candidates(
             # of several parts of one angle, each in turn: their bounds are adjusted
             # later
             for conditions in product(*filter(None, conditions_of_factor.values())):
-                if conditions not in seen_conditions:
-                    seen_conditions.add(conditions)
+                if conditions not in yielded_conditions:
+                    yielded_conditions.add(conditions)
                     yield conditions
 
 

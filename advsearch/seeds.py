@@ -12,9 +12,14 @@ import numpy as np
 
 
 def stream(root: int, name: str, index: int = 0) -> int:
-    """Return the seed number `index` of a stream such as "primal", "gradient" or
-    "verification" under a root seed; both numbers are at least 0. It is in [0, 2**32),
-    and the same for the same arguments on every machine.
+    """Return a seed of a named stream under a root seed, in [0, 2**32).
+
+    It is the same for the same arguments on every machine.
+
+    Args:
+        root: root seed, at least 0.
+        name: of the stream, such as "primal", "gradient" or "verification".
+        index: of the seed in the stream, at least 0.
     """
     sequence = np.random.SeedSequence([root, zlib.crc32(name.encode()), index])
     return int(sequence.generate_state(1, dtype=np.uint32)[0])

@@ -164,7 +164,8 @@ def failure_share(
     [failed], w_t = 1 / q_t relative to the even density, has the share p as its mean
     given these. Bets on the difference are fair games if the share is p: the capital of
 
-        prod_t (1 - c + c x_t / p)   and   prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives,
+        prod_t (1 - c + c x_t / p)
+        prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives,
 
     a mean over bets c, exceeds 2 / 0.05 with a probability of 0.025 at most (Ville
     1939), so the p at which neither does are a 95 % interval (Waudby-Smith and Ramdas

@@ -246,8 +246,8 @@ class Domain:
         """Return every block with its slice of u."""
         ends = [0, *accumulate(block.size for block in self.blocks)]
         return [
-            (block, slice(*place))
-            for block, place in zip(self.blocks, pairwise(ends), strict=True)
+            (block, slice(*bounds))
+            for block, bounds in zip(self.blocks, pairwise(ends), strict=True)
         ]
 
     def project(self, u: Tensor) -> Tensor:
@@ -402,13 +402,14 @@ def project_l2_box(
     one multiplier t in (0, 1], t = 1 if p(1) lies in the ball. Otherwise t solves
     ||p(t) - centre|| = radius. In s = t^2 the squared norm is
 
-        g(s) = sum_i min(s v_i^2, room_i^2),     v = u - centre, room_i = distance to the bound that v_i points at,
+        g(s) = sum_i min(s v_i^2, room_i^2),   v = u - centre,
 
-    concave, increasing and piecewise linear, so Newton's method from the left never
-    overshoots and stops at the exact root after finitely many steps (two to six in
-    practice). It is the scheme known from continuous quadratic knapsack problems
-    (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic
-    knapsack problem").
+    room_i being the distance to the bound that v_i points at. It is concave,
+    increasing and piecewise linear, so Newton's method from the left never overshoots
+    and stops at the exact root after finitely many steps (two to six in practice). It
+    is the scheme known from continuous quadratic knapsack problems (Cominetti,
+    Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic knapsack
+    problem").
 
     u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is
     over 0. The point is rounded towards the centre, so that rounding leaves no ball.
@@ -416,41 +417,58 @@ def project_l2_box(
     """
     squares = []
     rooms = []
-    full = inside = 0.0
-    for part, middle in zip(
+    squared_distance = 0.0
+    squared_distance_in_box = 0.0
+    for u_chunk, center_chunk in zip(
         torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
     ):
-        squares.append((part - middle).square_())
-        rooms.append(part.clamp(low, high).sub_(middle).square_())
-        full += float(squares[-1].sum(dtype=torch.float64))
-        inside += float(rooms[-1].sum(dtype=torch.float64))
-    if inside <= (radius * (1.0 + SLACK)) ** 2:
+        squares.append((u_chunk - center_chunk).square_())
+        rooms.append(u_chunk.clamp(low, high).sub_(center_chunk).square_())
+        squared_distance += float(squares[-1].sum(dtype=torch.float64))
+        squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
+    if squared_distance_in_box <= (radius * (1.0 + SLACK)) ** 2:
         return u.clamp(low, high)
-    s = radius**2 / full
+    s = _solve_multiplier(squares, rooms, radius, radius**2 / squared_distance)
+    return _move_towards(centre, u, math.sqrt(s), low, high)
+
+
+def _solve_multiplier(
+    squares: Sequence[Tensor], rooms: Sequence[Tensor], radius: float, s: float
+) -> float:
+    """Return s with g(s) = radius^2 by Newton's method, see `project_l2_box`.
+
+    `squares` and `rooms` are v_i^2 and room_i^2 in chunks; `s` is where it begins.
+    """
     for _ in range(_MAX_ITERATIONS):
-        value = slope = 0.0
+        value = 0.0
+        slope = 0.0
         for square, room in zip(squares, rooms, strict=True):
             scaled = square * s
             slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
             value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
-        better = s + (radius**2 - value) / slope if slope > 0.0 else s
-        if better <= s * (1.0 + 1e-7):
+        next_s = s + (radius**2 - value) / slope if slope > 0.0 else s
+        if next_s <= s * (1.0 + 1e-7):
             break
-        s = better
-    t = math.sqrt(s)
-    projected = torch.empty_like(u)
-    for out, part, middle in zip(
-        torch.split(projected, CHUNK),
+        s = next_s
+    return s
+
+
+def _move_towards(
+    center: Tensor, u: Tensor, t: float, low: float, high: float
+) -> Tensor:
+    """Return clip(center + t (u - center), low, high), rounded towards the center."""
+    moved = torch.empty_like(u)
+    for out, u_chunk, center_chunk in zip(
+        torch.split(moved, CHUNK),
         torch.split(u, CHUNK),
-        torch.split(centre, CHUNK),
+        torch.split(center, CHUNK),
         strict=True,
     ):
-        torch.lerp(middle, part, t, out=out)
-        outwards = (out - middle).abs() > ((part - middle) * t).abs()
-        torch.where(outwards, torch.nextafter(out, middle), out, out=out).clamp_(
-            low, high
-        )
-    return projected
+        torch.lerp(center_chunk, u_chunk, t, out=out)
+        is_outside = (out - center_chunk).abs() > ((u_chunk - center_chunk) * t).abs()
+        rounded = torch.nextafter(out, center_chunk)
+        torch.where(is_outside, rounded, out, out=out).clamp_(low, high)
+    return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,7 +519,7 @@ def wraps(domain: Domain) -> Tensor:
     ).repeat_interleave(sizes)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ---- points by index
 # Points that can be reached in any order by their number: draws from the unit cube, and
 # products of axes.
 #

@@ -82,11 +82,12 @@ def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     """Minus the logarithm of the probability of the right labels, in nats.
 
-    -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits of thousands nor cancels where p
-    is near 1. Its slope in l is 1 - p and would be lost where the model is sure. So
-    below l = `SUREST`, where the value is 3e-7, it is continued by its tangent: the
-    slope stays 3e-7, and values get slightly under 0. That is enough for policies that
-    normalise their steps; `log_odds` has slope 1 everywhere.
+    -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits
+    of thousands nor cancels where p is near 1. Its slope in l is 1 - p and would be
+    lost where the model is sure. So below l = `SUREST`, where the value is 3e-7, it
+    is continued by its tangent: the slope stays 3e-7, and values get slightly under
+    0. That is enough for policies that normalise their steps; `log_odds` has slope 1
+    everywhere.
     """
     return _softplus(log_odds(logits, images, labels))
 

@@ -379,54 +379,100 @@ _OWN = {
     kind.name: kind
     for kind in (
         *(
-            ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
+            ObjectiveKind(
+                name,
+                summary,
+                unit,
+                getattr(functions, name),
+                getattr(functions, f"targeted_{name}"),
+            )
             for name, summary, unit in (
-                ("margin", "the margin loss: the largest wrong logit minus the largest "
-                           "right one", "logits (log-odds)"),
-                ("log_odds", "the log-odds of a wrong prediction, over all classes", "logits (log-odds)"),
-                ("cross_entropy", "minus the logarithm of the probability of the right "
-                                  "labels", "nats"),
-                ("dlr", "the margin loss over a distance between logits: independent "
-                        "of their scale", "none (a ratio)"),
+                (
+                    "margin",
+                    "the margin loss: the largest wrong logit minus the largest "
+                    "right one",
+                    "logits (log-odds)",
+                ),
+                (
+                    "log_odds",
+                    "the log-odds of a wrong prediction, over all classes",
+                    "logits (log-odds)",
+                ),
+                (
+                    "cross_entropy",
+                    "minus the logarithm of the probability of the right labels",
+                    "nats",
+                ),
+                (
+                    "dlr",
+                    "the margin loss over a distance between logits: independent "
+                    "of their scale",
+                    "none (a ratio)",
+                ),
             )
         ),
         ObjectiveKind(
-            "feature_distance", "how far the features lie from those of the clean "
-                                "picture",
-            "lengths of the clean features", of_features=functions.feature_distance,
+            "feature_distance",
+            "how far the features lie from those of the clean picture",
+            "lengths of the clean features",
+            of_features=functions.feature_distance,
         ),
         ObjectiveKind(
-            "distance", "how far the features lie from those of the clean picture, by "
-                        "the angle", "1 - cosine",
-            task="similarity", of_features=functions.cosine_distance,
+            "distance",
+            "how far the features lie from those of the clean picture, by the angle",
+            "1 - cosine",
+            task="similarity",
+            of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where a prediction is a success; in "
-                     "classification the margin loss",
-            "that of the task", task=None, of_task=_score_of,
+            "score",
+            "the task's own score, over 0 where a prediction is a success; in "
+            "classification the margin loss",
+            "that of the task",
+            task=None,
+            of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"success: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
+            ObjectiveKind(
+                name,
+                f"success: {summary}",
+                "log-odds",
+                task=Detection.name,
+                of_task=_score_of,
+            )
             for name, summary in GOALS.items()
         ),
         ObjectiveKind(
-            Together.objective, "of several tasks at once: each task's own objective, "
-                                "put together by `ensemble`",
-            "those of the tasks", task=Together.name, of_task=_score_of,
+            Together.objective,
+            "of several tasks at once: each task's own objective, "
+            "put together by `ensemble`",
+            "those of the tasks",
+            task=Together.name,
+            of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"success: {summary}", "logarithm of a factor", task="depth", of_task=_score_of)
+            ObjectiveKind(
+                name,
+                f"success: {summary}",
+                "logarithm of a factor",
+                task="depth",
+                of_task=_score_of,
+            )
             for name, summary in _DEPTH_GOALS.items()
         ),
         ObjectiveKind(
-            "pixel_margin", "the largest wrong logit minus the largest right one, mean "
-                            "over the object's pixels",
-            "logits (log-odds)", task="segmentation",
-            of_task=lambda task: _plain(lambda output, images, truth: task.pixel_margin(output, truth)),
+            "pixel_margin",
+            "the largest wrong logit minus the largest right one, mean "
+            "over the object's pixels",
+            "logits (log-odds)",
+            task="segmentation",
+            of_task=lambda task: _plain(
+                lambda output, images, truth: task.pixel_margin(output, truth)
+            ),
         ),
     )
     if kind.task in (None, Together.name, *TASKS.own)
-}  # fmt: skip
+}
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
     "advsearch.objectives",
@@ -448,7 +494,6 @@ def objective_summaries() -> dict[str, str]:
 
 
 # ---- from names and functions to objectives
-# -------------------------------------------------------------------------
 
 
 def get_objective(
@@ -491,7 +536,8 @@ def get_objective(
             raise InputError(
                 f"objective {kind.name!r}: expected the model's features and a clean "
                 "picture, got none; use "
-                "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
+                "get_objective(name, "
+                "features=advsearch.models.features.features_of(model), clean=picture)"
             )
         function = _plain(kind.of_features(features, clean))
         function = function if ours else _handed(function)

@@ -190,17 +190,17 @@ def search(
         raise InputError(f"close: expected at least 0, got {close}")
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
-    begun = time.perf_counter()
+    started = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates), kind, noise)
     try:
         with interruptible():
-            in_time = math.inf if seconds is None else begun + seconds
+            deadline = math.inf if seconds is None else started + seconds
             stopped = _explore(
                 log,
                 policy,
                 steps,
                 seed,
-                late or (lambda _: time.perf_counter() >= in_time),
+                late or (lambda _: time.perf_counter() >= deadline),
             )
             if domain.drawn:
                 log.pool = with_last(log.pool, log.last, log.size)
@@ -208,16 +208,24 @@ def search(
                 _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
-    chosen = best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
-    claimed = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    started, state = (log.policy, log.state) if log.state is not None else (None, None)
-    if started is not None and log.told:  # a batch that was cut
-        state = started.update(state, log.told)
+    best_candidate = (
+        best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
+    )
+    claimed = best_candidate.rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    final_policy = None
+    state = None
+    if log.state is not None:
+        final_policy = log.policy
+        state = log.state
+        if final_policy is not None and log.evaluated_batch:  # a batch that was cut
+            state = final_policy.update(state, log.evaluated_batch)
     return SearchResult(
-        best_u=chosen.u,
-        best_objective=chosen.believed if math.isfinite(chosen.believed) else math.nan,
-        claimed_objective=chosen.objective,
-        success_rate=chosen.rate,
+        best_u=best_candidate.u,
+        best_objective=best_candidate.believed
+        if math.isfinite(best_candidate.believed)
+        else math.nan,
+        claimed_objective=best_candidate.objective,
+        success_rate=best_candidate.rate,
         ending=Ending.FOUND if claimed else stopped,
         stopped=stopped,
         history=tuple(record for record in log.records if record.phase == "search"),
@@ -226,11 +234,13 @@ def search(
         gradients=log.gradients,
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(record.non_finite for record in log.records),
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - started,
         agreement=tuple(log.agreement),
-        counts=Counts() if started is None else started.counts(state),
-        distribution=None if started is None else started.distribution(state),
-        failures=None if started is None else started.failures(state),
+        counts=Counts() if final_policy is None else final_policy.counts(state),
+        distribution=(
+            None if final_policy is None else final_policy.distribution(state)
+        ),
+        failures=None if final_policy is None else final_policy.failures(state),
     )
 
 
@@ -257,7 +267,7 @@ class _Log:
     agreement: list[float] = field(default_factory=list)
     policy: Policy[Any] | None = None
     state: Any = None
-    told: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
+    evaluated_batch: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
 
     def evaluated(
         self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
@@ -266,20 +276,28 @@ class _Log:
         each as it comes.
         """
         queries = list[Query]()
-        begun = time.perf_counter()
+        started = time.perf_counter()
         for number, (proposal, index) in enumerate(
             zip(proposals, indices, strict=True), len(self.records)
         ):
             u = proposal.u.clone()
             seed = stream(self.noise, self.kind, index)
-            wanted = proposal.gradient
+            gradient_request = proposal.gradient
             queries.append(
-                Query(u, seed, self.kind, number, phase, wanted, proposal.samples)
+                Query(
+                    u,
+                    seed,
+                    self.kind,
+                    number,
+                    phase,
+                    gradient_request,
+                    proposal.samples,
+                )
             )
         for proposal, query, raw in zip(
             proposals, queries, self.evaluate(queries), strict=True
         ):
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - started
             _check_evaluation(raw, proposal, self.domain)
             evaluation = raw.usable()
             self.gradients += bool(proposal.gradient)
@@ -329,7 +347,7 @@ class _Log:
             if self.on_step is not None:
                 self.on_step(self.records[-1], *copied((proposal.u, evaluation)))
             yield evaluation
-            begun = time.perf_counter()
+            started = time.perf_counter()
 
 
 def _explore(
@@ -342,43 +360,43 @@ def _explore(
     name = policy.name
     policy = log.policy = with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
-    in_a_row = 0
-    most = most_at_once(log.domain.dim)
+    n_non_finite = 0
+    max_batch = most_at_once(log.domain.dim)
     while log.renders < steps:
-        asked = min(most, steps - log.renders)
-        proposals, state = policy.propose(state, asked)
+        max_proposals = min(max_batch, steps - log.renders)
+        proposals, state = policy.propose(state, max_proposals)
         if not proposals:
             return Ending.STALLED
-        if len(proposals) > asked:
+        if len(proposals) > max_proposals:
             raise RuntimeError(
                 f"policy {name!r} proposed {len(proposals)} "
-                f"configurations; expected at most {asked}"
+                f"configurations; expected at most {max_proposals}"
             )
         batch = list[Proposal]()
-        left = steps - log.renders
+        renders_left = steps - log.renders
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
-            if left > 0:
+            if renders_left > 0:
                 # a policy may write into its own later
-                own = replace(proposal, u=proposal.u.clone())
-                batch.append(own.affordable(log.domain, left))
-                left -= batch[-1].cost(log.domain)
+                proposal_copy = replace(proposal, u=proposal.u.clone())
+                batch.append(proposal_copy.affordable(log.domain, renders_left))
+                renders_left -= batch[-1].cost(log.domain)
         log.state = state
-        log.told = []
-        over = False
+        log.evaluated_batch = []
+        is_out_of_time = False
         first = len(log.records)
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
-            log.told.append((proposal.u, evaluation))
-            in_a_row = 0 if evaluation.finite else in_a_row + 1
-            if in_a_row == NON_FINITE_LIMIT:
+            log.evaluated_batch.append((proposal.u, evaluation))
+            n_non_finite = 0 if evaluation.finite else n_non_finite + 1
+            if n_non_finite == NON_FINITE_LIMIT:
                 return Ending.NON_FINITE
-            if over := late(len(log.records)):
+            if is_out_of_time := late(len(log.records)):
                 break
-        if over:
+        if is_out_of_time:
             break
-        state = log.state = policy.update(state, log.told)
-        log.told = []
+        state = log.state = policy.update(state, log.evaluated_batch)
+        log.evaluated_batch = []
     return Ending.BUDGET_SPENT
 
 
@@ -398,12 +416,12 @@ def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
         pool = log.pool
         proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
         evaluations = log.evaluated(proposals, [*indices] * len(pool), "ranking")
-        for place, candidate in enumerate(pool):
+        for position, candidate in enumerate(pool):
             for evaluation in islice(evaluations, len(indices)):
                 candidate = candidate.seen_again(
                     evaluation.objective, evaluation.success
                 )
-                log.pool = (*log.pool[:place], candidate, *pool[place + 1 :])
+                log.pool = (*log.pool[:position], candidate, *pool[position + 1 :])
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
@@ -437,8 +455,8 @@ def _check_evaluation(
     """
     gradient = evaluation.gradient
     u = proposal.u
-    least = proposal.samples
-    most = proposal.cost(domain)
+    min_cost = proposal.samples
+    max_cost = proposal.cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
     if (
@@ -451,9 +469,9 @@ def _check_evaluation(
             f"{tuple(gradient.shape)}; expected "
             f"{u.dtype}, shape {tuple(u.shape)}"
         )
-    if not least <= evaluation.cost <= most:
+    if not min_cost <= evaluation.cost <= max_cost:
         raise RuntimeError(
-            f"evaluate took {evaluation.cost} renders; expected {least} to {most}, by "
+            f"evaluate took {evaluation.cost} renders; expected {min_cost} to {max_cost}, by "
             "the proposal's samples and the "
             "domain's gradient_cost"
         )

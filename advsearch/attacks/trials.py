@@ -75,15 +75,15 @@ def margins_of(
     rows of all sample counts are numbered together, and the first `keep` pictures of
     each are wanted.
     """
-    made = Counter[int]()
+    n_made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        numbers = range(made[spp], made[spp] + len(seeds))
-        asked = enumerate(zip(seeds, numbers, strict=True), made.total())
-        made[spp] += len(seeds)
+        numbers = range(n_made[spp], n_made[spp] + len(seeds))
+        rows = enumerate(zip(seeds, numbers, strict=True), n_made.total())
+        n_made[spp] += len(seeds)
         queries = [
             Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep)
-            for row, (seed, number) in asked
+            for row, (seed, number) in rows
         ]
         return [-evaluation.said.score for evaluation in evaluate(queries)]
 
@@ -177,16 +177,18 @@ def choose_spp(
     for name, render in margins.items():
         values = _climbed(render, seed, ladder, looks, trials)
         below: list[float] = []
-        for spp, here in zip(ladder, values, strict=False):
+        for spp, margins_here in zip(ladder, values, strict=False):
             half_width = (
-                _quantile(len(here), len(looks))
-                * _deviation(here)
-                / math.sqrt(len(here))
+                _quantile(len(margins_here), len(looks))
+                * _deviation(margins_here)
+                / math.sqrt(len(margins_here))
             )
-            drift = fmean(here) - fmean(below) if below else math.nan
-            settled = bool(below) and _settled(here, below, len(looks), trials)
-            table.append(Rung(name, spp, fmean(here), half_width, drift, settled))
-            below = here
+            drift = fmean(margins_here) - fmean(below) if below else math.nan
+            settled = bool(below) and _settled(margins_here, below, len(looks), trials)
+            table.append(
+                Rung(name, spp, fmean(margins_here), half_width, drift, settled)
+            )
+            below = margins_here
         renders = renders + sum(map(len, values))
         reached = max(reached, len(values) - 1)
         if not table[-1].settled:
@@ -205,10 +207,11 @@ def _climbed(
     settles or none above can.
     """
     values: list[list[float]] = [[] for _ in ladder]
-    places = list(product(range(1, len(ladder)), looks))
-    for number, (level, count) in enumerate(places):
+    looks_at_rungs = list(product(range(1, len(ladder)), looks))
+    for number, (level, count) in enumerate(looks_at_rungs):
         if not any(
-            _may_settle(values, ladder, *later, len(looks)) for later in places[number:]
+            _may_settle(values, ladder, *later, len(looks))
+            for later in looks_at_rungs[number:]
         ):
             break
         if not _may_settle(values, ladder, level, count, len(looks)):
@@ -225,21 +228,33 @@ def _climbed(
 
 
 def _settled(
-    here: Sequence[float], below: Sequence[float], looks: int, trials: int
+    at_rung: Sequence[float], below: Sequence[float], looks: int, trials: int
 ) -> bool:
-    """Whether the margins of a rung and of the one below show that more samples change
-    nothing; see `choose_spp`.
+    """Return whether more samples would not change the sign of the margin.
+
+    See `choose_spp` for the three conditions.
+
+    Args:
+        here: margins of a rung.
+        below: margins of the rung below.
+        looks: how often one looks, which share the 5 %.
+        trials: that will follow; 0 where other trials follow.
     """
-    mean = fmean(here)
-    count = min(len(here), len(below))
-    one = _deviation(here)
-    ahead = 2.0 * mean - fmean(below)
-    ahead_error = math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
-    side = math.copysign(1.0, mean)
+    mean = fmean(at_rung)
+    count = min(len(at_rung), len(below))
+    deviation = _deviation(at_rung)
+    # the mean if the rest of the noise changed it as much as the step from below did
+    extrapolated = 2.0 * mean - fmean(below)
+    extrapolated_error = math.hypot(2.0 * deviation, _deviation(below)) / math.sqrt(
+        count
+    )
+    sign = math.copysign(1.0, mean)
     quantile = _quantile(count, looks)
-    error = one / math.sqrt(count) if count == trials else one
-    far = side * mean > quantile * error and side * ahead > quantile * ahead_error
-    return far and all(side * value > 0.0 for value in here)
+    error = deviation / math.sqrt(count) if count == trials else deviation
+    is_mean_sure = sign * mean > quantile * error
+    is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
+    has_one_sign = all(sign * value > 0.0 for value in at_rung)
+    return is_mean_sure and is_extrapolated_sure and has_one_sign
 
 
 def _may_settle(
@@ -249,35 +264,31 @@ def _may_settle(
     count: int,
     looks: int,
 ) -> bool:
-    """Whether so many renders at a rung may show that the margin has settled there, by
-    what has been rendered.
+    """Return whether `count` renders at a rung may show that the margin has settled.
 
     The mean may be off by its standard error, and may move on by as much as it has
     moved before. Deviations stay; at rungs that were not rendered they fall with the
     root of the samples.
     """
-    known = [rung for rung in range(level + 1) if values[rung]]
-    if not known:
+    rendered_rungs = [rung for rung in range(level + 1) if values[rung]]
+    if not rendered_rungs:
         return True
     if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
         return False
-    best = values[known[-1]]
-    mean = fmean(values[known[-1]])
-    largest = (
-        abs(mean)
-        + abs(mean - fmean(values[known[-2]]))
-        + _deviation(best) / math.sqrt(len(best))
-    )
-    below, here = (
-        _deviation(values[rung])
-        if values[rung]
-        else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[rung])
-        for rung in (level - 1, level)
-    )
-    return (
-        math.hypot(2.0 * here, below) * _quantile(count, looks) / math.sqrt(count)
-        <= largest
-    )
+    last_rung = rendered_rungs[-1]
+    last_values = values[last_rung]
+    mean = fmean(last_values)
+    drift = abs(mean - fmean(values[rendered_rungs[-2]]))
+    standard_error = _deviation(last_values) / math.sqrt(len(last_values))
+    max_mean = abs(mean) + drift + standard_error
+
+    def estimate_deviation(rung: int) -> float:
+        if values[rung]:
+            return _deviation(values[rung])
+        return _deviation(last_values) * math.sqrt(ladder[last_rung] / ladder[rung])
+
+    error = math.hypot(2.0 * estimate_deviation(level), estimate_deviation(level - 1))
+    return error * _quantile(count, looks) / math.sqrt(count) <= max_mean
 
 
 def looks_of(trials: int = 0) -> tuple[int, ...]:
@@ -295,8 +306,10 @@ def most_samples(
 
 
 def _deviation(values: Sequence[float]) -> float:
+    """Return the standard deviation of a sample."""
     mean = fmean(values)
-    return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
+    squares = math.fsum((value - mean) ** 2 for value in values)
+    return math.sqrt(squares / (len(values) - 1))
 
 
 def _quantile(count: int, looks: int) -> float:
@@ -306,8 +319,8 @@ def _quantile(count: int, looks: int) -> float:
     return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / looks))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# How many samples a pixel trials over many conditions need: of a rate (docs/design.md).
+# ---- sample counts of trials over many conditions
+# How many samples per pixel the rate of such trials needs (docs/design.md).
 
 # conditions under which each configuration is rendered at each sample count
 CONDITIONS = 30
@@ -320,13 +333,15 @@ Floats = npt.NDArray[np.float64]
 
 
 def affordable(ladder: Sequence[int], pictures: int, searched: int) -> Sequence[int]:
-    """Return the rungs at which so many pictures take at most `MOST_TIMES` the samples
-    of the searches, and the first two in any case.
+    """Return the sample counts of a ladder that a check can afford.
+
+    Its images take at most `MOST_TIMES` the samples of the searches; the first two
+    counts are returned in any case.
     """
     return [
         spp
-        for place, spp in enumerate(ladder)
-        if place < 2 or pictures * spp <= MOST_TIMES * searched
+        for index, spp in enumerate(ladder)
+        if index < 2 or pictures * spp <= MOST_TIMES * searched
     ]
 
 
@@ -351,42 +366,56 @@ def choose_rate_spp(
     reached = 1
     seeds = [stream(seed, "sample count", number) for number in range(CONDITIONS)]
     for name, render in margins.items():
-        below: Floats | None = None
-        for place, spp in enumerate(ladder):
-            here = np.array(render(spp, seeds), dtype=np.float64)
-            half = (
-                stdtrit(len(here) - 1, CONFIDENCE)
-                * here.std(ddof=1)
-                / math.sqrt(len(here))
+        margins_below: Floats | None = None
+        for index, spp in enumerate(ladder):
+            margins_at_rung = np.array(render(spp, seeds), dtype=np.float64)
+            half_width = (
+                stdtrit(len(margins_at_rung) - 1, CONFIDENCE)
+                * margins_at_rung.std(ddof=1)
+                / math.sqrt(len(margins_at_rung))
             )
-            drift = math.nan if below is None else float(here.mean() - below.mean())
-            settled = below is not None and moved(here, below) <= MOVED
+            drift = (
+                math.nan
+                if margins_below is None
+                else float(margins_at_rung.mean() - margins_below.mean())
+            )
+            settled = (
+                margins_below is not None
+                and moved(margins_at_rung, margins_below) <= MOVED
+            )
             table.append(
-                Rung(name, spp, float(here.mean()), float(half), drift, settled)
+                Rung(
+                    name,
+                    spp,
+                    float(margins_at_rung.mean()),
+                    float(half_width),
+                    drift,
+                    settled,
+                )
             )
             if settled:
-                reached = max(reached, place)
+                reached = max(reached, index)
                 break
-            below = here
+            margins_below = margins_at_rung
         else:
             return SampleCount(ladder[-1], False, tuple(table), CONDITIONS * len(table))
     return SampleCount(ladder[reached], True, tuple(table), CONDITIONS * len(table))
 
 
 def moved(here: Floats, below: Floats) -> float:
-    """Return the share of conditions that the mean change of the margins (n,) from one
-    rung to the next, taken once more, would carry over zero at most; NaN where a margin
-    is no number. The margins are smoothed by normal kernels of Silverman's width.
+    """Return the fraction of conditions that more samples may carry over zero.
+
+    The mean change of the margins (n,) from one rung to the next is taken once more.
+    The margins are smoothed by normal kernels of Silverman's width. NaN where a margin
+    is no number.
     """
     change = here - below
     width = 0.9 * here.std(ddof=1) * len(here) ** -0.2
     if not np.isfinite(change).all():
         return math.nan
-    half = (
-        stdtrit(len(here) - 1, 0.5 + CONFIDENCE / 2.0)
-        * change.std(ddof=1)
-        / math.sqrt(len(here))
-    )
-    ends = np.array([0.0, change.mean() - half, change.mean() + half])[:, None]
-    shares = ndtr((here + ends) / max(width, 1e-12)).mean(axis=1)
-    return float(np.abs(shares[1:] - shares[0]).max())
+    quantile = stdtrit(len(here) - 1, 0.5 + CONFIDENCE / 2.0)
+    half_width = quantile * change.std(ddof=1) / math.sqrt(len(here))
+    mean_change = change.mean()
+    shifts = np.array([0.0, mean_change - half_width, mean_change + half_width])
+    fractions = ndtr((here + shifts[:, None]) / max(width, 1e-12)).mean(axis=1)
+    return float(np.abs(fractions[1:] - fractions[0]).max())

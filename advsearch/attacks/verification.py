@@ -343,59 +343,111 @@ def verify(
         curtailed: see above; where of what was found only the verdict matters.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
-    least = 0 if curtailed or len(looks) == 1 else rule.fewest
+    has_several_looks = len(looks) > 1
+    min_trials = rule.fewest if has_several_looks and not curtailed else 0
     u = domain.project(u)
-    beside = list(clean)
+    clean_trials = list(clean)
     done = list[Judgement]()
 
-    def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
-        return tuple(
-            rule.succeeded(trial, clean)
-            if clean.right or not rule.conditional
-            else None
-            for trial, clean in zip(others, beside, strict=False)
-        )
+    def has_failed(new_trials: Sequence[Judgement]) -> bool:
+        """Whether too many trials fail for any look."""
+        tried = [*done, *new_trials]
+        n_total = looks[-1] if has_several_looks else rule.counted(clean_trials)
+        n_failures = _list_outcomes(rule, tried, clean_trials).count(False)
+        return len(tried) >= min_trials and n_failures > rule.allowed(n_total)
 
-    def lost(others: Sequence[Judgement]) -> bool:
-        """Whether too many fail for any look."""
-        made = [*done, *others]
-        allowed = rule.allowed(rule.counted(beside) if len(looks) == 1 else looks[-1])
-        return len(made) >= least and tried(made).count(False) > allowed
-
-    more = partial(run_trials, evaluate, spp=spp, seed=seed, begin=begin)
+    run = partial(run_trials, evaluate, spp=spp, seed=seed, begin=begin)
+    run_clean = partial(run, domain.start, kind=control)
+    until = has_failed if curtailed or has_several_looks else None
     for look in looks:
+        # Under conditions, clean trials that are wrong do not count: more are run.
         count = look
-        beside += more(domain.start, trials=count, first=len(beside), kind=control)
-        while (short := look - rule.counted(beside[:count])) > 0 and count < looks[-1]:
-            count = min(count + short, looks[-1])
-            beside += more(domain.start, trials=count, first=len(beside), kind=control)
-        until = lost if curtailed or len(looks) > 1 else None
-        done += more(
-            u, trials=count, first=len(done), kind=kind, keep=keep, until=until
-        )
-        early = count < looks[-1]
-        needed = rule.needed(rule.counted(beside[:count]), early=early)
-        enough = tried(done).count(True) >= needed and not rule.already_wrong(
-            count_right(beside[:count], spp)
-        )
-        if len(done) < count or lost(()) or enough or not early:
+        clean_trials += run_clean(trials=count, first=len(clean_trials))
+        n_missing = look - rule.counted(clean_trials[:count])
+        while n_missing > 0 and count < looks[-1]:
+            count = min(count + n_missing, looks[-1])
+            clean_trials += run_clean(trials=count, first=len(clean_trials))
+            n_missing = look - rule.counted(clean_trials[:count])
+        done += run(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
+        is_early = count < looks[-1]
+        n_needed = rule.needed(rule.counted(clean_trials[:count]), early=is_early)
+        n_successes = _list_outcomes(rule, done, clean_trials).count(True)
+        is_clean_wrong = rule.already_wrong(count_right(clean_trials[:count], spp))
+        is_success = n_successes >= n_needed and not is_clean_wrong
+        if len(done) < count or has_failed(()) or is_success or not is_early:
             break
-    outcomes = tried(done)
-    right = count_right(beside, spp)
-    renders = len(done) + len(beside) - len(clean)
-    successes = outcomes.count(True)
-    counted = max(1, len(outcomes) - outcomes.count(None))
-    confidence = OVER_CONFIDENCE if rule.conditional and len(looks) > 1 else CONFIDENCE
-    verified = Trials(successes, counted, spp, confidence)
-    ending = rule.verdict(claim, right, verified)
-    reason = (
-        f"{ending.explanation} A success in {successes} of {counted} trials, "
-        f"{rule.needed(counted, early=enough and early)} are needed; clean right in "
-        f"{right.successes} of "
-        f"{right.trials}."
+    was_asked_for = not has_several_looks and len(done) == looks[0]
+    return _summarize_trials(
+        rule,
+        claim,
+        u,
+        clean_trials,
+        done,
+        spp=spp,
+        confidence=(
+            OVER_CONFIDENCE if rule.conditional and has_several_looks else CONFIDENCE
+        ),
+        renders=len(done) + len(clean_trials) - len(clean),
+        stopped="asked for" if was_asked_for else "decided",
+        is_early=is_success and is_early,
+        begin=begin,
     )
-    stopped = "asked for" if len(looks) == 1 and len(done) == looks[0] else "decided"
-    groups = tuple(beside), tuple(done)
+
+
+def _list_outcomes(
+    rule: Rule, trials: Sequence[Judgement], clean_trials: Sequence[Judgement]
+) -> tuple[bool | None, ...]:
+    """Return whether each trial is a success; None where it does not count.
+
+    Over conditions it does not count where the clean configuration is wrong.
+    """
+    outcomes: list[bool | None] = []
+    for trial, clean in zip(trials, clean_trials, strict=False):
+        if rule.conditional and not clean.right:
+            outcomes.append(None)
+        else:
+            outcomes.append(rule.succeeded(trial, clean))
+    return tuple(outcomes)
+
+
+def _summarize_trials(
+    rule: Rule,
+    claim: Ending,
+    u: Tensor,
+    clean_trials: Sequence[Judgement],
+    trials: Sequence[Judgement],
+    *,
+    spp: int,
+    confidence: float,
+    renders: int,
+    stopped: str,
+    is_early: bool,
+    begin: int,
+) -> Verification:
+    """Return the verification that the trials of both groups make.
+
+    `is_early` is whether the needed successes are those of an early look.
+    """
+    outcomes = _list_outcomes(rule, trials, clean_trials)
+    n_counted = max(1, len(outcomes) - outcomes.count(None))
+    clean_counts = count_right(clean_trials, spp)
+    counts = Trials(outcomes.count(True), n_counted, spp, confidence)
+    ending = rule.verdict(claim, clean_counts, counts)
+    reason = (
+        f"{ending.explanation} A success in {counts.successes} of {n_counted} trials, "
+        f"{rule.needed(n_counted, early=is_early)} are needed; clean right in "
+        f"{clean_counts.successes} of {clean_counts.trials}."
+    )
     return Verification(
-        ending, reason, u, right, verified, *groups, renders, stopped, outcomes, begin
+        ending,
+        reason,
+        u,
+        clean_counts,
+        counts,
+        tuple(clean_trials),
+        tuple(trials),
+        renders,
+        stopped,
+        outcomes,
+        begin,
     )

@@ -1,5 +1,6 @@
-"""Whether predicted images may take the place of rendered ones: the one rule for
-matrices and for light on surfaces.
+"""Decide whether predicted images may replace rendered ones.
+
+The rule is the same for matrices and for light on surfaces.
 
 A few views are traced beside predicted ones (docs/surface-light.md, "How far off
 predictions may be"). Noise averages out over a search, and bias does not: a search
@@ -21,28 +22,33 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.renderer import Renderer
 
-# mean difference of the margin over the views, with its sign, that is accepted (of a
-# classifier: logits)
+# largest accepted mean difference of the margin over the views (of a classifier: logits)
 MARGIN = 0.3
 OF_MOVED = 0.05
-"""The same as a share of what the search has moved the margin, where that is more: so
-much is the length of a step that is predicted, and not its direction.
+"""The same as a fraction of what the search has moved the margin, where that is larger.
+
+So much affects the length of a step that is predicted, and not its direction.
 """
-# levels of 255, root mean square over the object, that will do where a rendered picture
+# accepted root mean square over the object, in levels of 255, where a rendered image
 # has less noise
 BOUND = 2.0
-# share of the levels that is accepted in the end, so that one beyond the limit seldom
-# is by chance
+# fraction of the allowed levels that is accepted, so that a prediction beyond the limit
+# seldom passes by chance
 ACCEPTED = 0.9
-CHECK_SPP = 16  # samples a pixel of each of the two traced pictures of a view
+CHECK_SPP = 16  # samples per pixel of each of the two traced images of a view
 
 
 @dataclass(frozen=True)
 class ComparedView:
-    """A predicted picture beside traced ones: mean squares over the object, levels of
-    255, of what it is off and of what a rendered one is (below 0 by chance where both
-    are small); by how much its margin is larger; the pictures that were traced; and by
-    how much the search has moved the margin of what is predicted.
+    """A predicted image compared with traced ones.
+
+    Attributes:
+        square: mean squared error over the object, in levels of 255 squared; below 0
+            by chance where it is small.
+        allowed: the same of a rendered image.
+        margin: by how much its margin is larger than the traced one.
+        pictures: images that were traced.
+        moved: by how much the search has moved the margin of predicted images.
     """
 
     square: float
@@ -54,10 +60,14 @@ class ComparedView:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far predictions are off, over several views: the root mean square over the
-    object in levels of 255, the mean difference of the margin, and the levels that are
-    allowed; so many pictures were traced to find it; and the difference of the margin
-    that is allowed.
+    """How far predictions are off, over several views.
+
+    Attributes:
+        levels: root mean square over the object, in levels of 255.
+        logits: mean difference of the margin.
+        most: levels that are allowed.
+        pictures: images that were traced to measure it.
+        margin: difference of the margin that is allowed.
     """
 
     levels: float
@@ -68,33 +78,32 @@ class Deviation:
 
     @classmethod
     def of(cls, views: Sequence[ComparedView]) -> Deviation:
-        square, allowed, logits, moved = (
-            statistics.fmean(getattr(view, name) for view in views)
-            for name in ("square", "allowed", "margin", "moved")
-        )
-        pictures = sum(view.pictures for view in views)
+        """Return the deviation over several views."""
+        square = statistics.fmean(view.square for view in views)
+        allowed = statistics.fmean(view.allowed for view in views)
+        logits = statistics.fmean(view.margin for view in views)
+        moved = statistics.fmean(view.moved for view in views)
         return cls(
-            _root(square),
-            logits,
-            max(BOUND, _root(allowed)),
-            pictures,
-            max(MARGIN, OF_MOVED * moved),
+            levels=_root(square),
+            logits=logits,
+            most=max(BOUND, _root(allowed)),
+            pictures=sum(view.pictures for view in views),
+            margin=max(MARGIN, OF_MOVED * moved),
         )
 
     @property
     def share(self) -> float:
-        """Of the levels that are allowed."""
+        """The levels as a fraction of those that are allowed."""
         return self.levels / self.most if self.most > 0.0 else math.inf
 
     @property
     def good(self) -> bool:
-        """Whether predictions may take the place of rendered pictures; never where
-        something is NaN.
-        """
+        """Whether predictions may replace rendered images; False if anything is NaN."""
         return self.share <= ACCEPTED and abs(self.logits) <= self.margin
 
     @property
     def reason(self) -> str:
+        """Why predictions may not replace rendered images, for a sentence."""
         if not self.share <= ACCEPTED:
             return (
                 f"{self.levels:.1f} levels of 255 off on the object, where "
@@ -104,77 +113,100 @@ class Deviation:
 
 
 def compared(view: Callable[[int], ComparedView]) -> Deviation:
-    """Compare predictions, in few views where these decide; `view` compares one, by its
-    number below `VIEWS`.
+    """Compare predictions over several views, in few where these decide.
+
+    `view` compares a single view, by its index below `VIEWS`.
     """
-    views = [view(number) for number in range(FIRST)]
+    views = [view(index) for index in range(FIRST)]
     first = Deviation.of(views)
-    clearly = (
-        first.share <= CLEARLY_GOOD and abs(first.logits) <= CLEARLY_GOOD * first.margin
-    )
-    if not clearly and first.share < CLEARLY_BAD:
-        views += [view(number) for number in range(FIRST, VIEWS)]
+    margin_limit = CLEARLY_GOOD * first.margin
+    is_good = first.share <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
+    if not is_good and first.share < CLEARLY_BAD:
+        views += [view(index) for index in range(FIRST, VIEWS)]
     return Deviation.of(views)
 
 
 def view_of(
-    renderer: Renderer, predicted: Tensor, u: Tensor, seed: int, spp: int, margin: MarginOf,
+    renderer: Renderer,
+    predicted: Tensor,
+    u: Tensor,
+    seed: int,
+    spp: int,
+    margin: MarginOf,
     before: Tensor | None = None,
-) -> ComparedView:  # fmt: skip
-    """Compare a predicted picture (H, W, 3) of a configuration u (d,) of the whole
-    space with traced ones. The search renders with `spp` samples a pixel; `before` was
-    predicted in its place before the search, if anything was.
+) -> ComparedView:
+    """Compare a predicted image with traced images of the same configuration.
+
+    Args:
+        renderer: traces images.
+        predicted: (H, W, 3) image.
+        u: (d,) full configuration.
+        seed: of the noise of the traced images.
+        spp: samples per pixel of the search.
+        margin: from an image and a configuration to the model's margin.
+        before: (H, W, 3) image that was predicted in its place before the search, if
+            there was one.
     """
     with torch.no_grad():
         rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
-        *halves, clean = renderer.halves(u, seed, CHECK_SPP)
-        seen = renderer.mask(u)
-    square, allowed = (
-        squares_off(picture, halves, seen) for picture in (predicted, rendered)
-    )
-    here = margin(predicted, u)
-    moved = 0.0 if before is None else abs(here - margin(before, u))
+        *halves, converged = renderer.halves(u, seed, CHECK_SPP)
+        object_mask = renderer.mask(u)
+    predicted_margin = margin(predicted, u)
+    moved = 0.0
+    if before is not None:
+        moved = abs(predicted_margin - margin(before, u))
     return ComparedView(
-        square, allowed, here - margin(clean, u), pictures=3, moved=moved
+        square=squares_off(predicted, halves, object_mask),
+        allowed=squares_off(rendered, halves, object_mask),
+        margin=predicted_margin - margin(converged, u),
+        pictures=3,
+        moved=moved,
     )
 
 
 def squares_off(
     picture: Tensor, halves: Sequence[Tensor], seen: Tensor | None = None
 ) -> float:
-    """Return the mean squared difference, levels of 255, of a picture (H, W, 3) from
-    what two traced ones of independent noise converge to, over the pixels that are
-    seen, (H, W), or all where there are none.
+    """Return the mean squared error of an image without the noise of its reference.
 
-    These are traced without the denoiser, which leaves its own marks in all that it is
-    given. The mean product of the differences to both is the squared error without
-    their noise, which a square would count.
+    The mean product of the differences to two traced images of independent noise is the
+    squared error without their noise, which a square would count. They are traced
+    without the denoiser, which leaves marks of its own in every image.
+
+    Args:
+        picture: (H, W, 3) image.
+        halves: two traced images (H, W, 3).
+        seen: (H, W) mask of the pixels that count; all do if None, or if it is empty.
+
+    Returns:
+        The error in levels of 255, squared.
     """
     first, second = halves
     products = (picture - first) * (picture - second)
-    return 255.0**2 * float(
-        (products if seen is None or not bool(seen.any()) else products[seen]).mean()
-    )
+    if seen is not None and bool(seen.any()):
+        products = products[seen]
+    return 255.0**2 * float(products.mean())
 
 
 def levels_off(
     renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: int, spp: int
 ) -> list[float]:
-    """Return how far pictures (H, W, 3) of a configuration are off as a whole, levels
-    of 255.
+    """Return the root-mean-square error of full images (H, W, 3), in levels of 255.
+
+    All are of the configuration u (d,).
     """
     halves = renderer.halves(u, seed, spp)[:2]
     return [_root(squares_off(picture, halves)) for picture in pictures]
 
 
 def _root(square: float) -> float:
-    """NaN stays NaN."""
+    """Return the square root, or 0 of a negative number; NaN stays NaN."""
     return 0.0 if square <= 0.0 else math.sqrt(square)
 
 
-FIRST = 2  # views that are compared at first, and in all where these don't decide
-VIEWS = 6
-# shares of what is allowed up to which, and from which on, the first views decide
+FIRST = 2  # views that are compared at first
+VIEWS = 6  # views that are compared where the first do not decide
+# fractions of what is allowed up to which, and from which on, the first views decide
 CLEARLY_GOOD = 0.7
 CLEARLY_BAD = 1.4
 MarginOf = Callable[[Tensor, Tensor], float]

@@ -1,5 +1,7 @@
-"""Searches over base colours under conditions that vary by chance, by a matrix of light
-transport for each of a growing bank of them (docs/transport.md).
+"""Searches over base colors under random conditions, predicted by a bank of matrices.
+
+The bank has a matrix of light transport for each of its conditions, and grows during
+the search (docs/transport.md).
 """
 
 from __future__ import annotations
@@ -23,38 +25,46 @@ from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
 from advsearch.scene.color import to_8_bit
 from advsearch.scene.predictor import MOST_BYTES
-from advsearch.scene.transport.matrix import LinearRenderer, Tick
+from advsearch.scene.transport.matrix import Linearised, LinearRenderer, Tick
 from advsearch.trust.stored_files import scaled
 
-FIRST = 8  # conditions in the bank at first, in what an evaluation draws
-# an evaluation adds a condition for so many that it draws, while the bank grows
-GROWTH = 4
-EVERY = 100
+FIRST = 8  # conditions in the bank at first, as a multiple of those of an evaluation
+GROWTH = 4  # conditions that are drawn for each that is added, while the bank grows
+EVERY = 100  # evaluations from one comparison to the next
 # conditions that a comparison traces, and as many of the bank that it predicts
 UNSEEN = 16
-SURE = 1.0  # standard errors by which unseen conditions have to be better for the model
-SPP = 4  # samples a pixel of the paths of a condition (see `problem.LIGHT_DEPTH`)
-TOGETHER = 16  # pictures that the model is asked about at once
-SOBOL_MOST = 64  # numbers of a condition up to which they are stratified
+SURE = 1.0  # standard errors by which unseen conditions must be better for the model
+SPP = 4  # samples per pixel of a condition's light (see `problem.LIGHT_DEPTH`)
+TOGETHER = 16  # images in a batch of the model
+SOBOL_MOST = 64  # coordinates of a condition up to which conditions are stratified
 
 
 def stratified(domain: Domain, number: int, seed: int) -> Tensor:
-    """The condition with this number: as likely as any other, and as far from the ones
-    before as may be.
+    """Return the condition (d,) with an index, far from those before it.
+
+    By itself it is as likely as any other: a point of a scrambled Sobol sequence, or an
+    independent sample where the sequence cannot be used.
     """
-    if domain.dim > SOBOL_MOST or any(block.norm == "l2" for block in domain.blocks):
+    has_l2_block = any(block.norm == "l2" for block in domain.blocks)
+    if domain.dim > SOBOL_MOST or has_l2_block:
         generator = torch.Generator().manual_seed(
             seeds.stream(seed, "bank condition", number)
         )
         return domain.sample(generator)[0]
-    point = Draws(domain.dim, "sobol", seed, "bank conditions").points(number, 1)[0]
+    sequence = Draws(domain.dim, "sobol", seed, "bank conditions")
+    point = sequence.points(number, 1)[0]
     return to_domain(domain, torch.from_numpy(point).float())
 
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """A matrix, and the numbers of the conditions that it was made for; `alone` if base
-    colours under it depend on what is searched alone.
+    """A condition of the bank, and its matrix.
+
+    Attributes:
+        number: its index in the bank's sequence.
+        numbers: (d,) coordinates of the condition.
+        renderer: predicts images under it.
+        alone: whether base colors under it depend only on what is searched.
     """
 
     number: int
@@ -65,10 +75,13 @@ class Condition:
 
 @dataclass
 class Bank(PredictedSearch):
-    """The matrices of a run whose searches look at conditions that vary by chance.
-    After the comparisons `grown`, by evaluation, the bank went on growing; `gaps` are
-    by how much the objective was larger in it than under unseen conditions. `trace`
-    makes matrices, by workers where there are some.
+    """The matrices of a run whose searches have random conditions.
+
+    Attributes:
+        trace: collects the light of conditions, on workers where there are some.
+        grown: evaluations whose comparison let the bank go on growing.
+        gaps: of each comparison, by how much the objective was larger under conditions
+            of the bank than under unseen ones.
     """
 
     trace: Evaluate
@@ -76,201 +89,246 @@ class Bank(PredictedSearch):
     renewed: int | None = field(default=None, kw_only=True)
     grown: list[int] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
-    _held: list[Condition] = field(default_factory=list)
-    _places: dict[int, Tensor] = field(default_factory=dict)
-    _there: dict[str, Tensor] = field(default_factory=dict)
-    _still: LinearRenderer | None = None
-    _coming: Iterator[Evaluation] = field(default_factory=lambda: iter(()))
-    _until: int = 0
+    # conditions in memory, the newest last
+    _conditions: list[Condition] = field(default_factory=list)
+    # u of each comparison that let the bank grow, by evaluation
+    _grown_at: dict[int, Tensor] = field(default_factory=dict)
+    # inputs of the newest matrix, to share tensors that are equal
+    _latest_inputs: dict[str, Tensor] = field(default_factory=dict)
+    _image_renderer: LinearRenderer | None = None
+    # light that is being collected, for conditions up to `_collected_until`
+    _incoming: Iterator[Evaluation] = field(default_factory=lambda: iter(()))
+    _collected_until: int = 0
     _bytes: int = 0
-    _last: int = 0
-    _dropped: int = 0
+    _latest_step: int = 0
+    _n_dropped: int = 0
 
     @property
     def samples(self) -> int:
-        return self._wanted(0) * SPP
+        return self._bank_size(0) * SPP
 
     def size(self) -> tuple[int, int]:
-        return sum(condition.renderer.entries for condition in self._held), self._bytes
+        entries = sum(condition.renderer.entries for condition in self._conditions)
+        return entries, self._bytes
 
     def conditions(self) -> BankOfConditions:
-        gap = self.gaps[-1] if self.gaps else None
-        grown = len(self.grown)
         return BankOfConditions(
-            made=self._wanted(self._last), dropped=self._dropped, grown=grown, gap=gap
+            made=self._bank_size(self._latest_step),
+            dropped=self._n_dropped,
+            grown=len(self.grown),
+            gap=self.gaps[-1] if self.gaps else None,
         )
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         self._fill(0, tick)
 
     def passed(self, query: Query) -> None:
-        """Compare where that is due, and have the matrices that there are by then."""
+        """Compare where that is due, and make the matrices that exist by then."""
         if query.kind == "search" and query.phase == "search":
-            self._last = query.number
+            self._latest_step = query.number
             if query.number and query.number % EVERY == 0:
                 self._compare(query.u, query.number)
-        self._fill(self._last)
+        self._fill(self._latest_step)
         if query.keep:
-            self._picture(query.u)  # its noise is the same whenever it is made
+            # It has the same noise whenever it is rendered.
+            self._render_image(query.u)
 
     def evaluate(self, query: Query) -> Evaluation:
         self.passed(query)
-        evaluation = self._evaluated(
-            self._drawn(query.kind, query.number), query.u, query.gradient
-        )
-        return (
-            replace(evaluation, picture=to_8_bit(self._picture(query.u)))
-            if query.keep
-            else evaluation
-        )
+        conditions = self._choose_conditions(query.kind, query.number)
+        evaluation = self._evaluate_under(conditions, query.u, query.gradient)
+        if not query.keep:
+            return evaluation
+        return replace(evaluation, picture=to_8_bit(self._render_image(query.u)))
 
-    def _evaluated(
-        self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient
+    def _evaluate_under(
+        self, conditions: Sequence[Condition], u: Tensor, gradient: WhichGradient
     ) -> Evaluation:
-        wholes = [torch.cat([u, condition.numbers]) for condition in chosen]
+        """Evaluate u (d,) under conditions of the bank."""
+        full_configurations = [
+            torch.cat([u, condition.numbers]) for condition in conditions
+        ]
         evaluation = self.problem.mean_under(
-            lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER
+            lambda batch, batch_u: self._predict_images(conditions[batch], batch_u),
+            full_configurations,
+            u,
+            gradient,
+            TOGETHER,
         )
         return replace(evaluation, predicted=1)
 
-    def _drawn(self, kind: str, index: int) -> list[Condition]:
-        count = min(self.problem.draws, len(self._held))
-        before = self._wanted(index - 1 if kind == "search" else self._last)
-        new = [condition for condition in self._held if condition.number >= before][
-            :count
+    def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
+        """Return the conditions of an evaluation: all new ones, and random others."""
+        count = min(self.problem.draws, len(self._conditions))
+        previous_index = index - 1 if kind == "search" else self._latest_step
+        size_before = self._bank_size(previous_index)
+        new = [
+            condition
+            for condition in self._conditions
+            if condition.number >= size_before
+        ][:count]
+        old = [
+            condition
+            for condition in self._conditions
+            if condition.number < size_before
         ]
-        others = [condition for condition in self._held if condition.number < before]
-        return new + self._some(others, count - len(new), f"bank {kind}", index)
+        return new + self._sample(old, count - len(new), f"bank {kind}", index)
 
-    def _some(
+    def _sample(
         self, conditions: Sequence[Condition], count: int, stream: str, index: int
     ) -> list[Condition]:
+        """Return random conditions, each once."""
         generator = torch.Generator().manual_seed(
             seeds.stream(self.problem.seed, stream, index)
         )
         order = torch.randperm(len(conditions), generator=generator).tolist()
-        return [conditions[number] for number in order[:count]]
+        return [conditions[position] for position in order[:count]]
 
-    def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
+    def _predict_images(self, conditions: Sequence[Condition], u: Tensor) -> Tensor:
+        """Return predicted images (n, H, W, 3) of u (d,), with a graph."""
         inputs = self.problem.searched_space.inputs(u)
-        pictures = []
-        for condition in chosen:
-            whole = torch.cat([u, condition.numbers])
-            made = condition.renderer
-            alone = (
-                {name: inputs[name] for name in made.there} if condition.alone else None
-            )
-            pictures.append(made(whole) if alone is None else made.shown(alone, whole))
-        return torch.stack(pictures)
+        images = []
+        for condition in conditions:
+            full_u = torch.cat([u, condition.numbers])
+            renderer = condition.renderer
+            if condition.alone:
+                color_inputs = {name: inputs[name] for name in renderer.there}
+                images.append(renderer.shown(color_inputs, full_u))
+            else:
+                images.append(renderer(full_u))
+        return torch.stack(images)
 
-    def _picture(self, u: Tensor) -> Tensor:
-        if self._still is None:
+    def _render_image(self, u: Tensor) -> Tensor:
+        """Return the image (H, W, 3) of u (d,) without random conditions."""
+        if self._image_renderer is None:
             seed = seeds.stream(self.problem.seed, "bank still")
-            self._still = self.problem.linearised(
-                self.problem.whole(self.problem.domain.start), seed, SPP
-            )
+            start = self.problem.whole(self.problem.domain.start)
+            self._image_renderer = self.problem.linearised(start, seed, SPP)
             self.traced += 1
         with torch.no_grad():
-            return self._still(self.problem.whole(u))
+            return self._image_renderer(self.problem.whole(u))
 
-    def _wanted(self, index: int) -> int:
-        """How many conditions have been collected by the evaluation with this index."""
+    def _bank_size(self, index: int) -> int:
+        """Return how many conditions are collected by the evaluation with an index."""
+        # The second half of a search adds none.
         index = min(index, self.steps // 2 - 1)
-        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown))
-        return FIRST * self.problem.draws + steps * self.problem.draws // GROWTH
+        n_growing_steps = sum(
+            min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown)
+        )
+        draws = self.problem.draws
+        return FIRST * draws + n_growing_steps * draws // GROWTH
 
-    def _query(self, number: int) -> Query:
-        """Asks for the matrix of a condition: near what was searched when the bank last
-        began to grow.
+    def _make_query(self, number: int) -> Query:
+        """Return the query for the light of the condition with an index.
+
+        The light is collected where the search was when the bank last began to grow.
         """
         assert self.problem.conditions is not None
-        begun = [begin for begin in self.grown if self._wanted(begin - 1) <= number]
-        u = self._places[begun[-1]] if begun else self.problem.domain.start
-        numbers = stratified(
-            self.problem.conditions, number, seeds.stream(self.problem.seed, "bank")
-        )
+        starts = [begin for begin in self.grown if self._bank_size(begin - 1) <= number]
+        u = self._grown_at[starts[-1]] if starts else self.problem.domain.start
+        bank_seed = seeds.stream(self.problem.seed, "bank")
+        condition = stratified(self.problem.conditions, number, bank_seed)
         seed = seeds.stream(self.problem.seed, "bank matrix", number)
-        return Query(torch.cat([u, numbers]), seed, spp=SPP, wanted="light")
+        return Query(torch.cat([u, condition]), seed, spp=SPP, wanted="light")
 
     def _fill(self, index: int, tick: Tick = lambda samples: None) -> None:
-        """Make the matrices that there should be by an evaluation, newest last, as far
-        as memory lasts.
+        """Make the matrices of all conditions up to an evaluation, the newest last.
+
+        The oldest are dropped where memory is short.
         """
-        wanted = self._wanted(index)
-        first = self._held[-1].number + 1 if self._held else 0
-        if first >= wanted:
+        size = self._bank_size(index)
+        first = self._conditions[-1].number + 1 if self._conditions else 0
+        if first >= size:
             return
         with self.timed():
-            if self._until <= first:  # as far as the next comparison
-                self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
-                self._coming = iter(
-                    self.trace(
-                        [self._query(number) for number in range(first, self._until)]
-                    )
-                )
-            for number in range(first, wanted):
-                asked = self._query(number)
-                dim = self.problem.domain.dim
-                made = self.problem.linearised(
-                    asked.u, asked.seed, SPP, next(self._coming).light
-                )
-                self.traced += 1
-                with torch.no_grad():
-                    of_searched = self.problem.searched_space.inputs(asked.u[:dim])
-                    alone = True
-                for name, there in made.there.items():
-                    alone = (
-                        alone
-                        and name in of_searched
-                        and torch.equal(of_searched[name], there)
-                    )
-                    # one tensor for all alike
-                    if name in self._there and torch.equal(self._there[name], there):
-                        made.there[name] = self._there[name]
-                self._there = dict(made.there)
-                self._held.append(Condition(number, asked.u[dim:], made, alone))
-                self._bytes += made.bytes
+            if self._collected_until <= first:
+                next_comparison = (index // EVERY + 1) * EVERY
+                self._collected_until = self._bank_size(next_comparison - 1)
+                queries = [
+                    self._make_query(number)
+                    for number in range(first, self._collected_until)
+                ]
+                self._incoming = iter(self.trace(queries))
+            for number in range(first, size):
+                condition = self._make_condition(number, next(self._incoming).light)
+                self._conditions.append(condition)
+                self._bytes += condition.renderer.bytes
                 tick(SPP)
-                while len(self._held) > 1 and self._bytes > scaled(MOST_BYTES):
-                    self._bytes -= self._held.pop(0).renderer.bytes
-                    self._dropped += 1
+                while len(self._conditions) > 1 and self._bytes > scaled(MOST_BYTES):
+                    self._bytes -= self._conditions.pop(0).renderer.bytes
+                    self._n_dropped += 1
+
+    def _make_condition(self, number: int, light: Linearised | None) -> Condition:
+        """Return the condition with an index, with the matrix of its light."""
+        query = self._make_query(number)
+        dim = self.problem.domain.dim
+        renderer = self.problem.linearised(query.u, query.seed, SPP, light)
+        self.traced += 1
+        with torch.no_grad():
+            searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
+        depends_on_searched_only = True
+        for name, value in renderer.there.items():
+            if name not in searched_inputs or not torch.equal(
+                searched_inputs[name], value
+            ):
+                depends_on_searched_only = False
+            latest = self._latest_inputs.get(name)
+            if latest is not None and torch.equal(latest, value):
+                # Equal inputs of all matrices share one tensor.
+                renderer.there[name] = latest
+        self._latest_inputs = dict(renderer.there)
+        return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
 
     def _compare(self, u: Tensor, index: int) -> None:
-        """Look at unseen conditions and at the bank's own, and let the bank grow while
-        the first are clearly better for the model, or predictions of the second are too
-        far off.
+        """Compare the bank with unseen conditions, and let it grow where it must.
+
+        It grows if unseen conditions are clearly better for the model than those of the
+        bank, or if predictions are too far from traced images.
         """
         problem = self.problem
         with self.timed():
-            noise = seeds.stream(problem.seed, "bank check", index)
-            draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
-            unseen = [
-                problem.evaluated(Query(u, draw), problem.whole(u, draw), draw)[
-                    0
-                ].objective
-                for draw in draws
+            seed = seeds.stream(problem.seed, "bank check", index)
+            unseen_objectives = self._trace_unseen(u, seed)
+            conditions = self._sample(self._conditions, UNSEEN, "bank check", index)
+            full_configurations = [
+                torch.cat([u, condition.numbers]) for condition in conditions
             ]
-            chosen = self._some(self._held, UNSEEN, "bank check", index)
-            wholes = [torch.cat([u, condition.numbers]) for condition in chosen]
-            judged, _ = problem.judged(
-                partial(self._pictures, chosen), wholes, u, False
+            evaluated, _ = problem.judged(
+                partial(self._predict_images, conditions), full_configurations, u, False
             )
-            seen = [evaluation.objective for evaluation, _ in judged]
-            self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
+            bank_objectives = [evaluation.objective for evaluation, _ in evaluated]
+            bank_mean = statistics.fmean(bank_objectives)
+            gap = bank_mean - statistics.fmean(unseen_objectives)
+            self.gaps.append(gap)
             self.traced += UNSEEN
-            error = math.sqrt(
-                sum(statistics.pvariance(some) / len(some) for some in (seen, unseen))
+            standard_error = math.sqrt(
+                sum(
+                    statistics.pvariance(objectives) / len(objectives)
+                    for objectives in (bank_objectives, unseen_objectives)
+                )
             )
 
-        def view(number: int) -> ComparedView:
-            which = number % len(chosen)
+        def compare_view(number: int) -> ComparedView:
+            position = number % len(conditions)
             return problem.view(
-                chosen[which].renderer,
-                wholes[which],
-                seeds.stream(noise, "view", number),
+                conditions[position].renderer,
+                full_configurations[position],
+                seeds.stream(seed, "view", number),
                 SPP,
             )
 
-        if not self.compare(view).good or self.gaps[-1] > SURE * error:
-            self._places[index] = u.detach().clone()
+        is_accurate = self.compare(compare_view).good
+        if not is_accurate or gap > SURE * standard_error:
+            self._grown_at[index] = u.detach().clone()
             self.grown.append(index)
+
+    def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
+        """Return the objectives of u (d,) under conditions that are not in the bank."""
+        objectives = []
+        for index in range(UNSEEN):
+            draw = seeds.stream(seed, "draw", index)
+            evaluation, _ = self.problem.evaluated(
+                Query(u, draw), self.problem.whole(u, draw), draw
+            )
+            objectives.append(evaluation.objective)
+        return objectives

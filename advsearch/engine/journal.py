@@ -1,7 +1,8 @@
-"""The journal of a run: what was asked and answered, as rows of its store. What is in
-it is not asked again, so a run goes on by asking everything once more, with the
-functions and networks that it began with; the rest is answered in order, by workers
-where there are some.
+"""The journal of a run: its queries and their evaluations, as rows of its store.
+
+What is in it is not evaluated again. So a run is resumed by sending all queries once
+more, with the functions and networks that it began with; those that are not stored are
+evaluated in order, by workers where there are some.
 """
 
 from __future__ import annotations
@@ -37,29 +38,33 @@ from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
 
 ProblemKey = str | float
-"""Tells a problem from others that workers hold: its name, or by how much its ambient
-light is multiplied.
+"""Identifies a problem among those of workers: its name, or the factor of its ambient
+light.
 """
 Sent: TypeAlias = tuple[ProblemKey, Prepared | None, Query]
-"""The name of the problem, what it has been prepared with, and what is asked."""
+"""What a worker gets: the key of a problem, its preparation, and a query."""
 
 
 class Answerer(Protocol):
-    """What answers queries: a `Problem`, or a scene of a sweep."""
+    """Evaluates queries: a `Problem`, or a scene of a sweep."""
 
     def evaluate_all(
         self, queries: Sequence[Query], prepared: Prepared | None = None
     ) -> Iterable[Evaluation]:
-        """See `advsearch.attacks.evaluation.Evaluate`; with what the problem that asks
-        has been prepared with.
+        """Evaluate queries in order; see `advsearch.attacks.evaluation.Evaluate`.
+
+        `prepared` is the preparation of the problem that sends them.
         """
 
 
 @dataclass
 class Shared:
-    """Answers queries of a problem: several at once by an executor of `worker_call`,
-    where there is one, and all others here. Its `name` tells it from others that
-    workers hold. A sweep asks scenes, and has none.
+    """Evaluates the queries of a problem, several at once where there are workers.
+
+    Attributes:
+        own: the problem; None of a sweep, which has one for each scene and model.
+        executor: workers that run `worker_call`; None to evaluate in this process.
+        name: identifies the problem among those of workers.
     """
 
     own: Problem | None
@@ -76,74 +81,89 @@ class Shared:
 
     @property
     def facts(self) -> WorkerStats | None:
+        """Statistics of the workers; None without workers."""
         return None if self.executor is None else self.executor.facts
 
     @property
     def told(self) -> dict[str, float | str]:
-        """The same, beside a bar."""
+        """Statistics of the workers for a progress bar."""
         return {} if self.facts is None else self.facts.told
 
     def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer queries, each when it is its turn."""
+        """Evaluate queries, and yield the evaluations in the order of the queries."""
         if self.executor is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
             return
-        sent: list[Sent] = [
+        items: list[Sent] = [
             (self.name, self.problem.prepared, query) for query in queries
         ]
-        early = dict[int, Evaluation]()
-        turn = 0
-        numbers = {id(item): number for number, item in enumerate(sent)}
-        results: Any = self.executor.results([item] for item in sent)
+        index_of_item = {id(item): index for index, item in enumerate(items)}
+        # evaluations that came before those of earlier queries
+        waiting = dict[int, Evaluation]()
+        next_index = 0
+        results: Any = self.executor.results([item] for item in items)
         with closing(results):
-            for done in results:
-                number = numbers[id(done.items[0])]
-                evaluation = (
-                    lost(queries[number], done.lost) if done.lost else done.value[0]
-                )
-                early[number] = replace(evaluation, machine=done.machine)
-                while turn in early:
-                    self.problem.renderer.non_finite += early[turn].non_finite
-                    yield early.pop(turn)
-                    turn += 1
+            for result in results:
+                index = index_of_item[id(result.items[0])]
+                if result.lost:
+                    evaluation = lost(queries[index], result.lost)
+                else:
+                    evaluation = result.value[0]
+                waiting[index] = replace(evaluation, machine=result.machine)
+                while next_index in waiting:
+                    evaluation = waiting.pop(next_index)
+                    self.problem.renderer.non_finite += evaluation.non_finite
+                    yield evaluation
+                    next_index += 1
 
 
 def worker_call(named: Callable[[Any], Answerer]) -> Call:
-    """Return what answers queries that were sent: what a worker does."""
+    """Return the function that a worker runs on queries that were sent to it.
 
-    def call(sent: Sequence[Sent]) -> list[Evaluation]:
+    `named` returns the problem of a key.
+    """
+
+    def call(items: Sequence[Sent]) -> list[Evaluation]:
         evaluations = list[Evaluation]()
-        for name, items in groupby(sent, lambda item: item[0]):
-            # prepared with the same, as they are sent together
-            (_, prepared, first), *others = items
-            evaluations += named(name).evaluate_all(
-                [first, *(query for _, _, query in others)], prepared
-            )
+        for key, group in groupby(items, lambda item: item[0]):
+            items_of_problem = list(group)
+            # All are sent together, so that they have the same preparation.
+            _, prepared, _ = items_of_problem[0]
+            queries = [query for _, _, query in items_of_problem]
+            evaluations += named(key).evaluate_all(queries, prepared)
         return evaluations
 
     return call
 
 
 def lost(query: Query, why: str) -> Evaluation:
-    """Return what stands for an evaluation that nobody could make."""
+    """Return the evaluation of a query whose workers all died.
+
+    Raises:
+        ClusterError: the query is for an image or for light, which nothing replaces.
+    """
     if query.wanted != "judgement":
-        what = "a picture" if query.wanted == "picture" else "the light of a condition"
+        product = (
+            "a picture" if query.wanted == "picture" else "the light of a condition"
+        )
         raise ClusterError(
-            f"{what}: {why}; `advsearch resume RUN workers=null` makes it here"
+            f"{product}: {why}; `advsearch resume RUN workers=null` makes it here"
         )
     gradient = torch.zeros_like(query.u) if query.gradient else None
     cost = 0 if query.phase is None else query.samples
-    said = Judgement(
+    judgement = Judgement(
         math.nan,
         math.nan,
         right=False,
         prediction=Prediction(LOST, None, None),
         payload={"lost": why},
     )
-    return Evaluation(math.nan, gradient, False, cost=cost, judgement=said, lost=True)
+    return Evaluation(
+        math.nan, gradient, False, cost=cost, judgement=judgement, lost=True
+    )
 
 
-MADE_OF = "made of"  # the note of functions and weights
+MADE_OF = "made of"  # the note that has the digests of functions and weights
 
 
 def check_made_of(
@@ -151,30 +171,35 @@ def check_made_of(
     models: Sequence[Model],
     functions: Mapping[str, Callable[..., Any] | None] | None = None,
 ) -> None:
-    """Note what networks and functions are, or refuse to go on with others than a run
-    began with. A model behind an address keeps its answers in the run.
+    """Store the digests of networks and functions, or check those of a resumed run.
+
+    A model behind an address stores its answers in the run.
+
+    Raises:
+        InputError: a network or a function is not the one that the run began with.
     """
-    facts: dict[str, str | None] = {}
+    digests: dict[str, str | None] = {}
     for model in models:
-        for network in (
-            model.module.models if isinstance(model.module, Ensemble) else (model,)
-        ):
+        networks: Sequence[Model] = (model,)
+        if isinstance(model.module, Ensemble):
+            networks = model.module.models
+        for network in networks:
             if isinstance(network.module, RemoteNetwork):
                 network.module.keep_in(run.store)
-            facts[f"model {network.name}"] = weights_digest(network)
-    facts |= {
-        name: code_digest(function)
-        for name, function in (functions or {}).items()
-        if function is not None
+            digests[f"model {network.name}"] = weights_digest(network)
+    for name, function in (functions or {}).items():
+        if function is not None:
+            digests[name] = code_digest(function)
+    known_digests = {
+        name: digest for name, digest in digests.items() if digest is not None
     }
-    run.check_unchanged(
-        MADE_OF, {name: digest for name, digest in facts.items() if digest is not None}
-    )
+    run.check_unchanged(MADE_OF, known_digests)
 
 
 def weights_digest(model: Model) -> str | None:
-    """Return the SHA-256 of a network's weights and buffers, with their names; None
-    where it shows none.
+    """Return the SHA-256 of a network's weights and buffers, with their names.
+
+    None for a network that does not give access to them.
     """
     try:
         state = model.module.state_dict()  # type: ignore[attr-defined]
@@ -184,101 +209,96 @@ def weights_digest(model: Model) -> str | None:
         digest = hashlib.sha256()
         for name, tensor in sorted(tensors.items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-            digest.update(
-                tensor.detach()
-                .cpu()
-                .contiguous()
-                .flatten()
-                .view(torch.uint8)
-                .numpy()
-                .tobytes()
-            )
+            flat = tensor.detach().cpu().contiguous().flatten()
+            digest.update(flat.view(torch.uint8).numpy().tobytes())
     except (AttributeError, RuntimeError, TypeError, NotImplementedError):
         return None
     return digest.hexdigest() if tensors else None
 
 
 def code_digest(function: Callable[..., Any]) -> str | None:
-    """Return a digest of what a function does, and of the arrays that an object holds
-    which is called as one; None where it has no Python code.
+    """Return the SHA-256 of what a function does; None if it has no Python code.
+
+    It covers code, constants, defaults and closures; of an object that is called as a
+    function also the arrays that it holds.
     """
     while isinstance(function, partial):
         function = function.func
-    bare = inspect.unwrap(function)
-    bare = getattr(bare, "__func__", bare)
+    unwrapped: Any = inspect.unwrap(function)
+    unwrapped = getattr(unwrapped, "__func__", unwrapped)
     arrays: list[Any] = []
-    if not hasattr(bare, "__code__"):
-        arrays = [
-            (name, _plain(value))
-            for name, value in sorted(getattr(bare, "__dict__", {}).items())
-        ]
-        arrays = [pair for pair in arrays if isinstance(pair[1], bytes)]
-        bare = getattr(type(bare), "forward", None) or type(bare).__call__
-    code = getattr(bare, "__code__", None)
+    if not hasattr(unwrapped, "__code__"):
+        attributes = sorted(getattr(unwrapped, "__dict__", {}).items())
+        simplified = [(name, _simplify(value)) for name, value in attributes]
+        arrays = [pair for pair in simplified if isinstance(pair[1], bytes)]
+        cls = type(unwrapped)
+        unwrapped = getattr(cls, "forward", None) or cls.__call__
+    code = getattr(unwrapped, "__code__", None)
     if code is None:
         return None
-    cells = [_plain(cell) for cell in getattr(bare, "__closure__", None) or ()]
-    parts = (
-        _parts(code, getattr(bare, "__doc__", None)),
-        _plain(getattr(bare, "__defaults__", None)),
-        cells,
+    closure = getattr(unwrapped, "__closure__", None) or ()
+    components = (
+        _simplify_code(code, getattr(unwrapped, "__doc__", None)),
+        _simplify(getattr(unwrapped, "__defaults__", None)),
+        [_simplify(cell) for cell in closure],
         arrays,
     )
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
+    return hashlib.sha256(repr(components).encode()).hexdigest()
 
 
-def _parts(code: CodeType, text: str | None = None) -> tuple[Any, ...]:
-    """What a function does, without where it stands, what it is called and the text
-    that describes it.
-    """
-    inner = [
-        _parts(part) if isinstance(part, CodeType) else _plain(part)
-        for part in code.co_consts
-        if part != text
+def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, ...]:
+    """Return what a function does, without its name, place and docstring."""
+    constants = [
+        _simplify_code(constant)
+        if isinstance(constant, CodeType)
+        else _simplify(constant)
+        for constant in code.co_consts
+        if constant != docstring
     ]
-    return code.co_code.hex(), inner, code.co_names, code.co_freevars
+    return code.co_code.hex(), constants, code.co_names, code.co_freevars
 
 
-def _plain(value: Any) -> Any:
-    """Numbers and texts, however deep, and a digest of an array; of anything else its
-    type, since its text may be another one in each process.
+def _simplify(value: Any) -> Any:
+    """Return a value whose repr is the same in every process.
+
+    Numbers and strings stay, also in containers; arrays become their SHA-256, and other
+    objects the name of their type.
     """
     if isinstance(value, CellType):
         try:
-            return _plain(value.cell_contents)
-        except ValueError:  # nothing is in it yet
+            return _simplify(value.cell_contents)
+        except ValueError:  # the cell is empty
             return None
     if isinstance(value, (tuple, list)):
-        return [_plain(part) for part in value]
+        return [_simplify(item) for item in value]
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
-        array = np.ascontiguousarray(
-            value.detach().cpu() if isinstance(value, Tensor) else value
-        )
-        return hashlib.sha256(
-            f"{array.dtype} {array.shape}".encode() + array.tobytes()
-        ).digest()
-    return (
-        value
-        if isinstance(value, (int, float, complex, str, bytes, type(None)))
-        else type(value).__name__
-    )
+        if isinstance(value, Tensor):
+            value = value.detach().cpu()
+        array = np.ascontiguousarray(value)
+        header = f"{array.dtype} {array.shape}".encode()
+        return hashlib.sha256(header + array.tobytes()).digest()
+    if isinstance(value, (int, float, complex, str, bytes, type(None))):
+        return value
+    return type(value).__name__
 
 
-MACHINES = "machines"  # the note under which the store keeps what they are
-
-
-# the note under which the store keeps how derivatives are obtained
-PLAN = "gradient plan"
+MACHINES = "machines"  # the note that describes machines unlike this one
+PLAN = "gradient plan"  # the note of how derivatives are computed
 
 
 @dataclass
 class Journal:
-    """What a run has asked and was answered, without a run directory kept in `rows`;
-    `traced` answers what nothing predicts. It counts queries that nobody could answer
-    (`lost`), and knows the machines that are not like this one, by the names that rows
-    have.
+    """The stored evaluations of a run.
+
+    Attributes:
+        run: directory whose store has the rows; None to hold them in `rows`.
+        traced: evaluates queries that nothing predicts.
+        rows: of a journal without a run directory.
+        lost: queries whose workers all died.
+        machines: description of the machines that are not like this one, by the names
+            in rows.
     """
 
     run: RunDirectory | None
@@ -292,6 +312,7 @@ class Journal:
 
     @property
     def problem(self) -> Problem:
+        """The problem whose queries are evaluated."""
         return self.traced.problem
 
     def __post_init__(self) -> None:
@@ -302,7 +323,6 @@ class Journal:
             self._opened = True
 
     # ---- queries
-    # ----------------------------------------------------------------------------------------------------
 
     def evaluate_all(
         self,
@@ -310,57 +330,60 @@ class Journal:
         evaluate: Evaluate | None = None,
         passed: Callable[[Query], None] = lambda query: None,
     ) -> Iterator[Evaluation]:
-        """Answer queries in their order: from the journal, or else by `evaluate` (None
-        for `traced`), and then they are in it. `passed` is told of every query of a
-        search that is read back.
+        """Yield the evaluations of queries in their order, from the store or new ones.
+
+        New evaluations are stored.
+
+        Args:
+            queries: in order.
+            evaluate: evaluates those that are not stored; None for `traced`.
+            passed: called with every query of a search that is read from the store.
         """
         stored = [self._read(query) for query in queries]
+        new_queries = [
+            query
+            for query, evaluation in zip(queries, stored, strict=True)
+            if evaluation is None
+        ]
         evaluate = self.traced if evaluate is None else evaluate
-        asked = iter(
-            evaluate(
-                [
-                    query
-                    for query, known in zip(queries, stored, strict=True)
-                    if known is None
-                ]
-            )
-        )
-        for query, known in zip(queries, stored, strict=True):
-            begun = time.perf_counter()
-            if known is None:
-                known = next(asked)
-                seconds = None if query.phase is None else time.perf_counter() - begun
-                self.keep([(query, replace(known, seconds=seconds))])
+        new_evaluations = iter(evaluate(new_queries))
+        for query, evaluation in zip(queries, stored, strict=True):
+            started = time.perf_counter()
+            if evaluation is None:
+                evaluation = next(new_evaluations)
+                seconds = None
+                if query.phase is not None:
+                    seconds = time.perf_counter() - started
+                self.keep([(query, replace(evaluation, seconds=seconds))])
             elif query.phase is not None:
                 passed(query)
-            yield known
+            yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """The trials of a kind by their numbers: those of earlier lives, and of this
-        one.
-        """
-        if kind not in self._trials:
-            rows = (
-                ()
-                if self.run is None or kind not in self._counts
-                else self.run.store.rows(kind)
-            )
-            # old ones don't say it
-            stored = {row.step: row for row in rows if row.correct is not None}
-            self._trials[kind] = {
-                step: Evaluation.of(
-                    judgement_of(row),
-                    predicted=0 if row.seed is not None else row.spp or 1,
-                )
-                for step, row in stored.items()
-            }
-            self.lost += sum(
-                trial.said.prediction.label == LOST
-                for trial in self._trials[kind].values()
-            )
-        return self._trials[kind]
+        """Return the trials of a kind by their numbers, stored ones included."""
+        if kind in self._trials:
+            return self._trials[kind]
+        rows: Iterable[Row] = ()
+        if self.run is not None and kind in self._counts:
+            rows = self.run.store.rows(kind)
+        trials = {}
+        for row in rows:
+            # Rows of old runs may have no judgement.
+            if row.correct is not None:
+                predicted = 0 if row.seed is not None else row.spp or 1
+                trials[row.step] = Evaluation.of(judgement_of(row), predicted=predicted)
+        self._trials[kind] = trials
+        self.lost += sum(
+            trial.said.prediction.label == LOST for trial in trials.values()
+        )
+        return trials
 
     def _read(self, query: Query) -> Evaluation | None:
+        """Return the stored evaluation of a query; None if there is none.
+
+        Raises:
+            InputError: the stored evaluation is one of another configuration.
+        """
         if query.phase is None:
             return self._trials_of(query.kind).get(query.number)
         if self.run is None or query.number >= self._counts.get(query.kind, 0):
@@ -368,8 +391,8 @@ class Journal:
         stored = self.run.store.told(query.kind, query.number)
         if stored is None:
             return None
-        row, beside = stored
-        if beside.u != digest(query.u) or row.seed != query.seed:
+        row, cached = stored
+        if cached.u != digest(query.u) or row.seed != query.seed:
             raise InputError(
                 f"{self.run.path}: cannot resume: evaluation {query.number} of the "
                 f"{query.kind} is not the one that "
@@ -377,157 +400,191 @@ class Journal:
                 "changed since; "
                 f"{self.run.again}"
             )
-        if beside.non_finite:
-            self.problem.renderer.non_finite += beside.non_finite
+        if cached.non_finite:
+            self.problem.renderer.non_finite += cached.non_finite
+        gradient = None
+        if cached.gradient is not None:
+            gradient = torch.from_numpy(cached.gradient.copy())
+        image = None
+        if cached.picture is not None:
+            image = torch.from_numpy(cached.picture.copy()).float() / 255.0
         return Evaluation(
             objective=math.nan if row.objective is None else row.objective,
-            gradient=None
-            if beside.gradient is None
-            else torch.from_numpy(beside.gradient.copy()),
+            gradient=gradient,
             success=bool(row.success),
-            non_finite=beside.non_finite,
-            cost=beside.cost,
+            non_finite=cached.non_finite,
+            cost=cached.cost,
             judgement=None if row.correct is None else judgement_of(row),
-            picture=None
-            if beside.picture is None
-            else torch.from_numpy(beside.picture.copy()).float() / 255.0,
+            picture=image,
         )
 
     def keep(
         self, evaluated: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False
     ) -> list[Row]:
-        """Write evaluations in one transaction, a row each; what a search was told goes
-        beside it. If `numbered`, the place of a row in the store is the query's number,
-        in whatever order they come.
+        """Store evaluations in one transaction, a row each.
+
+        Gradient and image of a search's evaluation are stored with its row.
+
+        Args:
+            evaluated: queries and their evaluations.
+            numbered: whether the id of a row is the number of its query, in whatever
+                order they come.
+
+        Returns:
+            The rows.
         """
         rows = list[Row]()
-        told = None
+        cached = None
         for query, evaluation in evaluated:
             self.lost += evaluation.lost
-            if (name := evaluation.machine) is not None and name not in self.machines:
-                facts = self.traced.facts
-                self.machines[name] = (
-                    {} if facts is None else dict(facts.machines.get(name, {}))
-                )
-                self.set_note(MACHINES, self.machines)
+            self._note_machine(evaluation.machine)
             if query.phase is None:
-                values = dict(query.values)
-                if query.drawn:
-                    values |= self.problem.conditions_of(query.u, query.seed)
-                # it has no noise of its own
-                seed = None if evaluation.predicted else query.seed
-                spp = evaluation.predicted or query.spp
-                row = trial_row(
-                    query.kind,
-                    query.number,
-                    seed,
-                    spp,
-                    evaluation.said,
-                    values,
-                    sought=query.sought,
-                )
-                row = replace(
-                    row,
-                    machine=evaluation.machine,
-                    renders=evaluation.cost,
-                    seconds=evaluation.seconds,
-                )
+                row = self._row_of_trial(query, evaluation)
                 if not numbered:
-                    self._trials_of(query.kind)[query.number] = replace(
-                        evaluation, picture=None
-                    )
-            elif query.number < self._counts.get(
-                query.kind, 0
-            ):  # it had a row when the run, done by then, was opened
+                    trials = self._trials_of(query.kind)
+                    trials[query.number] = replace(evaluation, picture=None)
+            elif query.number < self._counts.get(query.kind, 0):
+                # It had a row when the run, complete by then, was opened.
                 continue
             else:
-                row, told = self._row_of_search(query, evaluation)
+                row, cached = self._row_of_search(query, evaluation)
             rows.append(replace(row, id=query.number + 1) if numbered else row)
         if self.run is None:
             for row in rows:
-                self.rows.append(
-                    replace(row, id=row.id or len(self.rows) + 1, time=time.time())
-                )
+                row_id = row.id or len(self.rows) + 1
+                self.rows.append(replace(row, id=row_id, time=time.time()))
         elif rows:
-            self.run.record(*rows, told=told)
+            self.run.record(*rows, told=cached)
         return rows
 
+    def _note_machine(self, name: str | None) -> None:
+        """Store the description of a machine that is not like this one, once."""
+        if name is None or name in self.machines:
+            return
+        stats = self.traced.facts
+        description: dict[str, str] = {}
+        if stats is not None:
+            description = dict(stats.machines.get(name, {}))
+        self.machines[name] = description
+        self.set_note(MACHINES, self.machines)
+
+    def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
+        """Return the row of a trial."""
+        values = dict(query.values)
+        if query.drawn:
+            values |= self.problem.conditions_of(query.u, query.seed)
+        row = trial_row(
+            query.kind,
+            query.number,
+            # A predicted image has no noise of its own.
+            None if evaluation.predicted else query.seed,
+            evaluation.predicted or query.spp,
+            evaluation.said,
+            values,
+            sought=query.sought,
+        )
+        return replace(
+            row,
+            machine=evaluation.machine,
+            renders=evaluation.cost,
+            seconds=evaluation.seconds,
+        )
+
     def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
+        """Return the row of a search's evaluation, and what is stored with it."""
         problem = self.problem
-        finite = evaluation.finite
-        gradient = evaluation.gradient
-        picture = evaluation.picture
+        is_finite = evaluation.finite
+        is_predicted = bool(evaluation.predicted)
         row = Row(
-            query.kind, query.number, query.seed, None if evaluation.predicted else problem.spp * query.samples,
-            objective=evaluation.objective if finite else math.nan, success=evaluation.success and finite,
-            values=problem.describe(query.u), seconds=evaluation.seconds, phase=query.phase,
-            renders=0 if evaluation.predicted else evaluation.cost * problem.draws, machine=evaluation.machine,
-        )  # fmt: skip
-        told = Told(
-            query.number, digest(query.u), evaluation.non_finite, evaluation.cost,
-            None if gradient is None else gradient.detach().numpy(),
-            None if picture is None else levels_of(picture).numpy(),
-        )  # fmt: skip
-        return row if evaluation.judgement is None else judged(
-            row, evaluation.judgement
-        ), told
+            query.kind,
+            query.number,
+            query.seed,
+            None if is_predicted else problem.spp * query.samples,
+            objective=evaluation.objective if is_finite else math.nan,
+            success=evaluation.success and is_finite,
+            values=problem.describe(query.u),
+            seconds=evaluation.seconds,
+            phase=query.phase,
+            renders=0 if is_predicted else evaluation.cost * problem.draws,
+            machine=evaluation.machine,
+        )
+        if evaluation.judgement is not None:
+            row = judged(row, evaluation.judgement)
+        gradient = None
+        if evaluation.gradient is not None:
+            gradient = evaluation.gradient.detach().numpy()
+        image = None
+        if evaluation.picture is not None:
+            image = levels_of(evaluation.picture).numpy()
+        cached = Told(
+            query.number,
+            digest(query.u),
+            evaluation.non_finite,
+            evaluation.cost,
+            gradient,
+            image,
+        )
+        return row, cached
 
     def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
-        """Return what says whether the time of a search is over, that of its earlier
-        lives included.
+        """Return a function that tells whether the time of a search is over.
 
-        An evaluation that is read back never ends the search before the one after which
-        it was ended; if the store has renders of the ranking, that is the last one
-        before these.
+        The time before the run was resumed counts. An evaluation that is read from the
+        store never ends the search before the one after which it was ended; if the
+        store has renders of the ranking, that is the last one before these.
+
+        Args:
+            kind: of the search.
+            seconds: its limit; None for none, and then the result is None.
         """
         if seconds is None:
             return None
-        stored: Iterable[Row] = (
-            ()
-            if self.run is None or not self.run.store.goes_on
-            else self.run.store.rows(kind)
-        )
+        stored: Iterable[Row] = ()
+        if self.run is not None and self.run.store.goes_on:
+            stored = self.run.store.rows(kind)
         phases = [(row.phase, row.seconds or 0.0) for row in stored]
-        explored = [spent for phase, spent in phases if phase == "search"]
-        left = seconds - math.fsum(explored)
-        begun = time.perf_counter()
+        search_seconds = [spent for phase, spent in phases if phase == "search"]
+        has_ranking = len(phases) > len(search_seconds)
+        seconds_left = seconds - math.fsum(search_seconds)
+        started = time.perf_counter()
 
-        def late(count: int) -> bool:
-            nonlocal begun
-            if count < len(explored):
-                begun = time.perf_counter()  # to read back takes none of the time
+        def is_out_of_time(n_evaluations: int) -> bool:
+            nonlocal started
+            if n_evaluations < len(search_seconds):
+                started = time.perf_counter()  # reading takes none of the time
                 return False
-            return len(phases) > len(explored) or time.perf_counter() - begun >= left
+            return has_ranking or time.perf_counter() - started >= seconds_left
 
-        return late
+        return is_out_of_time
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader has to know of the other machines."""
+        """A sentence about machines that are not like this one, if there are any."""
         if not self.machines:
             return []
-        told = "; ".join(
-            ", ".join(f"{key} {text}" for key, text in facts.items())
-            for facts in self.machines.values()
+        descriptions = "; ".join(
+            ", ".join(f"{key} {text}" for key, text in description.items())
+            for description in self.machines.values()
         )
         return [
             "Rows come from machines that are not alike, so that their last bits may "
             "differ; beside the one that kept "
-            f"the run: {told}."
+            f"the run: {descriptions}."
         ]
 
     # ---- notes
-    # ------------------------------------------------------------------------------------------------------
 
     def note(self, key: str) -> Any:
+        """Return the stored note of a key; None if there is none."""
         return None if self.run is None else self.run.store.noted(key)
 
     def set_note(self, key: str, value: Any) -> None:
+        """Store a value that JSON can hold as the note of a key."""
         if self.run is not None:
             self.run.store.set_note(key, json.dumps(value))
 
 
 def digest(u: Tensor) -> bytes:
-    return hashlib.blake2b(
-        np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16
-    ).digest()
+    """Return 16 bytes that identify a configuration (d,) by all its bits."""
+    array = np.ascontiguousarray(u.detach().numpy())
+    return hashlib.blake2b(array.tobytes(), digest_size=16).digest()

@@ -1,5 +1,7 @@
-"""What pictures are judged by: what is true of a scene, and metrics, numbers of one's
-own for every picture.
+"""How images are judged: tasks, user metrics, print terms, and objectives.
+
+A task compares the output of a model with what is true of the scene. A metric is a
+user function whose values are stored with every image.
 """
 
 from __future__ import annotations
@@ -44,18 +46,25 @@ from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
 from advsearch.trust.code import check_import, current_directory_importable
 
 Metric = Callable[[Tensor, Any, Any], Any]
-"""f(image, output, truth), which returns a number, or numbers by name. Where one name
-is right, `truth` is its index, a tensor without axes.
+"""f(image, output, truth), which returns a number, or numbers by name.
+
+Where a single class is right, `truth` is its index, a tensor without axes.
 """
 
 Metrics = Mapping[str, Metric]
 
-MAIN = "__main__"  # the script that runs, which has another name in every other process
+# module of the script that runs; every other process has it under another name
+MAIN = "__main__"
 
 
 def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
-    """Return metrics as a file names them: "package.module:function"; one that cannot
-    be named, by its bare name.
+    """Return metrics as a file names them: "package.module:function".
+
+    A function that cannot be named so has its bare name.
+
+    Raises:
+        InputError: no mapping of functions, a function with other parameters, or a name
+            that a column of rows has already.
     """
     if not isinstance(metrics, Mapping) or not all(
         isinstance(name, str) for name in metrics
@@ -80,30 +89,42 @@ def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
                 f"truth), got {function!r:.80}"
             )
         check_takes(f"metrics: {name}", function, "image", "output", "truth")
-        module = str(getattr(function, "__module__", None))
-        place = str(getattr(function, "__qualname__", None))
-        named: Any = sys.modules.get(module)
-        for part in place.split("."):
-            named = getattr(named, part, None)
-        bare = str(getattr(function, "__name__", type(function).__name__))
-        settings[name] = f"{module}:{place}" if named is function else bare
+        settings[name] = _import_name(function)
     return settings
 
 
+def _import_name(function: Metric) -> str:
+    """Return "module:qualified.name" of a function, or its bare name.
+
+    The bare name stands for a function that its module does not have under that name,
+    such as a lambda or a partial.
+    """
+    module_name = str(getattr(function, "__module__", None))
+    qualified_name = str(getattr(function, "__qualname__", None))
+    found: Any = sys.modules.get(module_name)
+    for attribute in qualified_name.split("."):
+        found = getattr(found, attribute, None)
+    if found is function:
+        return f"{module_name}:{qualified_name}"
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
 def only_here(settings: Mapping[str, str]) -> list[str]:
-    """Return the metrics, by name, that no file can name."""
+    """List the metrics, by name, that exist in this Python session only."""
     return [
         name
-        for name, text in settings.items()
-        if ":" not in text or text.startswith(f"{MAIN}:")
+        for name, import_name in settings.items()
+        if ":" not in import_name or import_name.startswith(f"{MAIN}:")
     ]
 
 
 def check_shared(settings: Mapping[str, str]) -> None:
+    """Raise InputError for a metric that workers could not import."""
     for name in only_here(settings):
+        bare_name = settings[name].rpartition(":")[2]
         raise InputError(
             f"metrics: {name}: workers import a metric by its name, and "
-            f"{settings[name].rpartition(':')[2]} has none "
+            f"{bare_name} has none "
             "that they could; write it as a function of a module, or leave `workers` "
             "and `cluster` out"
         )
@@ -112,36 +133,47 @@ def check_shared(settings: Mapping[str, str]) -> None:
 def load_metrics(
     settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None
 ) -> Metrics:
-    """Return the functions that settings name; `given` ones are there already, and take
-    their place.
+    """Return the functions of metrics by name.
+
+    Args:
+        settings: import name of each, see `metrics_as_settings`.
+        given: functions that the caller passed; they are not imported.
+
+    Raises:
+        InputError: a function cannot be imported, or is none.
     """
-    functions: dict[str, Any] = {}
-    for name, text in settings.items():
-        functions[name] = (given or {}).get(name)
-        if callable(functions[name]):
-            continue
-        module, colon, attribute = text.partition(":")
-        if not colon or not attribute:
-            raise InputError(
-                f"metrics: {name}: expected package.module:function, got {text!r}"
-            )
-        check_import(text)
-        try:
-            with current_directory_importable():
-                functions[name] = attrgetter(attribute)(import_module(module))
-        except Exception as error:  # the user's code may raise anything
-            raise InputError(
-                f"metrics: {name}: {text} cannot be imported ({type(error).__name__}: "
-                f"{error}); a module is looked for "
-                f"on the Python path and in {os.getcwd()}"
-            ) from error
-        if not callable(functions[name]):
-            got = f"{functions[name]!r:.80}"
-            raise InputError(
-                f"metrics: {name}: expected a function of (image, output, "
-                f"truth), got {got}"
-            )
-    return functions
+    loaded: dict[str, Any] = {}
+    for name, import_name in settings.items():
+        function: Any = (given or {}).get(name)
+        loaded[name] = (
+            function if callable(function) else _import_metric(name, import_name)
+        )
+    return loaded
+
+
+def _import_metric(name: str, import_name: str) -> Any:
+    """Import a metric, "package.module:function"."""
+    module, colon, attribute = import_name.partition(":")
+    if not colon or not attribute:
+        raise InputError(
+            f"metrics: {name}: expected package.module:function, got {import_name!r}"
+        )
+    check_import(import_name)
+    try:
+        with current_directory_importable():
+            function = attrgetter(attribute)(import_module(module))
+    except Exception as error:  # the user's code may raise anything
+        raise InputError(
+            f"metrics: {name}: {import_name} cannot be imported "
+            f"({type(error).__name__}: {error}); a module is looked for "
+            f"on the Python path and in {os.getcwd()}"
+        ) from error
+    if not callable(function):
+        raise InputError(
+            f"metrics: {name}: expected a function of (image, output, "
+            f"truth), got {function!r:.80}"
+        )
+    return function
 
 
 def judgements(
@@ -151,103 +183,134 @@ def judgements(
     truths: Sequence[Truth],
     metrics: Metrics = MappingProxyType({}),
 ) -> list[Judgement]:
-    """Return what a task and metrics say of pictures (N, H, W, 3), sRGB in [0, 1]: the
-    one place where a run judges. Each picture has its truth, or one is for all.
+    """Return the judgement of the task and the metrics on each image.
+
+    A run judges images here and nowhere else.
+
+    Args:
+        task: judges the output.
+        output: of the model for all N images.
+        pictures: (N, H, W, 3) sRGB in [0, 1].
+        truths: N, or one that holds for all images.
+        metrics: user functions by name.
     """
     with torch.no_grad():
         if len(truths) == 1:
-            said = task.judge(output, truths[0])
+            judged = task.judge(output, truths[0])
             truths = [truths[0]] * len(pictures)
         else:
-            said = [
-                task.judge(output[k : k + 1], truth)[0]
-                for k, truth in enumerate(truths)
+            judged = [
+                task.judge(output[index : index + 1], truth)[0]
+                for index, truth in enumerate(truths)
             ]
     if not metrics:
-        return said
+        return judged
     return [
-        measured(said[k], metrics, pictures[k], output[k : k + 1], truth)
-        for k, truth in enumerate(truths)
+        measured(
+            judged[index], metrics, pictures[index], output[index : index + 1], truth
+        )
+        for index, truth in enumerate(truths)
     ]
 
 
 def with_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
-    """Return a judgement whose payload has what the picture shows of each thing, beside
-    what is said of it.
+    """Return a judgement whose payload has what the image shows of each thing.
+
+    What the task states of a thing already is not replaced.
     """
     if things is None or judgement.not_a_number:
         return judgement
-    kept = judgement.payload if isinstance(judgement.payload, dict) else {}
-    said: Any = kept.get("things", {})
-    shown: Any = {name: {**seen, **said.get(name, {})} for name, seen in things.items()}  # type: ignore[dict-item]
-    return replace(judgement, payload={**kept, "things": shown})
+    payload = judgement.payload if isinstance(judgement.payload, dict) else {}
+    judged_things: Any = payload.get("things", {})
+    all_things: Any = {
+        name: {**visible, **judged_things.get(name, {})}  # type: ignore[dict-item]
+        for name, visible in things.items()
+    }
+    return replace(judgement, payload={**payload, "things": all_things})
 
 
 def measured(
     judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth
 ) -> Judgement:
-    """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics
-    say of it. A metric gets the truth as an objective does, of one picture; all that it
-    gets are copies.
+    """Return a judgement with the values of metrics.
+
+    Metrics get copies: no function of a user can change what a run computes with.
+
+    Args:
+        judgement: of the image.
+        metrics: functions by name.
+        image: (H, W, 3) sRGB in [0, 1].
+        output: of the model, for a batch of this one image.
+        truth: of the image; a metric gets it as an objective does.
+
+    Raises:
+        InputError: a metric returns no number and no mapping of numbers.
     """
     returned = dict[str, Any]()
-    numbers = dict[str, float | None]()
-    seen, right = _of_one(output, truth)
+    values = dict[str, float | None]()
+    image_output, image_truth = _unbatch(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
-            value = metric(*copied((image.detach(), seen, right)))
-            if isinstance(value, Mapping):
-                returned |= {f"{name}.{key}": each for key, each in value.items()}
+            result = metric(*copied((image.detach(), image_output, image_truth)))
+            if isinstance(result, Mapping):
+                returned |= {f"{name}.{key}": value for key, value in result.items()}
             else:
-                returned[name] = value
-        for name, value in returned.items():
+                returned[name] = result
+        for name, result in returned.items():
             try:
-                number = float(value)
+                value = float(result)
             except (TypeError, ValueError, RuntimeError):
-                expected = "a number, or a dict from names to numbers"
                 raise InputError(
-                    f"metrics: {name}: expected {expected}, got {value!r:.80}"
+                    f"metrics: {name}: expected a number, or a dict from names to "
+                    f"numbers, got {result!r:.80}"
                 ) from None
-            numbers[name] = number if math.isfinite(number) else None
-    return replace(judgement, metrics=numbers)
+            values[name] = value if math.isfinite(value) else None
+    return replace(judgement, metrics=values)
 
 
-def _of_one(output: Output, truth: Truth) -> tuple[Any, Any]:
-    """The output and the truth of one picture as a metric gets them; of several models,
-    a tuple of each.
+def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
+    """Return output and truth of the only image of a batch, as a metric gets them.
+
+    Of several models both are tuples, with an item for each model.
     """
-    first = output[0]
-    if isinstance(first, (tuple, list)):
-        each = [_of_one(*both) for both in zip(first, truth, strict=True)]
-        return tuple(seen for seen, _ in each), tuple(right for _, right in each)
+    first_output = output[0]
+    if isinstance(first_output, (tuple, list)):
+        pairs = [
+            _unbatch(model_output, model_truth)
+            for model_output, model_truth in zip(first_output, truth, strict=True)
+        ]
+        outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
+        return outputs, truths
     labels = labels_of(truth, output, 1)
-    return first, labels[0] if isinstance(labels, Tensor) else labels
+    first_label = labels[0] if isinstance(labels, Tensor) else labels
+    return first_output, first_label
 
 
 def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | None:
-    """Return the mean of each metric over pictures of which it is a number; None where
-    there are no metrics.
+    """Return the mean of each metric over the images for which it is a number.
+
+    A metric that is a number for none is None; without any metric the result is None.
     """
-    each = [
-        judgement.metrics for judgement in judgements if judgement.metrics is not None
-    ]
-    names = dict.fromkeys(name for metrics in each for name in metrics)
-    numbers = {
-        name: [number for metrics in each if (number := metrics.get(name)) is not None]
-        for name in names
+    values_by_name: dict[str, list[float]] = {}
+    for judgement in judgements:
+        for name, value in (judgement.metrics or {}).items():
+            values = values_by_name.setdefault(name, [])
+            if value is not None:
+                values.append(value)
+    means = {
+        name: mean(values) if values else None
+        for name, values in values_by_name.items()
     }
-    return {
-        name: mean(known) if known else None for name, known in numbers.items()
-    } or None
+    return means or None
 
 
-LOOK_SPP = 16  # samples a pixel of the clean picture that the model is shown
+LOOK_SPP = 16  # samples per pixel of the clean image that calibrates a task
 
 Described = Callable[[], Mapping[str, Value]]
-"""What says the configuration in named values, when it is asked."""
+"""Describes the configuration in named values, when it is called."""
 
 Looked = Callable[[], Surfaces]
-"""What says what the camera sees, when it is asked."""
+"""Renders what the camera sees, when it is called."""
 
 
 def calibrate_task(
@@ -258,11 +321,10 @@ def calibrate_task(
     judge: str,
     image_settings: Mapping[str, Any],
 ) -> Task:
-    """Return the task after it has seen what its model predicts of clean images, where
-    it `calibrates`.
+    """Return the task, calibrated by what its model predicts of clean images.
 
     The next scene is rendered where those before leave open how predictions are to be
-    read.
+    read. A task that does not calibrate is returned as it is.
 
     Args:
         task: of the model.
@@ -272,14 +334,22 @@ def calibrate_task(
         judge: the thing that is judged.
         image_settings: keywords of `render` for the images that the model sees, see
             `SceneConfig.image_settings`.
+
+    Raises:
+        InputError: the predictions stay ambiguous.
     """
     if not task.calibrates:
         return task
     for scene in scenes:
         rendering = render(
-            scene, model, task=task, label=label, judge=OBJECT if judge == ALL else judge, spp=LOOK_SPP,
+            scene,
+            model,
+            task=task,
+            label=label,
+            judge=OBJECT if judge == ALL else judge,
+            spp=LOOK_SPP,
             **image_settings,
-        )  # fmt: skip
+        )
         view = rendering.views[0]
         task = task.after_calibration(view.output, view.truth)
         if not task.ambiguities:
@@ -294,35 +364,35 @@ def check_truth(
     facts: Facts,
     image_settings: Mapping[str, Any],
 ) -> None:
-    """Refuse a scene of which the task cannot say what is right, before anything is
-    prepared.
+    """Check that the task can tell what is right in a scene, before a run is prepared.
 
-    Where no label is stated, the message has the model's first predictions of a clean
-    image; `image_settings` as for `calibrate_task`.
+    `image_settings` are as for `calibrate_task`.
+
+    Raises:
+        InputError: it cannot. Where no label is stated, the message has the model's
+            first predictions of a clean image.
     """
     try:
-        for each in facts.each.values() or (facts,):
-            task.check(each)
+        for facts_of_thing in facts.each.values() or (facts,):
+            task.check(facts_of_thing)
     except InputError as error:
         if facts.label is not None:
             raise
-        predictions = (
-            render(scene, model, task=task, spp=LOOK_SPP, **image_settings)
-            .views[0]
-            .predictions
+        rendering = render(scene, model, task=task, spp=LOOK_SPP, **image_settings)
+        predictions = rendering.views[0].predictions
+        prediction_texts = ", ".join(
+            seen_text(task.name, replace(prediction, label=repr(prediction.label)))
+            for prediction in predictions
         )
-        said = ", ".join(
-            seen_text(task.name, replace(each, label=repr(each.label)))
-            for each in predictions
-        )
-        term = f"#{predictions[0].index}"
-        # the label, where that names this class and no other
+        first = predictions[0]
+        term = f"#{first.index}"
+        # The label instead, if it names this class and no other.
         with suppress(InputError):
-            if model.label_set(predictions[0].label).indices == (predictions[0].index,):
-                term = predictions[0].label
+            if model.label_set(first.label).indices == (first.index,):
+                term = first.label
         raise InputError(
-            f"{error}; model {model.name} calls a clean picture of it {said}; name "
-            "what is right, such as "
+            f"{error}; model {model.name} calls a clean picture of it "
+            f"{prediction_texts}; name what is right, such as "
             f'`label="{term}"`'
         ) from None
 
@@ -330,250 +400,281 @@ def check_truth(
 def one_label_for_several(
     models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]
 ) -> list[str]:
-    """Return a sentence if a label that was given for all objects (None: each has its
-    own) is not what some of them are called, by the labels of their own.
+    """Return a warning if a label for all objects is another class than their own.
+
+    Args:
+        models: with names of classes.
+        label: stated for all objects; None if each has its own.
+        objects: label of each object, by name.
     """
     if label is None or len(objects) < 2:
         return []
-
-    def differ(own: str) -> bool:
-        """Whether a model has classes for both labels, and none in common."""
-        for model in models:
-            try:
-                known = set(model.label_set(own).indices)
-            except InputError:
-                continue
-            if not known & set(model.label_set(label).indices):
-                return True
-        return False
-
-    others = [
-        f"{name} (its own is {own!r})"
-        for name, own in objects.items()
-        if own and differ(own)
+    differing = [
+        f"{name} (its own is {object_label!r})"
+        for name, object_label in objects.items()
+        if object_label and _has_disjoint_classes(models, object_label, label)
     ]
-    if not others:
+    if not differing:
         return []
     return [
         f"The label {label!r} is taken as the right label for every object, also for "
-        f"{', '.join(others)}; "
+        f"{', '.join(differing)}; "
         "without a label, each object has its own."
     ]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# What a search maximises, over which domain, and what `printable` takes from it: how
-# rough colours are, and how far from ink (Sharif et al. 2016, *Accessorize to a Crime*,
-# sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and a product of distances to
-# all printable colours; these are means, and the distance to the nearest, which is zero
-# at the same colours.
+def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> bool:
+    """Return whether a model has classes for both labels, and none in common."""
+    for model in models:
+        try:
+            first_classes = set(model.label_set(first).indices)
+        except InputError:
+            continue
+        if not first_classes & set(model.label_set(second).indices):
+            return True
+    return False
+
+
+# ---- domain and objective
+# What a search maximises, over which domain, and the terms that `printable` subtracts:
+# the variation of colors, and their distance from printable ones (Sharif et al. 2016,
+# *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and a
+# product of distances to all printable colors; these are means, and the distance to the
+# nearest, which is zero at the same colors.
 
 
 def domain_of(
     controls: Sequence[Control], start: Tensor | None = None, **more: Any
 ) -> Domain:
-    """Return where a search over some controls may look: the budgets of all their
-    groups, in the order of u, from `start` (d,) or the controls' own, which leaves the
-    scene as it is; with `more` fields of `Domain`.
+    """Return the domain of a search over some controls: the budgets of their groups.
+
+    Args:
+        controls: in the order of u.
+        start: (d,); None for that of the controls, which leaves the scene unchanged.
+        **more: fields of `Domain`.
     """
-    blocks = tuple(
-        Block(
-            group.size, group.budget.norm, group.budget.epsilon,  # type: ignore[arg-type]
-            periodic=group.periodic, name=f"{control.name}.{group.parameter}", options=group.options,
-        )
-        for control in controls
-        for group in control.groups
-    )  # fmt: skip
+    blocks = []
+    for control in controls:
+        for group in control.groups:
+            block = Block(
+                group.size,
+                group.budget.norm,  # type: ignore[arg-type]
+                group.budget.epsilon,
+                periodic=group.periodic,
+                name=f"{control.name}.{group.parameter}",
+                options=group.options,
+            )
+            blocks.append(block)
     if start is None:
-        start = (
-            torch.cat([control.start for control in controls])
-            if controls
-            else torch.zeros(0)
-        )
-    return Domain(start, blocks, **more)
+        starts = [control.start for control in controls]
+        start = torch.cat(starts) if starts else torch.zeros(0)
+    return Domain(start, tuple(blocks), **more)
 
 
 class Named(Mapping[str, Tensor]):
-    """Tensors (N, ...) of N configurations by name; a message says `what` a name stands
-    for that is none.
+    """Tensors of N configurations by name, stacked to (N, ...) when one is read.
+
+    `what` is what a name stands for, in the message about an unknown one.
     """
 
     def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
-        self._what = what
-        self._each = each
+        self._kind = what
+        self._tensors_of_configuration = each
 
     def __getitem__(self, name: str) -> Tensor:
-        if name not in self:  # also of `get`
-            raise UnknownNameError(self._what, name, self._each[0])
-        return torch.stack([tensors[name] for tensors in self._each])
+        # `get` is caught too: an unknown name is an error, and not None.
+        if name not in self:
+            raise UnknownNameError(self._kind, name, self._tensors_of_configuration[0])
+        return torch.stack(
+            [tensors[name] for tensors in self._tensors_of_configuration]
+        )
 
     def __contains__(self, name: object) -> bool:
-        return name in self._each[0]
+        return name in self._tensors_of_configuration[0]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._each[0])
+        return iter(self._tensors_of_configuration[0])
 
     def __len__(self) -> int:
-        return len(self._each[0])
+        return len(self._tensors_of_configuration[0])
 
 
 class ConfigurationInputs:
-    """Gives what is asked for at N configurations (d,) of the whole space, which differ
-    in nothing that is searched; `used` says whether anything was. The searched controls
-    come first there.
+    """What an objective may read beside images, at N configurations.
+
+    Attributes:
+        used: whether the objective has read anything.
+
+    Args:
+        space: all controls; those that are searched come first.
+        searched: the controls that are searched.
+        wholes: N configurations (d,) of `space`, equal in what is searched.
     """
 
     def __init__(self, space: Space, searched: Space, wholes: Sequence[Tensor]) -> None:
         self._space = space
         self._searched = searched
-        self._wholes = wholes
+        self._configurations = wholes
         self.used = False
 
     def __call__(self, name: str) -> Any:
-        """Return what an objective asks for by name: "u", (N, d) of the searched
-        controls; "texture", (N, h, w, 3) display-referred sRGB in [0, 1], the searched
-        colours of the control that has some, or (N, h, w, 4) with 1 where they are
-        searched and 0 elsewhere; "textures", the same by control, where several have
-        some; "inputs", the scene inputs by name; "configuration", the numbers by
-        parameter.
+        """Return an input of the objective by its name.
+
+        - "u": (N, d) of the searched controls;
+        - "texture": (N, h, w, 3) display-referred sRGB in [0, 1], the searched colors
+          of the only control that has some, or (N, h, w, 4) with 1 where they are
+          searched and 0 elsewhere;
+        - "textures": the same by control, where several have some;
+        - "inputs": the scene inputs by name;
+        - "configuration": the values of parameters by name.
+
+        Raises:
+            InputError: "texture", and not exactly one control has searched colors.
         """
         self.used = True
         if name == "inputs":
-            return Named(
-                "input of the scene",
-                [self._space.inputs(whole) for whole in self._wholes],
-            )
+            inputs = [self._space.inputs(u) for u in self._configurations]
+            return Named("input of the scene", inputs)
         if name == "configuration":
-            return Named(
-                "number of the configuration",
-                [self._space.numbers(whole) for whole in self._wholes],
-            )
-        u = self._wholes[0][: len(self._searched.start)]
+            values = [self._space.numbers(u) for u in self._configurations]
+            return Named("number of the configuration", values)
+        n_configurations = len(self._configurations)
+        searched_u = self._configurations[0][: len(self._searched.start)]
         if name == "u":
-            return u.expand(len(self._wholes), *u.shape)
-        printed = self._searched.printed(u)
+            return searched_u.expand(n_configurations, *searched_u.shape)
+        textures = self._searched.printed(searched_u)
         if name == "textures":
             return Named(
-                "control whose colours are searched:", [printed] * len(self._wholes)
+                "control whose colours are searched:", [textures] * n_configurations
             )
-        if len(printed) != 1:
-            got = (
-                ", ".join(
-                    printed or (control.name for control in self._searched.controls)
-                )
-                or "nothing"
-            )
-            instead = (
-                "ask for `textures`, which has them by name"
-                if printed
-                else "add `texture` or `patch`"
-            )
-            raise InputError(
-                "objective: it asks for `texture`, so it needs one control whose "
-                f"colours are searched, got {got}; "
-                f"{instead}"
-            )
-        (colors,) = printed.values()
-        return colors.expand(len(self._wholes), *colors.shape)
+        if len(textures) != 1:
+            raise self._make_texture_error(textures)
+        (texture,) = textures.values()
+        return texture.expand(n_configurations, *texture.shape)
+
+    def _make_texture_error(self, textures: Mapping[str, Tensor]) -> InputError:
+        """Return the error of a "texture" where there are none or several."""
+        if textures:
+            got = ", ".join(textures)
+            instead = "ask for `textures`, which has them by name"
+        else:
+            got = ", ".join(control.name for control in self._searched.controls)
+            instead = "add `texture` or `patch`"
+        return InputError(
+            "objective: it asks for `texture`, so it needs one control whose "
+            f"colours are searched, got {got or 'nothing'}; {instead}"
+        )
 
 
 LOW = 0.1
 HIGH = 0.9
 STEP = 0.2
-"""The printable colours: all 125 of which each channel is 0.1, 0.3, 0.5, 0.7 or 0.9 in
-sRGB. No printer was measured: that ink on paper reaches neither the black, nor the
-white, nor the pure colours of a screen is all that they say.
+"""The printable colors: all 125 whose channels are 0.1, 0.3, 0.5, 0.7 or 0.9 in sRGB.
+
+No printer was measured: the colors only express that ink on paper reaches neither the
+black, nor the white, nor the pure colors of a screen.
 """
-# of either term, in the objective's unit (logits for a margin) per unit of sRGB
+# of each print term, in units of the objective (logits for a margin) per unit of sRGB
 WEIGHT = 10.0
 LEAST = 2.0**-40  # shortest step in sRGB that has a gradient
 
 
 def variation(colors: Tensor) -> Tensor:
-    """Return the mean length of the step from a pixel (h, w, 3) to its right and lower
-    neighbours, by channel; of a picture (h, w, 4) only between pixels that its last
-    channel has.
+    """Return the mean length of the step from a pixel to its right and lower neighbors.
+
+    Args:
+        colors: (h, w, 3) sRGB; or (h, w, 4), of which only steps between pixels with a
+            last channel over 0 count.
     """
-    colors, there = colors[..., :3], colors[..., 3:]
+    is_masked = colors.shape[-1] == 4
+    mask = colors[..., 3:]
+    colors = colors[..., :3]
     right = colors.diff(dim=1)
     down = colors.diff(dim=0)
-    if there.shape[-1]:
-        right = right * there[:, 1:]
-        down = down * there[1:]
-    squared = F.pad(right.square(), (0, 0, 0, 1)) + F.pad(
-        down.square(), (0, 0, 0, 0, 0, 1)
-    )
+    if is_masked:
+        right = right * mask[:, 1:]
+        down = down * mask[1:]
+    squared_right = F.pad(right.square(), (0, 0, 0, 1))
+    squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
+    squared = squared_right + squared_down
     length = squared.clamp(min=LEAST**2).sqrt() - LEAST
-    return length[there[..., 0] > 0.0].mean() if there.shape[-1] else length.mean()
+    if is_masked:
+        length = length[mask[..., 0] > 0.0]
+    return length.mean()
 
 
 def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
-    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest
-    printable colour, of a palette (P, 3) where one is given; of a picture (h, w, 4) of
-    those that its last channel has.
+    """Return the mean Euclidean distance of pixels from the nearest printable color.
+
+    Args:
+        colors: (h, w, 3) sRGB; or (h, w, 4), of which only pixels with a last channel
+            over 0 count.
+        palette: (P, 3) sRGB of printable colors; None for the grid of 125 colors.
     """
-    colors = (
-        colors if colors.shape[-1] == 3 else colors[colors[..., 3] > 0][:, None, :3]
-    )
+    if colors.shape[-1] != 3:
+        colors = colors[colors[..., 3] > 0][:, None, :3]
+    fixed_colors = colors.detach()
     if palette is None:
-        nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(
-            LOW, HIGH
-        )
+        nearest = (LOW + STEP * ((fixed_colors - LOW) / STEP).round()).clamp(LOW, HIGH)
     else:
         palette = palette.to(colors)
-        nearest = palette[
-            torch.cdist(colors.detach().reshape(-1, 3), palette).argmin(dim=1)
-        ].reshape(colors.shape)
+        palette_index = torch.cdist(fixed_colors.reshape(-1, 3), palette).argmin(dim=1)
+        nearest = palette[palette_index].reshape(colors.shape)
     distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
     return distance
 
 
-def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
-    printed = list(space.printed(u).values())
-    if not printed:
+def _compute_print_terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the variation and the printable distance of all searched colors.
+
+    Raises:
+        InputError: no control has searched colors.
+    """
+    textures = list(space.printed(u).values())
+    if not textures:
+        control_names = ", ".join(control.name for control in space.controls)
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, "
-            "got "
-            f"{', '.join(control.name for control in space.controls)}; add `texture` "
-            "or `patch`, or leave it out"
+            f"got {control_names}; add `texture` or `patch`, or leave it out"
         )
-    return torch.stack(list(map(variation, printed))).sum(), torch.stack(
-        list(map(off_print, printed))
-    ).sum()
+    variations = [variation(texture) for texture in textures]
+    distances = [off_print(texture) for texture in textures]
+    return torch.stack(variations).sum(), torch.stack(distances).sum()
 
 
 def print_terms(space: Space, u: Tensor) -> PrintTerms:
+    """Measure how printable the searched colors of a configuration (d,) are."""
     with torch.no_grad():
-        rough, off = _terms(space, u)
-    return PrintTerms(variation=float(rough), off_print=float(off))
+        total_variation, total_distance = _compute_print_terms(space, u)
+    return PrintTerms(variation=float(total_variation), off_print=float(total_distance))
 
 
 def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
-    """Return an evaluation of u whose objective is less by both weighted terms, and its
-    derivative by theirs.
+    """Return an evaluation of u (d,) minus both weighted print terms.
+
+    They are subtracted from its objective, and their derivative from its gradient.
     """
-    at = u.detach().clone().requires_grad_()
+    variable_u = u.detach().clone().requires_grad_()
     with torch.enable_grad():
-        penalty = WEIGHT * torch.stack(_terms(space, at)).sum()
-        (slope,) = torch.autograd.grad(penalty, at)
-    derivative = None if found.gradient is None else found.gradient - slope
-    return replace(
-        found, objective=found.objective - float(penalty.detach()), gradient=derivative
-    )
+        penalty = WEIGHT * torch.stack(_compute_print_terms(space, variable_u)).sum()
+        (penalty_gradient,) = torch.autograd.grad(penalty, variable_u)
+    gradient = None
+    if found.gradient is not None:
+        gradient = found.gradient - penalty_gradient
+    objective = found.objective - float(penalty.detach())
+    return replace(found, objective=objective, gradient=gradient)
 
 
 AnyObjective = str | Callable[..., Tensor]
 
 Way = Literal["mean", "worst"]
 
-# samples a pixel of the clean picture that an objective compares features with
+# samples per pixel of the clean image that an objective compares features with
 CLEAN_SPP = 64
 
 
 def task_for(task: Task, model: Model) -> Task:
-    """Return the task, or that of several models where the model is an ensemble of
-    them.
-    """
+    """Return the task of a model; for an ensemble, the joint task of its models."""
     if isinstance(task, Together) or not isinstance(model.module, Ensemble):
         return task
     return Together(parts=(task,) * len(model.module.models))
@@ -587,37 +688,52 @@ def objective_for(
     seed: int,
     ensemble: Way | None = None,
 ) -> tuple[Objective, str]:
-    """Return what is maximised, and what there is to say about it; one of features is
-    shown the clean picture first. The objectives of several models are put together as
-    `ensemble` says; without, their mean, or of several tasks, whose units differ, the
-    least.
+    """Return the function that a search maximises, and a remark about it or "".
+
+    Args:
+        wanted: name of an objective, or a function.
+        task: of the model.
+        model: whose output is maximised.
+        renderer: renders the clean image for an objective that compares features.
+        seed: of the noise of that image.
+        ensemble: how the objectives of several models become one. None for their mean;
+            of several tasks, whose units differ, for the smallest.
+
+    Raises:
+        InputError: an objective of features, and several models.
     """
     kind = OBJECTIVE_KINDS.get(wanted) if isinstance(wanted, str) else None
-    of_features = kind is not None and kind.needs_features
+    needs_features = kind is not None and kind.needs_features
     if isinstance(task, Together):
-        if of_features:
+        if needs_features:
             raise InputError(
                 f"objective: {wanted} compares the features of one model; "
                 "take another for `ensemble`"
             )
-        own = wanted == Together.objective
-        each = [
-            get_objective(part.objective if own else wanted, part)
+        uses_task_objectives = wanted == Together.objective
+        objectives = [
+            get_objective(part.objective if uses_task_objectives else wanted, part)
             for part in task.tasks
         ]
-        return of_ensemble(each, ensemble or ("worst" if own else "mean")), ""
-    if not of_features:
+        default_ensemble: Way = "worst" if uses_task_objectives else "mean"
+        return of_ensemble(objectives, ensemble or default_ensemble), ""
+    if not needs_features:
         return get_objective(wanted, task), ""
-    # otherwise they are what the model returns
+    # Without logits, the output of the model itself is compared.
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
-        clean = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
-    note = "" if features is None or features.penultimate else features.source
-    return get_objective(wanted, task, features=features or model, clean=clean), note
+        clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
+    remark = ""
+    if features is not None and not features.penultimate:
+        remark = features.source
+    objective = get_objective(
+        wanted, task, features=features or model, clean=clean_image
+    )
+    return objective, remark
 
 
 def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
-    """Return the objective of several models: the mean of theirs, or the least of them.
+    """Return the objective of several models: the mean of theirs, or the smallest.
 
     With "worst" the model that is hardest to mislead is the one that counts, so that
     the maximum is over 0 only where every model is misled. The mean may be large
@@ -631,10 +747,13 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
         more: More = nothing_more,
         /,
     ) -> Tensor:
-        each = zip(objectives, of_each(output), truth, strict=True)
-        values = torch.stack(
-            [value_of(own, images, right, more) for value_of, own, right in each]
-        )
-        return values.mean(dim=0) if way == "mean" else values.amin(dim=0)
+        values = [
+            objective_of_model(output_of_model, images, truth_of_model, more)
+            for objective_of_model, output_of_model, truth_of_model in zip(
+                objectives, of_each(output), truth, strict=True
+            )
+        ]
+        stacked = torch.stack(values)
+        return stacked.mean(dim=0) if way == "mean" else stacked.amin(dim=0)
 
     return objective

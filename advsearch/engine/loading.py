@@ -1,6 +1,4 @@
-"""A scene as a person uses it from Python: load it, and ask it for `render(u, seed,
-spp)`.
-"""
+"""Load a scene from Python, and make a renderer `render(u, seed, spp)` of it."""
 
 from __future__ import annotations
 
@@ -68,6 +66,11 @@ or its instance, and ``mitsuba:KEY`` a range.
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
+SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
+"""A mapping with one of these keys describes one value, and not the settings of a
+control.
+"""
+
 DEFAULT_RESOLUTION = 128
 
 
@@ -78,8 +81,7 @@ class Scene:
 
     Attributes:
         description: the scene as data.
-        only_here: whether it was made of something that no file and no command can
-            name.
+        only_here: whether it holds Python objects that no file and no command can name.
     """
 
     description: SceneDescription
@@ -87,9 +89,15 @@ class Scene:
 
     @names_code
     def renderer(
-        self, controls: Controls, *, resolution: int | tuple[int, int] = DEFAULT_RESOLUTION, denoise: str = "oidn",
-        seed: int = 0, estimators: Mapping[str, str] | None = None, sampler: str = SAMPLER,
-    ) -> Renderer:  # fmt: skip
+        self,
+        controls: Controls,
+        *,
+        resolution: int | tuple[int, int] = DEFAULT_RESOLUTION,
+        denoise: str = "oidn",
+        seed: int = 0,
+        estimators: Mapping[str, str] | None = None,
+        sampler: str = SAMPLER,
+    ) -> Renderer:
         """Return `render(u, seed, spp)` for the space of these controls.
 
         Args:
@@ -121,21 +129,26 @@ class Scene:
             )
 
     def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
-        """Return the scene under another environment that was asked for; None for no
-        map. Raises InputError where its ground shows a photograph, and there is none.
+        """Return the scene under another environment; None for no environment map.
+
+        The environment counts as chosen by the user.
+
+        Raises:
+            InputError: the ground of the scene shows the photograph of its environment,
+                and the new one has none.
         """
         name = NO_MAP if environment is None else environment.name
-        own = self.description
-        check_ground(own.given_values, name)
+        description = self.description
+        check_ground(description.given_values, name)
         if environment is not None:
-            check_one_environment(own.parts, f"`environment={name}`")
-        lit = replace(
-            own,
+            check_one_environment(description.parts, f"`environment={name}`")
+        relit = replace(
+            description,
             environment=environment,
             environment_spec=name,
-            given=own.given | {ENVIRONMENT},
+            given=description.given | {ENVIRONMENT},
         )
-        return Scene(with_lamps(on_its_ground(lit)), self.only_here)
+        return Scene(with_lamps(on_its_ground(relit)), self.only_here)
 
     def __getattr__(self, name: str) -> Any:
         if name == "render":
@@ -148,62 +161,44 @@ class Scene:
         raise AttributeError(f"'Scene' object has no attribute {name!r}")
 
     def __repr__(self) -> str:
-        described = self.description
+        description = self.description
         fixed = "".join(
             f", {name}={value!r}"
-            for name, value in sorted(described.given_values.items())
+            for name, value in sorted(description.given_values.items())
         )
-        return (
-            f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
-        )
+        names = f"{description.object_name!r}, {description.environment_name!r}"
+        return f"Scene({names}{fixed})"
 
     def with_texture(self, texture: Texture) -> Scene:
-        """Return the scene with another texture of the object; see `load_scene`. Raises
-        FileFormatError (the file is no picture), or InputError: it is no (h, w, 3)
-        picture in [0, 1].
+        """Return the scene with another texture of the object; see `load_scene`.
+
+        Raises:
+            FileFormatError: the file is no picture.
+            InputError: the array is no (h, w, 3) picture in [0, 1].
         """
         if isinstance(texture, (str, Path)):
             texels = read_picture(Path(texture), None)
         else:
-            array = np.asarray(
-                texture.detach().cpu() if isinstance(texture, Tensor) else texture
-            )
-            numbers: Floats = array.astype(np.float32) / (
-                255.0 if array.dtype == np.uint8 else 1.0
-            )
-            if numbers.ndim != 3 or numbers.shape[2] != 3 or not numbers.size:
-                raise InputError(
-                    "texture: expected a picture (h, w, 3), got an array "
-                    f"of shape {array.shape}"
-                )
-            if not (
-                np.isfinite(numbers).all()
-                and numbers.min() >= 0.0
-                and numbers.max() <= 1.0
-            ):
-                raise InputError(
-                    "texture: expected sRGB in [0, 1], or 8 bits as uint8, got "
-                    f"{array.dtype} from {array.min():g} to "
-                    f"{array.max():g}"
-                )
-            texels = np.ascontiguousarray(numbers)
-        painted = replace(self.description.object, base_color=texels)
-        return Scene(replace(self.description, object=painted), only_here=True)
+            texels = _array_to_texels(texture)
+        retextured = replace(self.description.object, base_color=texels)
+        return Scene(replace(self.description, object=retextured), only_here=True)
 
     def with_settings(self, given: Given) -> Scene:
-        """Return the scene with some of its parameters fixed to other values. Raises
-        InputError: a name is unknown or a value out of range.
+        """Return the scene with some of its parameters fixed to other values.
+
+        Raises:
+            InputError: a name is unknown or a value out of range.
         """
         resolved = settings.resolve(given)
-        own = self.description
-        check_meshes(own, given)
-        if own.camera_model is not None:
-            own.camera_model.check_given(given)
-        values = {**own.values, **{name: resolved[name] for name in given}}
+        description = self.description
+        check_meshes(description, given)
+        if description.camera_model is not None:
+            description.camera_model.check_given(given)
+        values = {**description.values, **{name: resolved[name] for name in given}}
         if "camera.elevation" in given:
             values["camera.height"] = None
         changed = on_its_ground(
-            replace(own, values=values, given=own.given | set(given))
+            replace(description, values=values, given=description.given | set(given))
         )
         return Scene(with_lamps(changed), self.only_here)
 
@@ -211,12 +206,22 @@ class Scene:
 @helped
 @plainly()
 def load_scene(
-    object: str | Path | ObjectAsset, environment: str | Path | EnvironmentAsset | None = None, *,
-    scene: str | Path | Mapping[str, object] | None = None, up: str | None = None, facing: str | None = None,
-    size: float | None = None, unit: str | None = None, settings: Given | None = None, camera: str | None = None,
+    object: str | Path | ObjectAsset,
+    environment: str | Path | EnvironmentAsset | None = None,
+    *,
+    scene: str | Path | Mapping[str, object] | None = None,
+    up: str | None = None,
+    facing: str | None = None,
+    size: float | None = None,
+    unit: str | None = None,
+    settings: Given | None = None,
+    camera: str | None = None,
     texture: Texture | None = None,
-    things: str | Mapping[str, object] | Sequence[str | Mapping[str, object]] | None = None,
-) -> Scene:  # fmt: skip
+    things: str
+    | Mapping[str, object]
+    | Sequence[str | Mapping[str, object]]
+    | None = None,
+) -> Scene:
     """Load a scene.
 
     Args:
@@ -228,10 +233,10 @@ def load_scene(
             `object` is a node or the id of a shape; a file may as well be written
             before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else
-            its shape says.
+            its shape states.
         facing: the axis of a mesh file that its front faces, "+x", "-x", "+y", "-y",
-            "+z" or "-z"; by default what its format says: +z of glTF and VRM 1, -z of
-            VRM 0, and +x of others. It is turned towards +x.
+            "+z" or "-z"; by default what its format states: +z of glTF and VRM 1, -z of
+            VRM 0, and +x of others. It is rotated towards +x.
         size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the
             camera, paths of files and the height of a photograph are in metres where
             the size of the object is known, and in object sizes elsewhere.
@@ -250,7 +255,7 @@ def load_scene(
         things: what stands beside the object, in metres from it, x forwards and y to
             its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
             such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
-            180}; `size` (metres), `name` and `label` may be said too.
+            180}; `size` (metres), `name` and `label` are optional.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -260,287 +265,416 @@ def load_scene(
         raise InputError(
             f"object: expected the name of a node or shape of the scene, got {object!r}"
         )
-    plugins = scene if isinstance(scene, Mapping) else None
-    described = describe(
-        object if scene is None or plugins is not None else f"{scene}#{object}", environment, up=up, facing=facing,
-        size=size, given=None if settings is None else as_python(settings), unit=unit, plugins=plugins,
+    mitsuba_dict = scene if isinstance(scene, Mapping) else None
+    object_spec = object
+    if scene is not None and mitsuba_dict is None:
+        object_spec = f"{scene}#{object}"
+    fixed_values = None if settings is None else as_python(settings)
+    description = describe(
+        object_spec,
+        environment,
+        up=up,
+        facing=facing,
+        size=size,
+        given=fixed_values,
+        unit=unit,
+        plugins=mitsuba_dict,
         things=things_as_text(things),
-    )  # fmt: skip
-    named = all(
-        given is None or isinstance(given, (str, Path))
-        for given in (object, environment)
     )
-    only_here = plugins is not None or not named
-    loaded = Scene(
-        described if camera is None else described.seen_by(camera), only_here
+    if camera is not None:
+        description = description.seen_by(camera)
+    has_asset = any(
+        asset is not None and not isinstance(asset, (str, Path))
+        for asset in (object, environment)
     )
+    loaded = Scene(description, only_here=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
 
 
-def scene_as_settings(scene: Scene) -> dict[str, Any]:
-    own = scene.description
-    model = own.camera_model
-    turned = own.camera == ORBIT_CAMERA
-    named = (
-        own.preset
-        or (model.name if model is not None else "")
-        or (None if turned else own.camera)
+def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Floats:
+    """Return a texture (h, w, 3) as contiguous float32 sRGB in [0, 1].
+
+    Values of dtype uint8 are divided by 255.
+
+    Raises:
+        InputError: another shape, or values outside [0, 1].
+    """
+    array = np.asarray(
+        texture.detach().cpu() if isinstance(texture, Tensor) else texture
     )
+    scale = 255.0 if array.dtype == np.uint8 else 1.0
+    texels: Floats = array.astype(np.float32) / scale
+    if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
+        raise InputError(
+            f"texture: expected a picture (h, w, 3), got an array of shape {array.shape}"
+        )
+    is_in_range = texels.min() >= 0.0 and texels.max() <= 1.0
+    if not np.isfinite(texels).all() or not is_in_range:
+        raise InputError(
+            "texture: expected sRGB in [0, 1], or 8 bits as uint8, got "
+            f"{array.dtype} from {array.min():g} to {array.max():g}"
+        )
+    return np.ascontiguousarray(texels)
+
+
+def scene_as_settings(scene: Scene) -> dict[str, Any]:
+    """Return the settings by which a configuration names a loaded scene.
+
+    The keys are those of `SceneConfig`; a scene with `only_here` has parts that these
+    settings cannot name.
+    """
+    description = scene.description
     return {
-        "object": own.object_name,
-        "environment": own.environment_name,
-        **{name: getattr(own, name) for name in ("up", "facing", "size", "unit")},
-        "camera": own.rig_spec if own.rig else named,
-        "things": own.things_spec or None,
-        "set": own.given_values,
+        "object": description.object_name,
+        "environment": description.environment_name,
+        "up": description.up,
+        "facing": description.facing,
+        "size": description.size,
+        "unit": description.unit,
+        "camera": _camera_setting(description),
+        "things": description.things_spec or None,
+        "set": description.given_values,
     }
+
+
+def _camera_setting(description: SceneDescription) -> str | None:
+    """Return the `camera` setting of a scene; None for the pinhole that orbits."""
+    if description.rig:
+        return description.rig_spec
+    if description.preset:
+        return description.preset
+    model = description.camera_model
+    if model is not None and model.name:
+        return model.name
+    return None if description.camera == ORBIT_CAMERA else description.camera
 
 
 def framed(
     description: SceneDescription, resolution: int | tuple[int, int]
 ) -> SceneDescription:
-    """Return the scene as it is seen in a picture of this size (side, or height and
-    width).
+    """Return the scene with its camera fitted to a picture size.
+
+    Args:
+        description: the scene.
+        resolution: side, or (height, width), in pixels.
+
+    Raises:
+        InputError: several cameras and drops on a lens.
     """
-    height, width = (
-        (resolution, resolution) if isinstance(resolution, int) else resolution
-    )
-    model = description.camera_model
+    height, width = _height_and_width(resolution)
+    aspect = width / height
+    camera_model = description.camera_model
     remarks = description.remarks
     if description.number("camera.drops") > 0.0:
         if description.rig:
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # drops are before a camera whose rays are worked out one by one
-        if model is None or not model.name:
-            model = pinhole(description.number("camera.fov"), width / height)
-    if model is not None:
-        model = bundled(width / height).get(model.name, model)
-        remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
+        # Drops need a camera whose rays are computed one by one.
+        if camera_model is None or not camera_model.name:
+            camera_model = pinhole(description.number("camera.fov"), aspect)
+    if camera_model is not None:
+        camera_model = bundled(aspect).get(camera_model.name, camera_model)
+        scaling_remarks = camera_model.scaling((height, width))
+        remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
     return replace(
-        description, aspect=width / height, camera_model=model, remarks=remarks
+        description, aspect=aspect, camera_model=camera_model, remarks=remarks
     )
 
 
+def _height_and_width(resolution: int | tuple[int, int]) -> tuple[int, int]:
+    """Return (height, width) in pixels of a resolution, which may be a single side."""
+    if isinstance(resolution, int):
+        return resolution, resolution
+    return resolution
+
+
 def make_renderer(
-    description: SceneDescription, space: Space, resolution: int | tuple[int, int], denoise: str, seed: int,
-    estimators: Mapping[str, str] | None = None, leave_out: Collection[str] = EVERYTHING, sampler: str = SAMPLER, *,
+    description: SceneDescription,
+    space: Space,
+    resolution: int | tuple[int, int],
+    denoise: str,
+    seed: int,
+    estimators: Mapping[str, str] | None = None,
+    leave_out: Collection[str] = EVERYTHING,
+    sampler: str = SAMPLER,
+    *,
     differentiated: bool = True,
-) -> Renderer:  # fmt: skip
-    """Put a described scene, with what the space's controls need in it, into Mitsuba at
-    one size.
+) -> Renderer:
+    """Load a described scene, with what the space's controls need, into Mitsuba.
 
     How fast coordinates move outlines is measured only where pictures are
     differentiated with respect to them: it takes a third of the time in which a scene
     is loaded and a few small pictures are rendered.
+
+    Raises:
+        InputError: the scene has no light, or its cameras differ in time and nothing
+            that they show does.
     """
-    size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    size = _height_and_width(resolution)
     description = space.scene or description
     if not description.lit:
         raise InputError(
             "environment: the scene has neither a map nor a lamp, so that every "
-            "picture is black; give it one of the "
-            "two, such as `controls=light`"
+            "picture is black; give it one of the two, such as `controls=light`"
         )
-    exposure = description.number("camera.exposure")
-    gain = description.gain
     formation = ImageFormation(
-        denoiser=denoise, sampler=sampler, exposure=exposure, resolution=size, gain=gain
+        denoiser=denoise,
+        sampler=sampler,
+        exposure=description.number("camera.exposure"),
+        resolution=size,
+        gain=description.gain,
     )
     scene = MitsubaScene(
         description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler
     )
-    exposed = any(space.exposure)
-    if any(mount.later for mount in description.rig):
-        moved = any(
-            now is not then
-            for now, then in zip(space.controls, space.later(1.0).controls, strict=True)
-        )
-        if exposed or not moved:
-            wrong = (
-                "have motion blur or a rolling shutter"
-                if exposed
-                else "show the same: nothing knows a time"
-            )
-            raise InputError(
-                f"camera: the pictures of {description.rig_spec} are taken one after "
-                "the other, and "
-                f"{'can not ' if exposed else ''}{wrong}; "
-                f"{'leave that out' if exposed else 'add a `path`'}"
-            )
-    motion = (
-        Motion(description, size, scene.assembly) if differentiated or exposed else None
-    )
-    moments = (
-        exposed_in(space, motion, scene.assembly, size[0])
-        if exposed and motion is not None
-        else ()
-    )
-    measured = motion if differentiated else None
+    has_exposure_time = any(space.exposure)
+    _check_rig_times(description, space)
+    motion = None
+    if differentiated or has_exposure_time:
+        motion = Motion(description, size, scene.assembly)
+    moments: tuple[Moment, ...] = ()
+    if has_exposure_time and motion is not None:
+        moments = exposed_in(space, motion, scene.assembly, size[0])
     return Renderer(
         scene,
         space,
         formation,
         seed,
-        motion=measured,
+        motion=motion if differentiated else None,
         estimators=estimators,
         moments=moments,
     )
 
 
+def _check_rig_times(description: SceneDescription, space: Space) -> None:
+    """Check that the pictures of a rig can be taken one after the other, if they are.
+
+    Raises:
+        InputError: nothing changes with time, or a picture has motion blur.
+    """
+    if not any(mount.later for mount in description.rig):
+        return
+    in_order = (
+        f"camera: the pictures of {description.rig_spec} are taken one after the other"
+    )
+    if any(space.exposure):
+        raise InputError(
+            f"{in_order}, and can not have motion blur or a rolling shutter; "
+            "leave that out"
+        )
+    controls_later = space.later(1.0).controls
+    changes_with_time = any(
+        control is not control_later
+        for control, control_later in zip(space.controls, controls_later, strict=True)
+    )
+    if not changes_with_time:
+        raise InputError(
+            f"{in_order}, and show the same: nothing knows a time; add a `path`"
+        )
+
+
 A_FLASH = 8  # moments of each flash of a light
-# configurations in which it is measured how far points move in the picture while it is
-# taken
-LOOKS = 64
+LOOKS = 64  # random configurations on which motion during an exposure is measured
 
 
 def exposed_in(
     space: Space, motion: Motion, assembly: Assembly, height: int
 ) -> tuple[Moment, ...]:
-    """Return the moments of an exposure, so many that no point goes far in the picture
-    between two of them, and that light which flashes is seen on and off.
+    """Return the moments of an exposure at which a picture is rendered.
+
+    There are enough of them that no point moves far in the picture between two moments,
+    and that a flashing light is seen on and off. `height` is in pixels.
     """
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
-    moving = replace(
-        space,
-        controls=tuple(control for control in space.controls if any(control.exposure)),
-    )
-    ends = [moving.later(side * duration / 2.0) for side in (-1.0, 1.0)]
-    draws = torch.rand(
-        LOOKS, len(moving.start), generator=torch.Generator().manual_seed(0)
-    )
-    travelled = 0.0
-    for u in draws:
-        (before, seen), (after, still) = (
-            motion.pixels(assembly(end.inputs(u))) for end in ends
-        )
-        moved = (after - before)[seen & still].norm(dim=1)
-        travelled = max(travelled, float(moved.max()) if len(moved) else 0.0)
-    flashes = max(control.flashes for control in space.controls) * duration
-    count = min(
-        max(FEWEST, math.ceil(A_PIXEL * travelled), math.ceil(A_FLASH * flashes)), MOST
-    )
-    offsets, rows, samples = moments_of(shutter, rolling, height, count)
+    max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
+    n_flashes = max(control.flashes for control in space.controls) * duration
+    n_for_motion = math.ceil(A_PIXEL * max_pixels_moved)
+    n_for_flashes = math.ceil(A_FLASH * n_flashes)
+    n_moments = min(max(FEWEST, n_for_motion, n_for_flashes), MOST)
+    offsets, rows, samples = moments_of(shutter, rolling, height, n_moments)
     return tuple(
-        Moment(space.later(float(at)), own, samples)
-        for at, own in zip(offsets, rows, strict=True)
+        Moment(space.later(float(offset)), rows_of_moment, samples)
+        for offset, rows_of_moment in zip(offsets, rows, strict=True)
     )
+
+
+def _measure_max_motion(
+    space: Space, motion: Motion, assembly: Assembly, duration: float
+) -> float:
+    """Return how many pixels a point moves at most in a duration in seconds.
+
+    It is measured on `LOOKS` random configurations of the controls that move, on points
+    that are visible before and after.
+    """
+    moving_controls = tuple(
+        control for control in space.controls if any(control.exposure)
+    )
+    moving_space = replace(space, controls=moving_controls)
+    space_at_begin = moving_space.later(-duration / 2.0)
+    space_at_end = moving_space.later(duration / 2.0)
+    configurations = torch.rand(
+        LOOKS, len(moving_space.start), generator=torch.Generator().manual_seed(0)
+    )
+    max_moved = 0.0
+    for u in configurations:
+        before, is_visible_before = motion.pixels(assembly(space_at_begin.inputs(u)))
+        after, is_visible_after = motion.pixels(assembly(space_at_end.inputs(u)))
+        is_visible = is_visible_before & is_visible_after
+        moved = (after - before)[is_visible].norm(dim=1)
+        if len(moved):
+            max_moved = max(max_moved, float(moved.max()))
+    return max_moved
 
 
 def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
-    """Return settings by name, as a file holds them, for controls in whatever form they
-    were given.
+    """Return settings by name, as a file holds them, for controls in any form.
 
-    Of a control that was given by its name it is what was said about it; of an
-    instance, all of it.
+    A control that is named has the settings that the caller stated; an instance has all
+    of its settings.
     """
-    asked = controls_by_name(controls)
+    control_by_name = controls_by_name(controls)
     if not isinstance(controls, Mapping):
-        as_controls(asked)
+        as_controls(control_by_name)
     return {
-        name: given.settings() if isinstance(given, Control) else dict(given)
-        for name, given in asked.items()
+        name: control.settings() if isinstance(control, Control) else dict(control)
+        for name, control in control_by_name.items()
     }
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
-    """Return control instances for whatever form they were given in, in the order in
-    which they were given.
+    """Return control instances for controls in any form, in the caller's order.
+
+    Raises:
+        InputError: a control is unknown, has wrong settings, or comes twice.
     """
-    asked = controls_by_name(controls)
-    ready = {name: given for name, given in asked.items() if isinstance(given, Control)}
-    named = gathered(
-        {
-            name: {} if isinstance(given, Control) else given
-            for name, given in asked.items()
-        }
-    )
-    for name in ready:
-        if named[name]:
+    control_by_name = controls_by_name(controls)
+    instances: dict[str, Control] = {}
+    named_settings: dict[str, Mapping[str, object]] = {}
+    for name, control in control_by_name.items():
+        if isinstance(control, Control):
+            instances[name] = control
+            named_settings[name] = {}
+        else:
+            named_settings[name] = control
+    settings_by_control = gathered(named_settings)
+    for name in instances:
+        if settings_by_control[name]:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "
-                "name; say all of it in one"
+                "name; state all of it in one"
             )
     return tuple(
-        ready.get(name) or make_control(name, given) for name, given in named.items()
+        instances.get(name) or make_control(name, control_settings)
+        for name, control_settings in settings_by_control.items()
     )
 
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
-    """Return instances and settings by name, in the order in which they were given."""
-    asked: dict[str, object] = {}
+    """Return instances and settings by name, in the caller's order.
+
+    Raises:
+        InputError: something else than names, settings and instances, or a name that
+            comes twice.
+    """
     if isinstance(controls, Mapping):
-        for name, given in controls.items():
-            if isinstance(given, type) or (
-                isinstance(given, Control) and given.name != name
-            ):
-                got = (
-                    f"one that is called {given.name}"
-                    if isinstance(given, Control)
-                    else told(given)
-                )
-                raise InputError(
-                    f"`controls` {name}: expected settings, or an instance of that "
-                    f"name, got {got}; instances stand in "
-                    "a list as well, controls=[...]"
-                )
-            if isinstance(given, Mapping) and not given.keys() & {
-                "distribution",
-                "choices",
-                "range",
-            }:
-                asked[name] = {key: as_setting(value) for key, value in given.items()}
-            else:
-                asked[name] = given if isinstance(given, Control) else as_setting(given)
+        control_by_name = _read_control_mapping(controls)
     else:
-        listed: Iterable[object] = (
-            controls if isinstance(controls, Iterable) else [controls]
-        )
-        for control in [controls] if isinstance(controls, (str, Control)) else listed:
-            if not isinstance(control, (str, Control)):
-                raise InputError(
-                    "controls: expected names or Control instances, got "
-                    f"{told(control)}"
-                )
-            named = (
-                read_controls([control], "controls")
-                if isinstance(control, str)
-                else {control.name: control}
+        control_by_name = _read_control_list(controls)
+    instances = {
+        name: control
+        for name, control in control_by_name.items()
+        if isinstance(control, Control)
+    }
+    all_settings = settings_by_name({**control_by_name, **dict.fromkeys(instances)})
+    return {
+        name: instances.get(name, control_settings)
+        for name, control_settings in all_settings.items()
+    }
+
+
+def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
+    """Return the controls of a mapping with Python distributions as settings.
+
+    Raises:
+        InputError: a class, or an instance under another name than its own.
+    """
+    control_by_name: dict[str, object] = {}
+    for name, control in controls.items():
+        is_misnamed = isinstance(control, Control) and control.name != name
+        if isinstance(control, type) or is_misnamed:
+            got = told(control)
+            if isinstance(control, Control):
+                got = f"one that is called {control.name}"
+            raise InputError(
+                f"`controls` {name}: expected settings, or an instance of that "
+                f"name, got {got}; instances stand in a list as well, controls=[...]"
             )
-            for name in named:
-                if name in asked:
-                    raise InputError(
-                        f"controls: every instance needs a name of its own, got {name} "
-                        "twice; write KIND:NAME, such as "
-                        "light:key,light:fill"
-                    )
-            asked |= named
-    ready = {name: given for name, given in asked.items() if isinstance(given, Control)}
-    settings = settings_by_name({**asked, **dict.fromkeys(ready)})
-    return {name: ready.get(name, given) for name, given in settings.items()}
+        if isinstance(control, Control):
+            control_by_name[name] = control
+        elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
+            control_by_name[name] = {
+                key: as_setting(value) for key, value in control.items()
+            }
+        else:
+            control_by_name[name] = as_setting(control)
+    return control_by_name
+
+
+def _read_control_list(
+    controls: str | Control | Sequence[str | Control],
+) -> dict[str, object]:
+    """Return one control or several, which are names or instances, by name.
+
+    Raises:
+        InputError: something else than names and instances, or a name that comes twice.
+    """
+    control_list: Iterable[object] = [controls]
+    if isinstance(controls, Iterable) and not isinstance(controls, (str, Control)):
+        control_list = controls
+    control_by_name: dict[str, object] = {}
+    for control in control_list:
+        if isinstance(control, str):
+            added: dict[str, Any] = dict(read_controls([control], "controls"))
+        elif isinstance(control, Control):
+            added = {control.name: control}
+        else:
+            raise InputError(
+                f"controls: expected names or Control instances, got {told(control)}"
+            )
+        for name in added:
+            if name in control_by_name:
+                raise InputError(
+                    "controls: every instance needs a name of its own, got "
+                    f"{name} twice; write KIND:NAME, such as light:key,light:fill"
+                )
+        control_by_name |= added
+    return control_by_name
 
 
 def instances_in(controls: object) -> list[Control]:
-    listed = controls.values() if isinstance(controls, Mapping) else controls
-    listed = listed if isinstance(listed, (list, tuple, ValuesView)) else [listed]
-    return [control for control in listed if isinstance(control, Control)]
+    """Return the control instances among controls in any form."""
+    items = controls.values() if isinstance(controls, Mapping) else controls
+    if not isinstance(items, (list, tuple, ValuesView)):
+        items = [items]
+    return [control for control in items if isinstance(control, Control)]
 
 
 def only_here(controls: Controls) -> list[str]:
-    """Return the classes of controls that have no name by which a file or another
-    process could ask for them, and the parameters that functions from Python draw.
+    """List the controls and parameters that exist in this Python session only.
+
+    These are classes of controls without a name by which a file or another process
+    could load them, and parameters whose values a Python function samples.
     """
-    classes = [
+    session_only = [
         type(control).__name__
         for control in instances_in(controls)
         if CONTROLS.get(control.kind) is not type(control)
     ]
-    drawn = [
-        f"{name if '.' in name else f'{name}.{parameter}'} (drawn by {value['name']})"
-        for name, given in settings_of(controls).items()
-        for parameter, value in given.items()
-        if isinstance(value, OwnQuantiles)
-    ]
-    return [*classes, *drawn]
+    for name, control_settings in settings_of(controls).items():
+        for parameter, value in control_settings.items():
+            if isinstance(value, OwnQuantiles):
+                full_name = name if "." in name else f"{name}.{parameter}"
+                session_only.append(f"{full_name} (drawn by {value['name']})")
+    return session_only

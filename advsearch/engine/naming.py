@@ -1,5 +1,7 @@
-"""From what a configuration names to things, and what it says for all of its controls;
-one question at a time.
+"""Load the scene, the models and the controls that a configuration names.
+
+Also here: the settings that a configuration states for all of its controls, and the
+lock that lets one experiment of the process run at a time.
 """
 
 from __future__ import annotations
@@ -44,8 +46,7 @@ SCENE = "scene"
 def scene_of(
     config: SceneConfig, name: str | None = None, environment: str | None = None
 ) -> Scene:
-    """Load the scene that a configuration describes: its only object in its
-    environment, or a named one.
+    """Load the scene of a configuration: its only object, or a named one.
 
     A scene that a Python caller passed is returned as it is.
     """
@@ -59,6 +60,7 @@ def scene_of(
 
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
+    """Return the keyword arguments of `load_scene` that a configuration states."""
     names = ("up", "facing", "size", "unit", "camera", "things")
     return {
         **{name: getattr(config, name) for name in names},
@@ -67,26 +69,26 @@ def told_of_scene(config: SceneConfig) -> dict[str, Any]:
 
 
 def scene_settings(config: SceneConfig) -> Given:
-    """Return the parameters that a scene is loaded with: those of `set`, and the
-    exposure.
+    """Return the parameters that a scene is loaded with: `set` and `exposure`.
+
+    Raises:
+        InputError: both state an exposure.
     """
-    given: dict[str, Any] = dict(config.set_)
+    parameters: dict[str, Any] = dict(config.set_)
     if config.exposure:
-        if "camera.exposure" in given:
+        if "camera.exposure" in parameters:
             raise InputError(
                 "`exposure` and `set` camera.exposure say the same thing; "
                 "leave one of them out"
             )
-        given["camera.exposure"] = config.exposure
-    return given
+        parameters["camera.exposure"] = config.exposure
+    return parameters
 
 
 def code_of(
     models: Iterable[str], kinds: Iterable[str], metrics: Iterable[str] = ()
 ) -> tuple[str, ...]:
-    """Return the Python code that is imported for what is named:
-    "package.module:attribute".
-    """
+    """List the Python code, "package.module:attribute", that these names import."""
     code = [*(named_code(name) for name in models), *metrics]
     code += [name for name in kinds if CONTROLS.names_class(name)]
     return tuple(dict.fromkeys(name for name in code if name))
@@ -95,41 +97,85 @@ def code_of(
 def load_models(
     models: Sequence[Any], task: Task, config: SceneConfig
 ) -> tuple[tuple[Model, ...], list[str]]:
-    """Load models; their warnings become sentences of the run. Several tasks are for
-    one model each, and these are put together as one. The configuration has the names
-    of their classes, the texts that these are put into, and the processor threads that
-    everything takes from here on.
+    """Load the models of a configuration.
+
+    From here on the process has the number of threads that the configuration states.
+
+    Args:
+        models: names, or models that a Python caller passed.
+        task: of the models. Several tasks (`Together`) are for one model each, and
+            these models are joined into one.
+        config: has their labels, prompt, range of values and camera.
+
+    Returns:
+        The models, and their warnings as sentences of the run.
+
+    Raises:
+        InputError: another number of models than tasks, a task that cannot judge a rig,
+            or a model that takes another number of images than there are cameras.
     """
     threads.configure(config.used_threads)
-    parts = task.parts if isinstance(task, Together) else (task,) * len(models)
-    asked = several(models) if isinstance(task, Together) else models
-    if len(asked) != len(parts):
+    if isinstance(task, Together):
+        tasks = task.parts
+        models = several(models)
+    else:
+        tasks = (task,) * len(models)
+    if len(models) != len(tasks):
         raise InputError(
-            f"model: expected {len(parts)}, one for each task, got {len(asked)}"
+            f"model: expected {len(tasks)}, one for each task, got {len(models)}"
         )
-
-    def load(model: Any, of: Task) -> Model:
-        """Of several tasks, those that take no label or have names of their own are
-        given none.
-        """
-        part = of.of_one_image
-        told = of is task or (part.labelled and not part.names_from)
-        labels, prompt = (config.labels, config.prompt) if told else (None, None)
-        if isinstance(model, str):
-            model = config.python_object(MODEL, model) or model
-        return load_model(
-            model,
-            labels=labels,
-            prompt=prompt,
-            value_range=config.value_range,
-            task=part,
-            ask=config.ask,
-        )
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(map(load, asked, parts))
-        sentences = list[str]()
+        loaded = tuple(
+            _load_for_task(
+                model, task_of_model, config, is_only_task=task_of_model is task
+            )
+            for model, task_of_model in zip(models, tasks, strict=True)
+        )
+    sentences = _take_model_warnings(caught)
+    if config.camera is not None:
+        n_cameras = len(read_rig(config.camera))
+        if n_cameras:
+            _check_task_of_rig(task, config.camera, n_cameras)
+            loaded = tuple(replace(model, cameras=n_cameras) for model in loaded)
+    for model in loaded:
+        _check_n_images(model)
+    if isinstance(task, Together):
+        return (together(loaded, config.resolution),), sentences
+    return loaded, sentences
+
+
+def _load_for_task(
+    model: Any, task: Task, config: SceneConfig, *, is_only_task: bool
+) -> Model:
+    """Load one model for its task.
+
+    One of several tasks gets the labels of the configuration only where it takes labels
+    and has no names of its own.
+    """
+    single_image_task = task.of_one_image
+    labels = None
+    prompt = None
+    if is_only_task or (
+        single_image_task.labelled and not single_image_task.names_from
+    ):
+        labels = config.labels
+        prompt = config.prompt
+    if isinstance(model, str):
+        model = config.python_object(MODEL, model) or model
+    return load_model(
+        model,
+        labels=labels,
+        prompt=prompt,
+        value_range=config.value_range,
+        task=single_image_task,
+        ask=config.ask,
+    )
+
+
+def _take_model_warnings(caught: Iterable[warnings.WarningMessage]) -> list[str]:
+    """Return the warnings of models as sentences, and issue all others again."""
+    sentences = []
     for warning in caught:
         if issubclass(warning.category, ModelWarning):
             sentences.append(str(warning.message))
@@ -137,71 +183,81 @@ def load_models(
             warnings.warn_explicit(
                 warning.message, warning.category, warning.filename, warning.lineno
             )
-    if rig := () if config.camera is None else read_rig(config.camera):
-        if not task.judges_rig:
-            raise InputError(
-                f"camera: {config.camera} has {len(rig)} cameras, and task {task.name} "
-                "is of one picture; say what is "
-                f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
-            )
-        loaded = tuple(replace(model, cameras=len(rig)) for model in loaded)
-    for model in loaded:
-        if (
-            isinstance(model.module, AllAtOnce)
-            and model.module.cameras != model.cameras
-        ):
-            raise InputError(
-                f"model: {model.name} takes {model.module.cameras} pictures at once, "
-                f"and {model.cameras} "
-                f"{'is' if model.cameras == 1 else 'are'} taken; give a `camera` that "
-                "is a rig of as many"
-            )
-    return (together(loaded, config.resolution),) if isinstance(
-        task, Together
-    ) else loaded, sentences
+    return sentences
+
+
+def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
+    """Raise InputError if a task cannot judge the pictures of several cameras."""
+    if not task.judges_rig:
+        raise InputError(
+            f"camera: {camera} has {n_cameras} cameras, and task {task.name} "
+            "is of one picture; say what is "
+            f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
+        )
+
+
+def _check_n_images(model: Model) -> None:
+    """Raise InputError if a model takes another number of images than are rendered."""
+    module = model.module
+    if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
+        verb = "is" if model.cameras == 1 else "are"
+        raise InputError(
+            f"model: {model.name} takes {module.cameras} pictures at once, "
+            f"and {model.cameras} {verb} taken; give a `camera` that "
+            "is a rig of as many"
+        )
 
 
 AnyModel = Model | nn.Module | str | Path
 
 
 def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
-    """Return one model or several in a list; names may stand in a text with commas
-    between them.
+    """Return one model or several as a list.
+
+    One string may have several names, with commas between them.
     """
-    listed: list[AnyModel] = (
-        list(models) if isinstance(models, (list, tuple)) else [models]
-    )  # type: ignore[list-item]
-    return [
-        name
-        for model in listed
-        for name in (split_names(model) if isinstance(model, str) else (model,))
-    ]
+    items: Sequence[AnyModel] = [models]  # type: ignore[list-item]
+    if isinstance(models, (list, tuple)):
+        items = models
+    model_list: list[AnyModel] = []
+    for model in items:
+        if isinstance(model, str):
+            model_list += split_names(model)
+        else:
+            model_list.append(model)
+    return model_list
 
 
 def model_name(model: AnyModel) -> str:
+    """Return the name by which a run knows a model, which may not be loaded yet."""
     if isinstance(model, (str, Path)):
         return str(model)
-    return str(
-        getattr(model, "asked", None)
-        or getattr(model, "name", None)
-        or type(model).__name__
-    )
+    if isinstance(model, Model) and model.asked:
+        return model.asked
+    return str(getattr(model, "name", None) or type(model).__name__)
 
 
 def exists_here(model: AnyModel) -> bool:
-    """Whether a model exists in this session only, so that no file and no command can
-    name it.
+    """Return whether a model exists in this session only.
+
+    Then no file and no command can name it.
     """
-    return not isinstance(model, (str, Path)) and getattr(model, "asked", None) is None
+    if isinstance(model, Model):
+        return model.asked is None
+    return not isinstance(model, (str, Path))
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:
-    """Return the names; an InputError says if there are none, or one comes twice."""
-    twice = [name for name in names if names.count(name) > 1]
-    if twice or not names:
+    """Return the names.
+
+    Raises:
+        InputError: there are none, or one comes twice.
+    """
+    duplicates = [name for name in names if names.count(name) > 1]
+    if duplicates or not names:
         raise InputError(
             f"{setting}: expected different names, got {','.join(names)!r}; leave "
-            f"{', '.join(twice[:1])} out"
+            f"{', '.join(duplicates[:1])} out"
         )
     return names
 
@@ -221,16 +277,17 @@ OF_SCENE = (
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:
-    """Refuse settings of a scene that is loaded already."""
-    clash = [name for name in OF_SCENE if settings.get(name) is not None]
-    if clash:
+    """Raise InputError for settings of a scene that is loaded already."""
+    rejected = [name for name in OF_SCENE if settings.get(name) is not None]
+    if rejected:
         raise InputError(
-            f"{', '.join(clash)}: belongs to the scene, and a loaded "
+            f"{', '.join(rejected)}: belongs to the scene, and a loaded "
             "scene was given; use load_scene"
         )
 
 
 def check_not_spread(settings: Mapping[str, object]) -> None:
+    """Raise InputError for settings of workers, where the run has loaded objects."""
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
@@ -241,129 +298,183 @@ def check_not_spread(settings: Mapping[str, object]) -> None:
 
 
 RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rolling")
-"""What a configuration says for all of its controls; each control declares what it
-takes of it (`Choice.run_setting`). A configuration without such a setting counts as one
-that does not say it.
+"""Settings that a configuration states for all of its controls.
+
+Each control declares which of them it takes (`Choice.run_setting`). A configuration
+without such a setting counts as one that does not state it.
 """
 
 
 def given_to(
     config: SceneConfig, controls: Controls, *, are_searched: bool = True
 ) -> tuple[Control, ...]:
-    """Return control instances, with what they take of the configuration where they say
-    nothing themselves.
+    """Return control instances with the run's settings where they state none.
 
     Controls that are not searched, but vary by chance, have no budget.
+
+    Raises:
+        InputError: a control that was passed as an instance would take a setting of the
+            run, or a control is unknown.
     """
     if not are_searched:
         config = config.model_copy(update={"epsilon": None})
-    asked = {
-        name: given
-        if isinstance(given, Control)
-        else config.python_object(CONTROL, name) or given
-        for name, given in controls_by_name(controls).items()
-    }
-    as_controls(asked)  # refuses what is none
-    ready: dict[str, Control | Mapping[str, object]] = {}
-    for name, given in asked.items():
-        ready[name] = given
-        if isinstance(given, Control):
-            for choice in _counting(type(given), given.settings()):
-                if getattr(config, choice.run_setting, None) is not None:
-                    raise InputError(
-                        f"{choice.run_setting}: control {given.name} was given as an "
-                        "instance; set it there, as in "
-                        f"{type(given).__name__}({choice.name}=...)"
-                    )
+    control_by_name: dict[str, Any] = {}
+    for name, control in controls_by_name(controls).items():
+        if not isinstance(control, Control):
+            control = config.python_object(CONTROL, name) or control
+        control_by_name[name] = control
+    # Unknown controls are rejected here, before settings are read.
+    as_controls(control_by_name)
+    completed: dict[str, Control | Mapping[str, object]] = {}
+    for name, control in control_by_name.items():
+        if isinstance(control, Control):
+            _check_takes_no_run_setting(config, control)
+            completed[name] = control
         else:
-            taken = {}
-            for choice in _choices(name, given) or ():
-                value = getattr(config, choice.run_setting, None)
-                value = (
-                    value.get(names_of(name, given)[1])
-                    if isinstance(value, Mapping)
-                    else value
-                )
-                # each run of a curve has its own epsilon
-                if value is not None and not isinstance(value, tuple):
-                    taken[choice.name] = value
-            ready[name] = {**taken, **given}
-    return as_controls(ready)
+            completed[name] = {**_run_settings_of(config, name, control), **control}
+    return as_controls(completed)
+
+
+def _check_takes_no_run_setting(config: SceneConfig, control: Control) -> None:
+    """Raise InputError if an instance would take a setting that the run states."""
+    for choice in _list_active_choices(type(control), control.settings()):
+        if getattr(config, choice.run_setting, None) is not None:
+            raise InputError(
+                f"{choice.run_setting}: control {control.name} was given as an "
+                "instance; set it there, as in "
+                f"{type(control).__name__}({choice.name}=...)"
+            )
+
+
+def _run_settings_of(
+    config: SceneConfig, qualified_name: str, control_settings: Mapping[str, object]
+) -> dict[str, object]:
+    """Return what a control takes of the run's settings, by its own names for them."""
+    run_settings: dict[str, object] = {}
+    for choice in _list_choices(qualified_name, control_settings) or ():
+        value = getattr(config, choice.run_setting, None)
+        if isinstance(value, Mapping):
+            _, instance_name = names_of(qualified_name, control_settings)
+            value = value.get(instance_name)
+        # A tuple is a curve of epsilons: each of its runs has a single one.
+        if value is not None and not isinstance(value, tuple):
+            run_settings[choice.name] = value
+    return run_settings
 
 
 def settings_alone(
     config: SceneConfig, asked: str, given: Mapping[str, object]
 ) -> dict[str, Any]:
-    """Return what a run over one of the controls says: None for what that does not
-    take.
+    """Return the run's settings for a run over a single one of its controls.
+
+    Args:
+        config: of the run over all controls.
+        asked: kind and name of the control, as the configuration has it.
+        given: settings of the control.
+
+    Returns:
+        A value for each of `RUN_SETTINGS`; None for those that the control does not
+        take.
     """
-    _, name = names_of(asked, given)
-    kept = {}
+    _, instance_name = names_of(asked, given)
+    run_settings = {}
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
         if isinstance(value, Mapping):
-            value = {name: value[name]} if name in value else None
-        kept[setting] = value if takes(asked, given, setting) else None
-    return kept
+            value = (
+                {instance_name: value[instance_name]}
+                if instance_name in value
+                else None
+            )
+        run_settings[setting] = value if takes(asked, given, setting) else None
+    return run_settings
 
 
 def check_run_settings(config: SceneConfig) -> None:
-    """Refuse a setting that none of the controls takes; those that vary by chance have
-    no epsilon.
+    """Check that every setting of a run is taken by one of its controls.
+
+    Controls that vary by chance have no epsilon.
+
+    Raises:
+        InputError: no control takes a setting, or the one that it names does not.
+        UnknownNameError: a setting names a control that is not there.
     """
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
         if value is None:
             continue
-        drawn = {} if setting == "epsilon" else getattr(config, "over", {})
-        asked = gathered({**config.controls, **drawn})
-        without = {
-            name: names_of(name, given)[0]
-            for name, given in asked.items()
-            if not takes(name, given, setting)
+        random_controls = {} if setting == "epsilon" else getattr(config, "over", {})
+        controls = gathered({**config.controls, **random_controls})
+        # kind of each control that does not take the setting
+        rejecting_kinds = {
+            name: names_of(name, control_settings)[0]
+            for name, control_settings in controls.items()
+            if not takes(name, control_settings, setting)
         }
         if isinstance(value, Mapping):
-            known = {names_of(name, given)[1]: name for name, given in asked.items()}
-            for name in value:
-                if name not in known:
-                    raise UnknownNameError(f"control in `{setting}`", name, known)
-                if known[name] in without:
-                    raise _not_taken(setting, name, without[known[name]])
-        elif without and (isinstance(value, tuple) or len(without) == len(asked)):
-            raise _not_taken(setting, *next(iter(without.items())))
+            _check_named_controls(setting, value, controls, rejecting_kinds)
+        elif rejecting_kinds:
+            # A curve of epsilons needs all controls, a single value any of them.
+            if isinstance(value, tuple) or len(rejecting_kinds) == len(controls):
+                name, kind = next(iter(rejecting_kinds.items()))
+                raise _make_not_taken_error(setting, name, kind)
+
+
+def _check_named_controls(
+    setting: str,
+    names: Iterable[str],
+    controls: Mapping[str, Mapping[str, object]],
+    rejecting_kinds: Mapping[str, str],
+) -> None:
+    """Check the controls that a setting names: they are there, and take it."""
+    qualified_names = {
+        names_of(qualified_name, control_settings)[1]: qualified_name
+        for qualified_name, control_settings in controls.items()
+    }
+    for name in names:
+        if name not in qualified_names:
+            raise UnknownNameError(f"control in `{setting}`", name, qualified_names)
+        kind = rejecting_kinds.get(qualified_names[name])
+        if kind is not None:
+            raise _make_not_taken_error(setting, name, kind)
 
 
 def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
-    """Whether a control takes one of the run's settings; one that is not known counts
-    as one that does.
+    """Return whether a control takes one of the run's settings.
+
+    A control that is not known counts as one that does.
     """
-    choices = _choices(asked, given)
+    choices = _list_choices(asked, given)
     return choices is None or setting in {choice.run_setting for choice in choices}
 
 
-def _choices(asked: str, given: Mapping[str, object]) -> list[Choice] | None:
-    """The choices of a control, as it is asked for, that count; None of one that is not
-    known.
-    """
-    ((name, settings),) = gathered({asked: given}).items()
+def _list_choices(
+    qualified_name: str, control_settings: Mapping[str, object]
+) -> list[Choice] | None:
+    """List the active choices of a control; None if its kind is not known."""
+    ((name, settings),) = gathered({qualified_name: control_settings}).items()
     kind, _ = names_of(name, settings)
-    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else None
+    if kind not in CONTROLS:
+        return None
+    return _list_active_choices(CONTROLS[kind], settings)
 
 
-def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
-    """The choices that count beside the settings that are given: what they are about is
-    searched.
+def _list_active_choices(
+    kind: type[Control], settings: Mapping[str, object]
+) -> list[Choice]:
+    """List the choices of a control that have an effect with these settings.
+
+    A choice that bounds a parameter has none where that parameter is not searched.
     """
     fixed = {
-        choice.fixes for choice in kind.choices if given.get(choice.name) is not None
+        choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
-    searched |= {name for name, value in given.items() if value is not None}
-    searched -= fixed | {
-        name for name, value in given.items() if Parameter.is_number(value)
-    }
+    searched |= {name for name, value in settings.items() if value is not None}
+    fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
+    searched -= fixed
     return [
         choice
         for choice in kind.choices
@@ -371,7 +482,8 @@ def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
     ]
 
 
-def _not_taken(setting: str, name: str, kind: str) -> InputError:
+def _make_not_taken_error(setting: str, name: str, kind: str) -> InputError:
+    """Return the error of a setting that a control does not take."""
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
         bounded = [
@@ -396,18 +508,19 @@ def _not_taken(setting: str, name: str, kind: str) -> InputError:
     )
 
 
-_TURN = threading.RLock()
-"""Held by the question at work: the threads of torch and Dr.Jit, and warnings that are
-caught, are the process's.
+_PROCESS_LOCK = threading.RLock()
+"""Held by the experiment that runs.
+
+The threads of torch and Dr.Jit, and warnings that are caught, belong to the process.
 """
 
 
 @contextmanager
 def in_turn() -> Iterator[None]:
-    """Do what a question does inside the block, after those of other threads.
+    """Run the block while no other thread of the process runs an experiment.
 
     Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`,
     `torch.inference_mode`). torch and Dr.Jit have their threads again after it.
     """
-    with _TURN, threads.given_back(), plainly():
+    with _PROCESS_LOCK, threads.given_back(), plainly():
         yield

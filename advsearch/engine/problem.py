@@ -1,12 +1,15 @@
-"""What a search works on: scene, space, model, task and objective, joined into the
-calls that `attacks` asks for.
+"""The problem of a search: scene, space, model, task and objective in one.
+
+A `Problem` evaluates the queries of `attacks`. u (d,) are the coordinates of the
+controls that are searched. A *full configuration* has those of the conditions behind
+them: of the controls that vary by chance.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -37,7 +40,7 @@ from advsearch.options import Value
 from advsearch.runs.results import GroupDerivative, PlannedGradient
 from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import NO_MAP
-from advsearch.scene.gradients import GradientPlan
+from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
@@ -46,8 +49,12 @@ from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class Prepared(NamedTuple):
-    """What is measured before a search; the longest light path is in segments, None for
-    the scene's.
+    """What is measured before a search, and sent to workers with its queries.
+
+    Attributes:
+        spp: samples per pixel.
+        search_depth: segments of the longest light path; None for that of the scene.
+        plan: how derivatives are computed.
     """
 
     spp: int
@@ -56,57 +63,73 @@ class Prepared(NamedTuple):
 
 
 LIGHT_DEPTH = 4
-"""Segments of the longest path of light that is collected under one of many conditions:
-many with some noise and without the last light teach more than few that are right.
+"""Segments of the longest light path that is collected under each of many conditions.
+
+Many conditions with some noise and without the last light teach more than few that are
+exact.
 """
 
 MOST_NUMBERS = 64
+"""Coordinates, beside base colors, of a configuration whose truth is cached, at most."""
+
 MOST = 512
-"""Numbers, beside base colours, of a configuration whose truth is remembered; and
-truths that are.
-"""
+"""Truths that are cached, at most."""
 
 
-def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
-    while len(kept) >= MOST:  # the oldest ones make room
-        del kept[next(iter(kept))]
-    kept[key] = value
+def _cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
+    """Add a value to a cache; the oldest ones make room."""
+    while len(cached) >= MOST:
+        del cached[next(iter(cached))]
+    cached[key] = value
 
 
+# why nothing is computed for the conditions; a plan has it as the reason of a group
 BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
 
 @dataclass
 class Problem:
-    """The joint of rendering, model and search."""
+    """Evaluates configurations of a scene by renderer, model, task and objective.
 
-    renderer: Renderer  # `render(u, seed, spp)` of the whole space
-    # the controls behind the whole of u: those that are searched, then those that vary
-    # by chance
+    Attributes:
+        renderer: `render(u, seed, spp)` of full configurations.
+        space: all controls: those that are searched, then those that vary by chance.
+        model: predicts what an image shows.
+        task: judges the model's output, and defines success.
+        facts: returns what the task judges by, from functions that describe and render
+            a configuration.
+        objective: the function that a search maximises; None of a sweep.
+        spp: samples per pixel of a search.
+        seed: root seed.
+        searched: how many of the controls are searched, None for all. The others are
+            the conditions: every image has new ones from their full range.
+        steps: renders of a search.
+        draws: conditions of one evaluation, if there are any; the objective is their
+            mean.
+        search_depth: segments of the longest light path in a search; None for that of
+            the scene.
+        aovs: ground truth that is stored of the clean and the adversarial scene
+            (`formation.AOVS`).
+        metrics: user functions whose values are stored with every image.
+        domain: the domain of the searched controls.
+        conditions: the domain of the conditions; None if there are none.
+    """
+
+    renderer: Renderer
     space: Space
     model: Model
-    task: Task  # judges the model's output; says what counts as success
-    # what it judges by, from what describes and what sees a configuration
+    task: Task
     facts: Callable[[Described, Looked], Facts]
-    objective: Objective | None  # what is maximised; None of a sweep
-    spp: int  # samples a pixel while searching
+    objective: Objective | None
+    spp: int
     seed: int
-    # how many of the controls are searched, None for all; the others are the
-    # conditions, which are drawn anew from their whole range for every picture
     searched: int | None = None
-    steps: int = 0  # renders of a search
-    # conditions that one evaluation looks at, where there are any; the objective is
-    # their mean
+    steps: int = 0
     draws: int = 1
-    # longest light path in segments of a search's renders; None for the scene's
     search_depth: int | None = None
-    # layers of ground truth that are kept of clean and adversarial scene
-    # (`formation.AOVS`)
     aovs: tuple[str, ...] = ()
-    # numbers of every picture beside what the task says
     metrics: Metrics = field(default_factory=dict)
-    domain: Domain = field(init=False)  # where a search may look: the searched controls
-    # where the others are drawn from; None where there are none
+    domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 
     def __post_init__(self) -> None:
@@ -116,62 +139,69 @@ class Problem:
 
     @property
     def plan(self) -> GradientPlan:
+        """How derivatives are computed."""
         return self.renderer.plan
 
     @plan.setter
     def plan(self, plan: GradientPlan) -> None:
-        """Take a plan: nothing is computed for the conditions, and the domain's cost
-        follows.
+        """Set the plan of the gradient, without derivatives by the conditions.
+
+        The cost of the domain is updated.
         """
-        count = len(self.space.controls) if self.searched is None else self.searched
-        searched = self.space.controls[:count]
-        by_chance = self.space.controls[count:]
-        names = {control.name for control in by_chance}
-        none = {group.name: "none" for group in plan.groups if group.control in names}
-        self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
+        controls = self.space.controls
+        n_searched = len(controls) if self.searched is None else self.searched
+        searched = controls[:n_searched]
+        conditions = controls[n_searched:]
+        condition_names = {control.name for control in conditions}
+        estimator_by_group = {
+            group.name: "none"
+            for group in plan.groups
+            if group.control in condition_names
+        }
+        self.renderer.plan = plan.with_estimator(estimator_by_group, BY_CHANCE)
         self.domain = domain_of(
             searched, gradient_cost=self.renderer.plan.renders, partial_gradients=True
         )
-        self.conditions = domain_of(by_chance) if by_chance else None
+        self.conditions = domain_of(conditions) if conditions else None
 
     @property
     def prepared(self) -> Prepared:
+        """What another process needs to evaluate the same problem."""
         return Prepared(self.spp, self.search_depth, self.plan)
 
     @cached_property
     def searched_space(self) -> Space:
-        """The controls that are searched, as a space of their own: it describes and
-        keeps what was found.
-        """
+        """The space of the searched controls alone."""
         return replace(self.space, controls=self.space.controls[: self.searched])
 
     @property
     def environment(self) -> str:
+        """The name of the environment under which the scene is rendered."""
+        if self.space.environment:
+            return self.space.environment
         scene = self.space.scene
-        return self.space.environment or (
-            NO_MAP if scene is None else scene.environment_name
-        )
+        return NO_MAP if scene is None else scene.environment_name
 
     @property
     def is_linear(self) -> bool:
-        """Whether matrices of light transport tell the images of what is searched
-        (`linearised`).
-        """
-        by_chance = self.space.controls[self.searched :]
-        return why_not(self.renderer, [control.name for control in by_chance]) is None
+        """Whether matrices of light transport predict the images of this problem."""
+        conditions = self.space.controls[self.searched :]
+        return why_not(self.renderer, [control.name for control in conditions]) is None
 
     @property
     def rule(self) -> Rule:
+        """The rule by which trials verify a success."""
         if self.task.minimise:
             return EASIER
         return WORST_CASE if self.conditions is None else OVER_CONDITIONS
 
     # ---- pictures
-    # ---------------------------------------------------------------------------------------------------
 
     def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
-        """Return the configuration of the whole space: u, and the conditions of one
-        draw, by its seed; without, those that leave the scene as it is.
+        """Return the full configuration: u (d,), and conditions behind it.
+
+        `draw` is the seed of the conditions; without, they are those that leave the
+        scene unchanged.
         """
         if self.conditions is None:
             return u
@@ -181,31 +211,31 @@ class Problem:
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
     def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
-        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1],
-        rounded to 8 bits. The seed is that of the noise and, if they are `drawn`, of
-        the conditions; otherwise the scene has those it comes with.
+        """Render a configuration as a file would hold it.
+
+        Args:
+            u: (d,) the configuration.
+            seed: of the noise and, if they are drawn, of the conditions.
+            spp: samples per pixel.
+            drawn: whether conditions are drawn; else they leave the scene unchanged.
+
+        Returns:
+            (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
         """
+        full_u = self.whole(u, seed if drawn else None)
         with torch.no_grad():
-            return to_8_bit(
-                self.renderer(
-                    self.whole(u, seed if drawn else None), seed=seed, spp=spp
-                )
-            )
+            return to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
     def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
-        """Return what task and objective say of the model's output for a picture (H, W,
-        3), of the whole space at `whole`.
-        """
+        """Judge an image (H, W, 3) of a full configuration, with its objective."""
         if self.objective is None:
             return self.judge_several(picture[None], [whole], [{}])[0]
         with torch.no_grad():
             output = self.model(picture)
             truth = self.truth(whole)
-            objective = float(
-                self.objective(output, picture[None], truth, self.asked(whole))[0]
-            )
-            (said,) = self._judged(output, picture[None], [truth], [whole])
-            return replace(said, objective=objective)
+            values = self.objective(output, picture[None], truth, self.asked(whole))
+            (judgement,) = self._judge_outputs(output, picture[None], [truth], [whole])
+            return replace(judgement, objective=float(values[0]))
 
     def judge_several(
         self,
@@ -213,45 +243,55 @@ class Problem:
         wholes: Sequence[Tensor],
         listed: Sequence[Mapping[str, Value]],
     ) -> list[Judgement]:
-        """Return what the task says of pictures (N, H, W, 3) that the model sees at
-        once, without an objective; values of each configuration as they were `listed`,
-        as for `truth`. A margin that is not finite becomes NaN.
+        """Judge images that the model sees in one batch, without an objective.
+
+        A margin that is not finite becomes NaN.
+
+        Args:
+            pictures: (N, H, W, 3).
+            wholes: N full configurations.
+            listed: N mappings of values that replace those of the configurations, as
+                for `truth`.
         """
         with torch.no_grad():
             output = self.model(pictures)
-            truths = (
-                [self.truth()]
-                if not self.task.varies
-                else list(map(self.truth, wholes, listed))
+            if self.task.varies:
+                truths = [
+                    self.truth(full_u, values)
+                    for full_u, values in zip(wholes, listed, strict=False)
+                ]
+            else:
+                truths = [self.truth()]
+            judged = self._judge_outputs(output, pictures, truths, wholes)
+        judgements_without_objective = []
+        for judgement in judged:
+            plain = Judgement.of(
+                judgement.score,
+                judgement.margin,
+                judgement.prediction,
+                judgement.payload,
             )
-            judged = self._judged(output, pictures, truths, wholes)
-        plain = [
-            Judgement.of(each.score, each.margin, each.prediction, each.payload)
-            for each in judged
-        ]
-        return [
-            replace(judgement, metrics=each.metrics)
-            for judgement, each in zip(plain, judged, strict=True)
-        ]
+            judgements_without_objective.append(
+                replace(plain, metrics=judgement.metrics)
+            )
+        return judgements_without_objective
 
-    def _judged(
+    def _judge_outputs(
         self,
         output: Output,
         pictures: Tensor,
         truths: Sequence[Truth],
-        wholes: Sequence[Tensor],
+        full_configurations: Sequence[Tensor],
     ) -> list[Judgement]:
-        """What task and metrics say of pictures (N, H, W, 3), and what these show of
-        each thing.
-        """
+        """Judge images (N, H, W, 3) by task and metrics, with what each thing shows."""
         judged = list(judgements(self.task, output, pictures, truths, self.metrics))
         if self.space.scene is None or not self.space.scene.things:
             return judged
-        for number, whole in enumerate(wholes):
-            key = whole.detach()[self._rest].numpy().tobytes()
+        for index, full_u in enumerate(full_configurations):
+            key = full_u.detach()[self._is_geometric].numpy().tobytes()
             if key not in self._things:
-                _keep(self._things, key, things_seen(self.renderer, whole))
-            judged[number] = with_things(judged[number], self._things[key])
+                _cache(self._things, key, things_seen(self.renderer, full_u))
+            judged[index] = with_things(judged[index], self._things[key])
         return judged
 
     def view(
@@ -263,75 +303,72 @@ class Problem:
         *,
         drawn: Tensor | None = None,
     ) -> ComparedView:
-        """Compare a picture (H, W, 3) that is predicted of the whole space at `whole`
-        with traced ones; `spp` are the samples a pixel of a rendered one. Of what is
-        searched, the search has not moved what is `drawn`, (d,) bool.
+        """Compare a predicted image with traced images of the same configuration.
+
+        Args:
+            predict: from a full configuration to an image (H, W, 3).
+            whole: the full configuration.
+            seed: of the noise of the traced images.
+            spp: samples per pixel of a rendered image.
+            drawn: (d,) bool, the searched coordinates that are random here: the search
+                has not moved them.
         """
+        dim = self.domain.dim
         with torch.no_grad():
             predicted = predict(whole)
-            start = torch.cat([self.domain.start, whole[self.domain.dim :]])
+            start = torch.cat([self.domain.start, whole[dim:]])
             if drawn is not None:
-                start[: self.domain.dim][drawn] = whole[: self.domain.dim][drawn]
-            before = None if torch.equal(start, whole) else predict(start)
+                start[:dim][drawn] = whole[:dim][drawn]
+            predicted_start = None if torch.equal(start, whole) else predict(start)
+
+        def measure_margin(image: Tensor, u: Tensor) -> float:
+            return self.judge(image, u).margin
+
         return view_of(
-            self.renderer,
-            predicted,
-            whole,
-            seed,
-            spp,
-            lambda *at: self.judge(*at).margin,
-            before,
+            self.renderer, predicted, whole, seed, spp, measure_margin, predicted_start
         )
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
-        """Return what shows the model's prediction of a picture (H, W, 3) of the whole
-        space at `whole`.
-        """
+        """Return the marks of the model's prediction on an image (H, W, 3)."""
         return self.seen(picture, whole)[1]
 
     def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
-        """Return whether the model's prediction of a picture (H, W, 3) at `whole` is
-        right, and what shows it.
-        """
+        """Return whether the model is right on an image (H, W, 3), and its marks."""
         with torch.no_grad():
             output = self.model(picture)
             truth = self.truth(whole)
-            return self.task.judge(output, truth)[0].right, self.task.marks(
-                output, truth
-            )[0]
+            is_right = self.task.judge(output, truth)[0].right
+            return is_right, self.task.marks(output, truth)[0]
 
     def truth(
         self, whole: Tensor | None = None, listed: Mapping[str, Value] | None = None
     ) -> Truth:
-        """Return what is true of the scene at a configuration of the whole space; None
-        for the start. Values that are `listed` count as they are there, not as what
-        single precision makes of them.
+        """Return what is true of the scene at a full configuration; None for the start.
+
+        Values that are `listed` replace those of the configuration, which has single
+        precision only.
         """
         if whole is None or not self.task.varies:
             return self._start_truth
-        # what the camera sees first has nothing to do with base colours, so that a
-        # truth is remembered where the rest is a few numbers, unless the task asks for
-        # numbers
-        rest = whole.detach()[self._rest]
-        key = rest.numpy().tobytes()
+        # What the camera sees first does not depend on base colors. So a truth is cached
+        # if few other coordinates exist, unless the task reads numbers.
+        geometric_u = whole.detach()[self._is_geometric]
+        key = geometric_u.numpy().tobytes()
         if not listed and key in self._truths:
             return self._truths[key]
 
-        def values() -> dict[str, Value]:
-            return {
-                name: (listed or {}).get(name, value)
-                for name, value in self.space.describe(whole).items()
-            }
+        def describe() -> dict[str, Value]:
+            values = self.space.describe(whole)
+            return {name: (listed or {}).get(name, values[name]) for name in values}
 
-        rig = () if self.space.scene is None else self.space.scene.rig
-        facts, *views = [
-            self.facts(values, look)
-            for look in looks_at(self.renderer, whole, len(rig))
-        ]
-        facts = replace(facts, views=tuple(views))
+        n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
+        looks = looks_at(self.renderer, whole, n_rig_cameras)
+        facts, *camera_facts = [self.facts(describe, look) for look in looks]
+        facts = replace(facts, views=tuple(camera_facts))
         truth = self.task.truth(facts)
-        if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
-            _keep(self._truths, key, truth)
+        is_cacheable = not listed and len(geometric_u) <= MOST_NUMBERS
+        if is_cacheable and "numbers" not in vars(facts):
+            _cache(self._truths, key, truth)
         return truth
 
     @cached_property
@@ -347,65 +384,61 @@ class Problem:
         )
 
     @cached_property
-    def _rest(self) -> Tensor:
-        """Which coordinates do more than to colour surfaces, (d,) bool."""
-        linear = linear_inputs(self.renderer)
-        rest = torch.ones(len(self.space.start), dtype=torch.bool)
+    def _is_geometric(self) -> Tensor:
+        """Which coordinates do more than to color surfaces, (d,) bool."""
+        color_inputs = linear_inputs(self.renderer)
+        is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
             route = self.renderer.routes.get(group.name)
-            rest[group.coordinates] = not route or not route <= linear
-        return rest
+            is_geometric[group.coordinates] = not route or not route <= color_inputs
+        return is_geometric
 
     def asked(self, *wholes: Tensor) -> ConfigurationInputs:
-        """Return what gives the objective more than pictures, at configurations of the
-        whole space.
-        """
+        """Return the inputs that an objective may read at full configurations."""
         return ConfigurationInputs(self.space, self.searched_space, wholes)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
-        """Say a configuration of the searched controls in named values with units,
-        under the conditions of a draw, by its seed; without, those that the scene comes
-        with.
+        """Describe the searched controls of a configuration in values with units.
+
+        `draw` is the seed of the conditions; without, they leave the scene unchanged.
         """
         return self.space.describe(
             self.whole(u, draw), self.space.controls[: self.searched]
         )
 
     def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
-        """Return what a result holds of a plan: what is stored of it, and each step in
-        its parameter's unit.
-        """
+        """Return what a result stores of a plan, each step in its parameter's unit."""
         groups = []
         for group, row in zip(plan.groups, plan.to_dict()["groups"], strict=True):
-            u = self.whole(self.domain.start).clone()
-            half = min(group.step, 0.5)
-            ends = list[Value | None]()
-            for side in (
-                (0.5 - half, 0.5 + half)
-                if group.step_reason and group.size == 1
-                else ()
-            ):
-                u[group.coordinates] = side  # in the middle of its range
-                ends.append(self.space.describe(u).get(group.name))
-            low, high = ends or (None, None)
-            step = None
-            unit = ""
-            if (
-                low is not None
-                and high is not None
-                and isinstance(low["value"], (int, float))
-            ):
-                step = abs(float(high["value"]) - float(low["value"])) / 2.0
-                unit = low["unit"]
+            step, unit = self._step_in_unit(group)
             groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))
         return PlannedGradient(
             renders_per_gradient=plan.renders, spp=plan.spp, groups=groups
         )
 
-    def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
-        """Say the conditions of a draw in named values with units; empty where there
-        are none.
+    def _step_in_unit(self, group: Group) -> tuple[float | None, str]:
+        """Return the step of a single coordinate in its parameter's unit, and the unit.
+
+        It is measured in the middle of the range. (None, "") for a group of several
+        coordinates, without a step, or whose value is no number.
         """
+        if not group.step_reason or group.size != 1:
+            return None, ""
+        u = self.whole(self.domain.start).clone()
+        half_step = min(group.step, 0.5)
+        u[group.coordinates] = 0.5 - half_step
+        lower = self.space.describe(u).get(group.name)
+        u[group.coordinates] = 0.5 + half_step
+        upper = self.space.describe(u).get(group.name)
+        if lower is None or upper is None:
+            return None, ""
+        if not isinstance(lower["value"], (int, float)):
+            return None, ""
+        difference = float(upper["value"]) - float(lower["value"])
+        return abs(difference) / 2.0, lower["unit"]
+
+    def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
+        """Describe the conditions of a draw in values with units; {} without conditions."""
         if self.conditions is None:
             return {}
         return self.space.describe(
@@ -413,13 +446,13 @@ class Problem:
         )
 
     # ---- evaluations
-    # ------------------------------------------------------------------------------------------------
 
     def evaluate_all(
         self, queries: Sequence[Query], prepared: Prepared | None = None
     ) -> Iterator[Evaluation]:
-        """Answer queries, each when it is asked for, as another process has prepared
-        the same problem.
+        """Evaluate queries lazily, in their order.
+
+        `prepared` is what another process has prepared the same problem with.
         """
         if prepared is not None:
             self.spp = prepared.spp
@@ -429,128 +462,160 @@ class Problem:
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
-        """Answer one query: the only place where a run renders, asks and judges."""
-        u = query.u
-        seed = query.seed
-        before = self.renderer.non_finite
+        """Evaluate one query: a run renders, predicts and judges here only."""
+        non_finite_before = self.renderer.non_finite
         if query.wanted == "light":
-            evaluation = Evaluation(
-                math.nan,
-                None,
-                False,
-                light=self.linearised(u, seed, query.spp).collected,
-            )
+            linear = self.linearised(query.u, query.seed, query.spp)
+            evaluation = Evaluation(math.nan, None, False, light=linear.collected)
         elif query.wanted == "picture":
-            evaluation = Evaluation(
-                math.nan, None, False, picture=self.picture(u, seed, query.spp)
-            )
+            image = self.picture(query.u, query.seed, query.spp)
+            evaluation = Evaluation(math.nan, None, False, picture=image)
         elif query.phase is None:
-            picture = self.picture(u, seed, query.spp, drawn=query.drawn)
-            whole = self.whole(u, seed if query.drawn else None)
-            evaluation = Evaluation.of(
-                self.judge(picture, whole), picture=picture if query.keep else None
-            )
+            evaluation = self._evaluate_trial(query)
         elif self.conditions is None:
-            evaluation = self.evaluated(query, u, seed)[0]
+            evaluation, _ = self.evaluated(query, query.u, query.seed)
         else:
-            draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]
-            alone = replace(query, keep=False)
-            evaluation = self.mean(
-                [self.evaluated(alone, self.whole(u, draw), draw) for draw in draws], u
-            )
-            if query.keep:
-                evaluation = replace(
-                    evaluation, picture=self.picture(u, seed, self.spp, drawn=False)
-                )
-        lost = self.renderer.non_finite - before
-        return replace(evaluation, non_finite=lost) if lost else evaluation
+            evaluation = self._evaluate_over_conditions(query)
+        n_non_finite = self.renderer.non_finite - non_finite_before
+        if n_non_finite:
+            return replace(evaluation, non_finite=n_non_finite)
+        return evaluation
 
-    def _values(
+    def _evaluate_trial(self, query: Query) -> Evaluation:
+        """Evaluate a trial: judge the image as a file would hold it."""
+        image = self.picture(query.u, query.seed, query.spp, drawn=query.drawn)
+        full_u = self.whole(query.u, query.seed if query.drawn else None)
+        judgement = self.judge(image, full_u)
+        return Evaluation.of(judgement, picture=image if query.keep else None)
+
+    def _evaluate_over_conditions(self, query: Query) -> Evaluation:
+        """Evaluate a query of a search: the mean over conditions that are drawn."""
+        condition_seeds = [
+            seeds.stream(query.seed, "draw", index) for index in range(self.draws)
+        ]
+        query_without_image = replace(query, keep=False)
+        evaluated = [
+            self.evaluated(query_without_image, self.whole(query.u, seed), seed)
+            for seed in condition_seeds
+        ]
+        evaluation = self.mean(evaluated, query.u)
+        if not query.keep:
+            return evaluation
+        image = self.picture(query.u, query.seed, self.spp, drawn=False)
+        return replace(evaluation, picture=image)
+
+    def _compute_objective(
         self,
         outputs: Output,
         pictures: Tensor,
         truth: Truth,
-        asked: ConfigurationInputs,
+        inputs: ConfigurationInputs,
     ) -> Tensor:
+        """Return the objective (N,) of images (N, H, W, 3), with a graph."""
         if self.objective is None:
             raise RuntimeError("a sweep has no objective")
-        return self.objective(outputs, pictures, truth, asked)
+        return self.objective(outputs, pictures, truth, inputs)
 
     def linearised(
         self, whole: Tensor, seed: int, spp: int, collected: Linearised | None = None
     ) -> LinearRenderer:
-        """Return what predicts pictures near a configuration of the whole space, from
-        light that was collected there or is collected now.
+        """Return a renderer that predicts images near a full configuration.
+
+        Args:
+            whole: the full configuration.
+            seed: of the noise.
+            spp: samples per pixel.
+            collected: light that was collected there; None to collect it now.
         """
-        own = {control.name for control in self.searched_space.controls}
-        groups = [group.name for group in self.plan.groups if group.control in own]
-        names = frozenset().union(
-            *(self.renderer.routes.get(name, frozenset()) for name in groups)
-        )
-        names &= linear_inputs(self.renderer)
-        with self.renderer.scene.shorter(
-            min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
-        ):
+        searched_names = {control.name for control in self.searched_space.controls}
+        searched_groups = [
+            group.name for group in self.plan.groups if group.control in searched_names
+        ]
+        routes = [
+            self.renderer.routes.get(name, frozenset()) for name in searched_groups
+        ]
+        input_names = frozenset().union(*routes) & linear_inputs(self.renderer)
+        depth = min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
+        with self.renderer.scene.shorter(depth):
             return LinearRenderer(
                 self.renderer,
                 whole,
                 seed,
                 spp=spp,
                 quick=True,
-                names=names,
+                names=input_names,
                 collected=collected,
             )
 
     def evaluated(
         self, query: Query, whole: Tensor, seed: int, renderer: Renderer | None = None
     ) -> tuple[Evaluation, Output]:
-        """Answer a query of a search by one picture of the whole space, by the
-        problem's renderer or by another one; and return the model's output.
+        """Evaluate a query of a search by one image of a full configuration.
+
+        Args:
+            query: of a search.
+            whole: the full configuration.
+            seed: of the noise.
+            renderer: another one than that of the problem, such as a predictor.
+
+        Returns:
+            The evaluation and the model's output.
         """
         renderer = self.renderer if renderer is None else renderer
-        before = renderer.non_finite
-        renders = renderer.renders
+        non_finite_before = renderer.non_finite
+        renders_before = renderer.renders
         truth = self.truth(whole)
-        gradient = query.gradient
-        samples = query.samples
-        seen: list[tuple[Tensor, Output]] = []
-        at = whole.detach().clone().requires_grad_(bool(gradient))
-        asked = self.asked(at)
-        slope = torch.zeros(())
+        variable_u = whole.detach().clone().requires_grad_(bool(query.gradient))
+        inputs = self.asked(variable_u)
+        # image and output of each call of the loss; the first is that of u itself
+        calls: list[tuple[Tensor, Output]] = []
+        input_gradient = torch.zeros(())
 
         def loss(image: Tensor) -> Tensor:
-            nonlocal slope
+            nonlocal input_gradient
             output = self.model(image)
-            seen.append((image.detach(), output))
-            value = self._values(output, image[None], truth, asked)[0]
-            # exact, whatever the plan does with the picture
-            if asked.used and len(seen) == 1 and value.requires_grad:
-                (by_input,) = torch.autograd.grad(
-                    value, at, retain_graph=True, allow_unused=True
+            calls.append((image.detach(), output))
+            values = self._compute_objective(output, image[None], truth, inputs)
+            objective = values[0]
+            # The derivative by inputs is exact, whatever the plan does with the image.
+            if inputs.used and len(calls) == 1 and objective.requires_grad:
+                (gradient_or_none,) = torch.autograd.grad(
+                    objective, variable_u, retain_graph=True, allow_unused=True
                 )
-                slope = slope if by_input is None else by_input
-            return value
+                if gradient_or_none is not None:
+                    input_gradient = gradient_or_none
+            return objective
 
-        spp = self.spp * samples
-        depth = self.search_depth
-        derivative = None
-        with nullcontext() if depth is None else renderer.scene.shorter(depth):
-            if gradient:
-                value, derivative = renderer.gradient(
-                    loss, whole, seed, spp, free=gradient == "free"
+        spp = self.spp * query.samples
+        gradient = None
+        with self._limit_search_depth(renderer):
+            if query.gradient:
+                value, gradient = renderer.gradient(
+                    loss, whole, seed, spp, free=query.gradient == "free"
                 )
-                derivative = derivative + slope if asked.used else derivative
+                if inputs.used:
+                    gradient = gradient + input_gradient
             else:
                 with torch.no_grad():
                     value = loss(renderer(whole, seed=seed, spp=spp))
-        image, output = seen[0]
-        (judgement,) = self._judged(output, image[None], [truth], [whole])
+        image, output = calls[0]
+        (judgement,) = self._judge_outputs(output, image[None], [truth], [whole])
         evaluation = Evaluation(
-            float(value), derivative, judgement.success, renderer.non_finite - before,
-            cost=max(1, renderer.renders - renders) * samples, judgement=judgement,
+            float(value),
+            gradient,
+            judgement.success,
+            renderer.non_finite - non_finite_before,
+            cost=max(1, renderer.renders - renders_before) * query.samples,
+            judgement=judgement,
             picture=to_8_bit(image) if query.keep else None,
-        )  # fmt: skip
+        )
         return evaluation, output
+
+    def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
+        """Shorten the light paths of a renderer to those of a search in a block."""
+        if self.search_depth is None:
+            return nullcontext()
+        return renderer.scene.shorter(self.search_depth)
 
     def judged(
         self,
@@ -559,66 +624,90 @@ class Problem:
         u: Tensor,
         gradient: WhichGradient,
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
-        """Ask the model about several pictures at once: those that `render` makes of u,
-        (N, H, W, 3) with a graph, each of a configuration of the whole space. Returns
-        an evaluation without derivative and the model's output for each, and the
-        derivative (d,) of the sum of their objectives, weighted by `hard_first`.
+        """Evaluate several images in one batch of the model.
+
+        Args:
+            render: from u (d,) to images (N, H, W, 3), with a graph.
+            wholes: full configuration of each image.
+            u: (d,) the searched coordinates, equal in all of them.
+            gradient: whether a derivative is computed.
+
+        Returns:
+            An evaluation without derivative and the model's output for each image, and
+            the derivative (d,) of the sum of their objectives, weighted by
+            `hard_first`.
         """
-        at = u.detach().clone().requires_grad_(bool(gradient))
+        variable_u = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
-            pictures = render(at)
-            outputs = self.model(pictures)
-            each = [outputs[number : number + 1] for number in range(len(wholes))]
-            truths = [self.truth(whole) for whole in wholes]
-            places = [torch.cat([at, whole[len(at) :]]) for whole in wholes]
+            images = render(variable_u)
+            outputs = self.model(images)
+            outputs_of_images = [
+                outputs[index : index + 1] for index in range(len(wholes))
+            ]
+            truths = [self.truth(full_u) for full_u in wholes]
+            variable_configurations = [
+                torch.cat([variable_u, full_u[len(variable_u) :]]) for full_u in wholes
+            ]
             if self.task.varies:
-                of_each = zip(
-                    each,
-                    pictures.split(1),
-                    truths,
-                    map(self.asked, places),
-                    strict=True,
-                )
-                values = torch.cat([self._values(*picture) for picture in of_each])
+                objectives = [
+                    self._compute_objective(output, image, truth, self.asked(full_u))
+                    for output, image, truth, full_u in zip(
+                        outputs_of_images,
+                        images.split(1),
+                        truths,
+                        variable_configurations,
+                        strict=True,
+                    )
+                ]
+                values = torch.cat(objectives)
             else:
-                values = self._values(outputs, pictures, truths[0], self.asked(*places))
+                inputs = self.asked(*variable_configurations)
+                values = self._compute_objective(outputs, images, truths[0], inputs)
             derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
-                derivative = torch.autograd.grad(
-                    (values * hard_first(values)).sum(), at
-                )[0]
-        evaluations = []
-        judged = self._judged(outputs, pictures, truths, wholes)
-        for value, judgement, output in zip(values.detach(), judged, each, strict=True):
-            evaluations.append(
-                (
-                    Evaluation(
-                        float(value), None, judgement.success, judgement=judgement
-                    ),
-                    output,
-                )
-            )
-        return evaluations, derivative
+                weighted_sum = (values * hard_first(values)).sum()
+                (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
+        judged = self._judge_outputs(outputs, images, truths, wholes)
+        evaluations = [
+            Evaluation(float(value), None, judgement.success, judgement=judgement)
+            for value, judgement in zip(values.detach(), judged, strict=True)
+        ]
+        return list(zip(evaluations, outputs_of_images, strict=True)), derivative
 
     def mean_under(
-        self, render: Callable[[slice, Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient,
+        self,
+        render: Callable[[slice, Tensor], Tensor],
+        wholes: Sequence[Tensor],
+        u: Tensor,
+        gradient: WhichGradient,
         at_once: int,
-    ) -> Evaluation:  # fmt: skip
-        """Return the mean over conditions whose pictures are predicted: `render` goes
-        from some of them and u to pictures (N, H, W, 3), with a graph. The model is
-        asked about `at_once` of them at once.
+    ) -> Evaluation:
+        """Evaluate the mean over conditions whose images are predicted.
+
+        Args:
+            render: from a slice of the conditions and u to images (N, H, W, 3), with a
+                graph.
+            wholes: full configuration of each condition.
+            u: (d,) the searched coordinates.
+            gradient: whether a derivative is computed.
+            at_once: images in a batch of the model.
         """
         evaluated = []
-        total = None
+        total_derivative = None
         for begin in range(0, len(wholes), at_once):
-            some = slice(begin, begin + at_once)
-            each, derivative = self.judged(
-                partial(render, some), wholes[some], u, gradient
+            batch = slice(begin, begin + at_once)
+            batch_evaluated, derivative = self.judged(
+                partial(render, batch), wholes[batch], u, gradient
             )
-            evaluated += each
-            if derivative is not None:
-                total = derivative if total is None else total + derivative
-        return self.mean(evaluated, u, None if total is None else total / len(wholes))
+            evaluated += batch_evaluated
+            if total_derivative is None:
+                total_derivative = derivative
+            elif derivative is not None:
+                total_derivative = total_derivative + derivative
+        mean_derivative = None
+        if total_derivative is not None:
+            mean_derivative = total_derivative / len(wholes)
+        return self.mean(evaluated, u, mean_derivative)
 
     def mean(
         self,
@@ -626,58 +715,81 @@ class Problem:
         u: Tensor,
         gradient: Tensor | None = None,
     ) -> Evaluation:
-        """Return the mean over conditions, from evaluations with the model's outputs,
-        and the gradient of the mean where these have none. Its cost is counted in
-        evaluations, each of which takes a picture a draw.
+        """Return the mean over conditions.
+
+        Args:
+            evaluated: an evaluation and the model's output for each condition.
+            u: (d,) the searched coordinates.
+            gradient: (d,) of the mean, where the evaluations have none.
+
+        Returns:
+            The mean. Its cost is counted in evaluations, each of which takes an image
+            for every draw.
         """
-        each, outputs = zip(*evaluated, strict=True)
+        evaluations, outputs = zip(*evaluated, strict=True)
         gradients = [
             evaluation.gradient[: u.numel()]
-            for evaluation in each
+            for evaluation in evaluations
             if evaluation.gradient is not None
         ]
+        if gradients:
+            gradient = torch.stack(gradients).mean(dim=0)
         judged = [
             evaluation.judgement
-            for evaluation in each
+            for evaluation in evaluations
             if evaluation.judgement is not None
         ]
-        if self.task.varies:  # each condition has a truth of its own
+        judgement = self._mean_judgement(judged, outputs)
+        n_successes = sum(evaluation.success for evaluation in evaluations)
+        n_needed = OVER_CONDITIONS.share(len(evaluations))
+        total_objective = sum(evaluation.objective for evaluation in evaluations)
+        return Evaluation(
+            total_objective / len(evaluations),
+            gradient,
+            n_successes >= n_needed,
+            non_finite=sum(evaluation.non_finite for evaluation in evaluations),
+            cost=max(evaluation.cost for evaluation in evaluations),
+            judgement=replace(judgement, metrics=mean_metrics(judged)),
+        )
+
+    def _mean_judgement(
+        self, judged: Sequence[Judgement], outputs: Sequence[Output]
+    ) -> Judgement:
+        """Return the judgement over several conditions.
+
+        Where each condition has a truth of its own, scores are averaged; else the task
+        judges the average of the outputs.
+        """
+        if self.task.varies:
             usual = typical(judged)
             score = mean([judgement.score for judgement in judged])
             margin = mean([judgement.margin for judgement in judged])
-            judgement = Judgement.of(score, margin, usual.prediction, usual.payload)
-        else:
-            with torch.no_grad():
-                judgement = self.task.judge(
-                    self.task.average(list(outputs)), self.truth()
-                )[0]
-        return Evaluation(
-            sum(evaluation.objective for evaluation in each) / len(each),
-            torch.stack(gradients).mean(dim=0) if gradients else gradient,
-            sum(evaluation.success for evaluation in each) >= OVER_CONDITIONS.share(len(each)),
-            non_finite=sum(evaluation.non_finite for evaluation in each), cost=max(one.cost for one in each),
-            judgement=replace(judgement, metrics=mean_metrics(judged)),
-        )  # fmt: skip
+            return Judgement.of(score, margin, usual.prediction, usual.payload)
+        with torch.no_grad():
+            output = self.task.average(list(outputs))
+            return self.task.judge(output, self.truth())[0]
 
     def loss(self, image: Tensor) -> Tensor:
-        """The objective of a picture (H, W, 3) sRGB near the start, as a number with a
-        graph.
-        """
-        start = self.asked(self.whole(self.domain.start))
-        return self._values(self.model(image), image[None], self.truth(), start)[0]
+        """Return the objective of an image (H, W, 3) near the start, with a graph."""
+        inputs = self.asked(self.whole(self.domain.start))
+        output = self.model(image)
+        values = self._compute_objective(output, image[None], self.truth(), inputs)
+        return values[0]
 
 
 def hard_first(values: Tensor) -> Tensor:
-    """Return how much each of several conditions counts in a derivative (n,), by its
-    objective: the smaller that is among the others, the more. All count 1 on average.
+    """Return weights (n,) of conditions in a derivative, by their objectives (n,).
 
-    The mean of all would be raised most easily where the prediction is wrong already.
-    Weights of exp(-z), where z is the objective in standard deviations, raise it where
-    that is not so (Li et al. 2021, *Tilted Empirical Risk Minimization*, section 2,
-    with a tilt of the opposite sign).
+    The smaller the objective of a condition is, the larger is its weight. The mean
+    weight is 1. The mean of all objectives would be raised most easily where the
+    prediction is wrong already. Weights of exp(-z), where z is the objective in standard
+    deviations, raise it where that is not so (Li et al. 2021, *Tilted Empirical Risk
+    Minimization*, section 2, with a tilt of the opposite sign).
     """
-    known = values.detach()
-    spread = known.std() if len(known) > 1 else known.new_zeros(())
+    objectives = values.detach()
+    spread = objectives.new_zeros(())
+    if len(objectives) > 1:
+        spread = objectives.std()
     if not bool(torch.isfinite(spread)) or float(spread) == 0.0:
-        return torch.ones_like(known)
-    return len(known) * torch.softmax(-known / spread, dim=0)
+        return torch.ones_like(objectives)
+    return len(objectives) * torch.softmax(-objectives / spread, dim=0)

@@ -1,6 +1,4 @@
-"""What is known of a run so far, and kept of it: findings and stages of an attack,
-judgements as rows, measurements.
-"""
+"""The state of a run, and how it is stored: findings, judgements as rows, rates."""
 
 from __future__ import annotations
 
@@ -29,12 +27,12 @@ from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 
-KEPT = 4  # pictures of each group of trials that are kept
+KEPT = 4  # images of each group of trials that are stored
 
 
 @dataclass
 class Findings:
-    """What is known so far; whatever is still None or empty was not reached."""
+    """The results of a run so far; what is None or empty was not reached."""
 
     # renders of the clean configuration at the search's sample count
     first_look: tuple[Judgement, ...] = ()
@@ -75,6 +73,7 @@ class Findings:
 
     @property
     def spp(self) -> int:
+        """Samples per pixel of the verification."""
         if self.sample_count is None:
             raise RuntimeError(
                 "the sample count of the verification has not been chosen yet"
@@ -83,51 +82,59 @@ class Findings:
 
     @property
     def transport_summary(self) -> LinearTransport:
-        """What predicted the images of the searches, and how far it was off; or why
-        nothing did.
-        """
+        """How the images of the searches were predicted, or why they were not."""
         if self.transport is None:
-            return LinearTransport(
-                used=False, reason=str(self.rendered_because or "nothing was searched")
-            )
-        predicted = self.transport.summary()
-        surface_refused = str(self.surface_refused) if self.surface_refused else None
-        return predicted.model_copy(
-            update={"reason": predicted.reason or surface_refused}
-        )
+            reason = str(self.rendered_because or "nothing was searched")
+            return LinearTransport(used=False, reason=reason)
+        summary = self.transport.summary()
+        if summary.reason or not self.surface_refused:
+            return summary
+        return summary.model_copy(update={"reason": str(self.surface_refused)})
 
 
-# the label of a picture that nobody could make; what the row keeps beside it says why
+# the label of an image whose workers all died; the payload of its row has the reason
 LOST = "(no answer)"
 
 
 def lost_remarks(lost: int) -> list[str]:
-    """Return what a reader has to know of so many pictures that nobody could make."""
+    """Return a sentence about the images whose workers all died, if there are any."""
     if not lost:
         return []
-    has, it = ("has", "it") if lost == 1 else ("have", "them")
+    verb, pronoun = ("has", "it") if lost == 1 else ("have", "them")
     return [
-        f"{count(lost, 'picture')} {has} no answer, which counts as not right: "
-        f"every worker that took {it} died."
+        f"{count(lost, 'picture')} {verb} no answer, which counts as not right: "
+        f"every worker that took {pronoun} died."
     ]
 
 
 def trial_row(
-    kind: str, number: int, seed: int | None, spp: int, trial: Judgement, values: Mapping[str, Value] | None = None, *,
+    kind: str,
+    number: int,
+    seed: int | None,
+    spp: int,
+    trial: Judgement,
+    values: Mapping[str, Value] | None = None,
+    *,
     sought: bool = True,
-) -> Row:  # fmt: skip
-    """Return what the store keeps of a trial; the seed is None of a picture that was
-    predicted. There is a success only where a search sought some prediction.
+) -> Row:
+    """Return the row that the store has of a trial.
+
+    Args:
+        kind: of the row.
+        number: of the trial among those of the kind.
+        seed: of the noise; None for a predicted image.
+        spp: samples per pixel.
+        trial: its judgement.
+        values: of the configuration.
+        sought: whether a search seeks some prediction; else the row has no success.
     """
-    objective = _number(trial.objective)
-    success = trial.success if sought else None
     row = Row(
         kind,
         number,
         seed=seed,
         spp=spp,
-        objective=objective,
-        success=success,
+        objective=_none_if_nan(trial.objective),
+        success=trial.success if sought else None,
         values=values or {},
         renders=1,
     )
@@ -135,29 +142,34 @@ def trial_row(
 
 
 def judged(row: Row, judgement: Judgement) -> Row:
+    """Return a row with the values of a judgement."""
     prediction = judgement.prediction
     return replace(
-        row, score=_number(judgement.score), correct=judgement.right, margin=_number(judgement.margin),
-        label=None if judgement.not_a_number else prediction.label, label_index=prediction.index,
-        probability=prediction.probability, payload=judgement.payload, metrics=judgement.metrics or {},
-    )  # fmt: skip
+        row,
+        score=_none_if_nan(judgement.score),
+        correct=judgement.right,
+        margin=_none_if_nan(judgement.margin),
+        label=None if judgement.not_a_number else prediction.label,
+        label_index=prediction.index,
+        probability=prediction.probability,
+        payload=judgement.payload,
+        metrics=judgement.metrics or {},
+    )
 
 
-def _number(value: float | None) -> float | None:
+def _none_if_nan(value: float | None) -> float | None:
     return None if value is None or math.isnan(value) else value
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row: nothing where it has no label, for
-    the output was not a number.
+    """Return the judgement that a row has.
+
+    A row without a label is of an output that was not a number.
     """
-    score, margin = (
-        math.nan if value is None else value for value in (row.score, row.margin)
-    )
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
-        score,
-        margin,
+        math.nan if row.score is None else row.score,
+        math.nan if row.margin is None else row.margin,
         bool(row.correct),
         prediction,
         row.payload,
@@ -167,52 +179,55 @@ def judgement_of(row: Row) -> Judgement:
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:
-    """Return the rate of a success, with how often each such prediction was given and
-    the mean score of the trials.
-    """
-    rated = rate_of(checked.adversarial, checked.counting, checked.successes)
-    return rated.model_copy(update={"stopped": checked.stopped})
+    """Return the rate of success of a verification, with labels and mean score."""
+    rate = rate_of(checked.adversarial, checked.counting, checked.successes)
+    return rate.model_copy(update={"stopped": checked.stopped})
 
 
 def rate_of(
     rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
 ) -> VerifiedRate:
-    """Return a rate with the predictions of its successes and the mean score of those
-    that are a number.
+    """Return a rate as a result stores it.
+
+    Args:
+        rate: counts of the trials.
+        trials: those that count; the mean score is over those that are a number.
+        successes: those whose labels are counted.
     """
-    labels = dict(Counter(trial.prediction.label for trial in successes).most_common())
+    labels = Counter(trial.prediction.label for trial in successes)
+    # 0.0 - x, and not -x: the mean of zeros is shown as 0 and not as -0.
     margin = 0.0 - mean_number(trial.score for trial in trials)
-    counted = _counted(rate, trials)
-    outcomes = count_outcomes(trial.payload for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
         spp=rate.spp,
-        labels=labels,
-        outcomes=outcomes,
+        labels=dict(labels.most_common()),
+        outcomes=count_outcomes(trial.payload for trial in successes),
         margin=margin,
-        **counted,
+        **_rate_fields(rate, trials),
     )
 
 
 def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+    """Return the trials of the clean configuration as a result stores them."""
     right = count_right(trials, spp)
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
     return ControlGroup(
-        correct=right.successes, outcomes=outcomes, **_counted(right, trials)
+        correct=right.successes, outcomes=outcomes, **_rate_fields(right, trials)
     )
 
 
-def _counted(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
-    nothing = sum(trial.not_a_number for trial in trials)
+def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
+    """Return the fields that all rates of a result have."""
+    n_not_a_number = sum(trial.not_a_number for trial in trials)
     return {
         "trials": rate.trials,
         "rate": rate.rate,
         "interval": rate.interval,
-        "not_a_number": nothing,
+        "not_a_number": n_not_a_number,
     }
 
 
 def mean_number(values: Iterable[float]) -> float:
-    """Return the mean of those that are numbers; NaN where none is."""
+    """Return the mean of the values that are not NaN; NaN if there are none."""
     numbers = [value for value in values if not math.isnan(value)]
     return mean(numbers) if numbers else math.nan

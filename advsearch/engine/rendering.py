@@ -1,4 +1,4 @@
-"""Pictures of a scene before anything is searched, and what the model says of them."""
+"""Render images of a scene before anything is searched, with the model's predictions."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config import PICTURE_SPP, PICTURES
-from advsearch.controls import compose
+from advsearch.controls import Control, Space, compose
 from advsearch.controls.base import sentences
 from advsearch.engine.loading import (
     Controls,
@@ -41,12 +41,12 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
-from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
+from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, Task, make_task
 from advsearch.tasks.together import each_thing
 from advsearch.trust.foreign_code import plainly
 from advsearch.trust.writing import placed_by
 
-MOST_PREDICTIONS = 5  # predictions of the model that are kept of a picture
+MOST_PREDICTIONS = 5  # predictions of the model that a view has at most
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,16 +57,16 @@ class View:
         azimuth: of the camera, degrees.
         picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the
             model sees.
-        linear: (H, W, 3) linear radiance times the gain, before what controls do to the
-            finished picture.
-        predictions: what the model says, the likeliest first.
-        marks: what shows its prediction, and what is true, in the picture; empty where
-            words say it all.
-        surfaces: what is seen in each pixel; None where nobody asked.
+        linear: (H, W, 3) linear radiance times the gain, before controls change the
+            finished image.
+        predictions: of the model, the most probable first.
+        marks: boxes and masks of the prediction and of the truth; empty where the task
+            draws nothing.
+        surfaces: what each pixel shows; None if it was not requested.
         output: of the model, for its task.
-        truth: of the scene; None where the task does not depend on what is seen, or
-            nobody says it.
-        things: what is seen of the object and each thing beside it, see `things_seen`.
+        truth: of the scene; None where the task does not depend on what is visible, or
+            where it is unknown.
+        things: visible parts of the object and each thing beside it, see `things_seen`.
     """
 
     azimuth: float
@@ -80,22 +80,22 @@ class View:
     things: JsonObject | None = None
 
     def __repr__(self) -> str:
-        said = self.predictions[0].label if self.predictions else None
-        return f"View(azimuth={self.azimuth:g}, {said!r})"
+        label = self.predictions[0].label if self.predictions else None
+        return f"View(azimuth={self.azimuth:g}, {label!r})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rendering:
-    """Pictures of a scene. Made by `render`.
+    """Images of a scene. Made by `render`.
 
     Attributes:
         scene: what was rendered.
-        model: name of the model that was asked.
-        task: name of the task that it was asked to do.
-        formation: how the pictures were formed, with size and gain.
-        spp: samples a pixel.
-        views: one, or one for each azimuth.
-        warnings: what was said on the way.
+        model: name of the model.
+        task: name of its task.
+        formation: how the images were formed, with size and gain.
+        spp: samples per pixel.
+        views: a single one, or one for each azimuth.
+        warnings: sentences for the user.
     """
 
     scene: SceneDescription
@@ -107,27 +107,34 @@ class Rendering:
     warnings: tuple[str, ...] = ()
 
     def save(self, path: str | Path) -> tuple[int, int]:
-        """Write the picture, whole or not at all; several views become one sheet with
-        the predictions under each. Return height and width of what was written, in
-        pixels.
+        """Write the image atomically; return its height and width in pixels.
 
-        A .png holds what the model sees, an .exr linear radiance times the gain; an
-        older file is replaced. Raises InputError (another ending, or an .exr of several
-        views), or StorageError where it could not be written.
+        Several views become one sheet with the predictions under each. A .png holds
+        what the model sees, an .exr linear radiance times the gain; an older file is
+        replaced.
+
+        Raises:
+            InputError: another suffix, or an .exr of several views.
+            StorageError: it could not be written.
         """
         file = writable(path, len(self.views))
         with placed_by("out"):
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
-            write_png(file, self._shown)
-        return self._shown.shape[0], self._shown.shape[1]
+            write_png(file, self._png_pixels)
+        height, width = self._png_pixels.shape[:2]
+        return height, width
 
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
-        """Write ground truth of the view as layers of one EXR, whole or not at all,
-        beside the picture of this path, as ``NAME.aov.exr``, and return its path;
-        `aovs` are names of `advsearch.scene.formation.AOVS`. Raises InputError where
-        `render` was not asked for it, or StorageError.
+        """Write ground truth of the view atomically as layers of one EXR file.
+
+        It is written beside the image of this path, as ``NAME.aov.exr``, which is
+        returned. `aovs` are names of `advsearch.scene.formation.AOVS`.
+
+        Raises:
+            InputError: `render` was called without `aov`, or there are several views.
+            StorageError: it could not be written.
         """
         surfaces = self.views[0].surfaces
         if surfaces is None or len(self.views) > 1:
@@ -143,60 +150,64 @@ class Rendering:
             )
 
     def sheet(self) -> Any:
-        """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth
-        and predictions under each.
+        """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1].
+
+        Azimuth and predictions are written under each.
         """
         return contact_sheet(
             [view.picture.numpy() for view in self.views], self._captions
         )
 
     def save_predictions(self, path: str | Path) -> Path | None:
-        """Write the picture, or the sheet, with boxes and masks drawn in beside that of
-        `save`, as NAME-prediction.png, and return its path; None where the task draws
-        nothing. Raises StorageError.
+        """Write the image or the sheet with the predicted boxes and masks.
+
+        It is written beside the image of this path, as NAME-prediction.png, which is
+        returned; None where the task draws nothing.
+
+        Raises:
+            StorageError: it could not be written.
         """
         if not any(view.marks for view in self.views):
             return None
-        drawn = [marked(view.picture.numpy(), view.marks) for view in self.views]
+        images = [marked(view.picture.numpy(), view.marks) for view in self.views]
+        image = images[0]
+        if len(images) > 1:
+            image = contact_sheet(images, self._captions)
         file = Path(path).with_name(f"{Path(path).stem}-prediction.png")
         with placed_by("out"):
-            write_png(
-                file,
-                contact_sheet(drawn, self._captions) if len(drawn) > 1 else drawn[0],
-            )
+            write_png(file, image)
         return file
 
     @cached_property
-    def _shown(self) -> Any:
+    def _png_pixels(self) -> Any:
+        """The image of a single view or the sheet of several, (h, w, 3) float32."""
         return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
 
     def __repr__(self) -> str:
-        said = [
-            view.predictions[0].label if view.predictions else None
+        labels = [
+            repr(view.predictions[0].label if view.predictions else None)
             for view in self.views
         ]
         height, width = self.formation.resolution
-        of = (
+        names = (
             f"{self.scene.object_name!r}, {self.scene.environment_name!r}, "
             f"{self.model!r}"
         )
-        return (
-            f"Rendering({of} says {', '.join(map(repr, said))}, {height} x {width} "
-            "pixels)"
-        )
+        return f"Rendering({names} says {', '.join(labels)}, {height} x {width} pixels)"
 
     def _repr_png_(self) -> bytes:
-        return png_bytes(self._shown)
+        return png_bytes(self._png_pixels)
 
     @property
     def _captions(self) -> list[list[str]]:
-        return [
-            [
-                f"azimuth {view.azimuth:g}",
-                *(seen_text(self.task, p) for p in view.predictions),
+        """Lines of text under each view."""
+        captions = []
+        for view in self.views:
+            texts = [
+                seen_text(self.task, prediction) for prediction in view.predictions
             ]
-            for view in self.views
-        ]
+            captions.append([f"azimuth {view.azimuth:g}", *texts])
+        return captions
 
     def result(
         self,
@@ -205,34 +216,93 @@ class Rendering:
         warnings: Sequence[str],
         answered: Path | None = None,
     ) -> RenderResult:
-        """Return everything but the pictures: with the file that was written, its
-        height and width in pixels, all that was said, and the file with the predictions
-        drawn in.
+        """Return everything but the images, as a result that can be stored.
+
+        Args:
+            out: file that was written.
+            size: its height and width in pixels.
+            warnings: all sentences for the user.
+            answered: file with the predictions drawn in, if there is one.
         """
         scene = self.scene
-        up = self.scene.object.up
+        up = scene.object.up
         return RenderResult(
-            out=str(out), answered=None if answered is None else str(answered), size=size, object=scene.object_name,
-            environment=scene.environment_name, model=self.model, task=self.task, spp=self.spp,
-            image_formation=Formation.of(self.formation), up=None if up is None else MeshUp.of(up),
-            views=[ViewPredictions.of(view) for view in self.views], warnings=list(warnings),
-        )  # fmt: skip
+            out=str(out),
+            answered=None if answered is None else str(answered),
+            size=size,
+            object=scene.object_name,
+            environment=scene.environment_name,
+            model=self.model,
+            task=self.task,
+            spp=self.spp,
+            image_formation=Formation.of(self.formation),
+            up=None if up is None else MeshUp.of(up),
+            views=[ViewPredictions.of(view) for view in self.views],
+            warnings=list(warnings),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewSettings:
+    """Arguments of `render` that are the same for all views."""
+
+    controls: tuple[Control, ...]
+    size: tuple[int, int]
+    spp: int
+    denoise: str
+    sampler: str
+    seed: int
+    label: str | None
+    judge: str
+    with_surfaces: bool
+    at: Tensor | None
+
+
+class _RenderedView(NamedTuple):
+    """A view, with what `render` needs of it for the next views and its result.
+
+    Attributes:
+        view: the view.
+        task: after it was calibrated by the view.
+        space: of the controls in the scene of the view.
+        formation: of the image.
+        truth_error: why the truth of the view is unknown; "" where it is known or not
+            needed.
+    """
+
+    view: View
+    task: Task
+    space: Space
+    formation: ImageFormation
+    truth_error: str
 
 
 @plainly()
 def render(
-    scene: Scene | str | Path, model: Model | nn.Module | str | Path = "reference", *, task: AnyTask = "classification",
-    label: str | None = None, judge: str = OBJECT, controls: Controls = (), around: int | None = None,
-    texture: Texture | None = None, resolution: int | tuple[int, int] | None = None, spp: int = PICTURE_SPP,
-    denoise: str = "oidn", sampler: str = SAMPLER, seed: int = 0, aov: bool = False, at: Tensor | None = None,
+    scene: Scene | str | Path,
+    model: Model | nn.Module | str | Path = "reference",
+    *,
+    task: AnyTask = "classification",
+    label: str | None = None,
+    judge: str = OBJECT,
+    controls: Controls = (),
+    around: int | None = None,
+    texture: Texture | None = None,
+    resolution: int | tuple[int, int] | None = None,
+    spp: int = PICTURE_SPP,
+    denoise: str = "oidn",
+    sampler: str = SAMPLER,
+    seed: int = 0,
+    aov: bool = False,
+    at: Tensor | None = None,
     progress: Watched = None,
-) -> Rendering:  # fmt: skip
-    """Render a scene and ask the model what it sees.
+) -> Rendering:
+    """Render a scene and predict with a model what it shows.
 
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what says the model's predictions: a name, a mapping with a `name` and
+        task: reads the model's predictions: a name, a mapping with a `name` and
             options, an instance, or a function.
         label: the right labels, for a task that draws what is true; None for the
             object's own.
@@ -244,107 +314,179 @@ def render(
             the scene's own camera.
         texture: of the object in place of its own, as `load_scene` takes it.
         resolution: side, or (height, width), in pixels; None for what the model takes.
-        spp: samples a pixel.
+        spp: samples per pixel.
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
-        aov: keep what is seen in each pixel, for `Rendering.save_aov`.
+        aov: store what each pixel shows, for `Rendering.save_aov`.
         at: (d,) in [0, 1], the configuration of `controls` in place of their start:
             `result.u`, say.
-        progress: True shows a bar, False none, None one on a terminal; or told how far
-            it is.
+        progress: True shows a bar, False none, None one on a terminal; or an object
+            that is told how far it is.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, a value is out of range,
             or the scene cannot take a control.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    scene = scene if texture is None else scene.with_texture(texture)
-    made = make_task(task)
-    model = load_model(model, task=made.of_one_image)
-    model = replace(model, cameras=max(1, len(scene.description.rig)))
-    check_judged(scene.description, judge)
-    asked = made.on(model) if judge != ALL else each_thing(made.on(model))
+    if texture is not None:
+        scene = scene.with_texture(texture)
+    description = scene.description
+    unbound_task = make_task(task)
+    model = load_model(model, task=unbound_task.of_one_image)
+    model = replace(model, cameras=max(1, len(description.rig)))
+    check_judged(description, judge)
+    model_task = unbound_task.on(model)
+    if judge == ALL:
+        model_task = each_thing(model_task)
     instances = as_controls(controls)
-    if around is not None and any(
+    if around is not None:
+        _check_azimuth_is_free(instances)
+    settings = _ViewSettings(
+        controls=instances,
+        size=as_python(resolution) or model.input_size,
+        spp=spp,
+        denoise=denoise,
+        sampler=sampler,
+        seed=seed,
+        label=label,
+        judge=judge,
+        with_surfaces=aov,
+        at=at,
+    )
+    progress = watcher(progress)
+    progress.stage("rendering", around or 1)
+    views = list[View]()
+    truth_warnings = list[str]()
+    remarks = tuple[str, ...]()
+    for view_description in _turned(description, around):
+        rendered = _render_view(view_description, model, model_task, settings)
+        views.append(rendered.view)
+        model_task = rendered.task
+        remarks = remarks or model_task.remarks
+        if rendered.truth_error:
+            truth_warnings = [
+                f"Nothing is drawn into the picture: {rendered.truth_error}"
+            ]
+        progress.advance(1)
+    # Formation and space are the same for all views, exposure included.
+    space = rendered.space
+    warnings = (
+        *space.notes(description),
+        *sentences(space.moved),
+        *truth_warnings,
+        *remarks,
+    )
+    environment_spec = space.environment or description.environment_spec
+    return Rendering(
+        replace(description, environment_spec=environment_spec),
+        model.name,
+        unbound_task.name,
+        rendered.formation,
+        spp,
+        tuple(views),
+        warnings,
+    )
+
+
+def _check_azimuth_is_free(controls: Sequence[Control]) -> None:
+    """Raise InputError if a control sets the azimuth that `around` sets."""
+    if any(
         control.kind == "camera" and "azimuth" in control.settings()
-        for control in instances
+        for control in controls
     ):
         raise InputError(
             "around: sets camera.azimuth itself, and `controls` fixes it; "
             "leave one of them out"
         )
-    size = as_python(resolution) or model.input_size
-    progress = watcher(progress)
-    progress.stage("rendering", around or 1)
-    formation = None
-    views = list[View]()
-    untold = list[str]()
-    remarks = tuple[str, ...]()
-    for description in _turned(scene.description, around):
-        description = framed(description, size)
-        space = compose(instances, description)
-        renderer = make_renderer(
-            description, space, size, denoise, seed, sampler=sampler
-        )
-        formation = renderer.formation  # the same for all, exposure included
-        u = space.start if at is None else torch.as_tensor(at, dtype=torch.float32)
-        if u.shape != space.start.shape:
-            raise InputError(
-                f"at: expected ({len(space.start)},) numbers, as `controls` have in "
-                f"this scene, got {tuple(u.shape)}"
-            )
-        with torch.no_grad():
-            radiance = renderer.radiance(u, seeds.stream(seed, "pictures"), spp)
-            picture = to_8_bit(space.picture(u, formation.display(radiance)))
-            output = model(picture)
-            truth = None
-            if asked.varies:
-                name = description.object_name
-                told = partial(space.describe, u)
-                looks = looks_at(renderer, u, len(description.rig))
-                facts = [
-                    facts_about(description, name, label, told, look, judge)
-                    for look in looks
-                ]
-                try:
-                    truth = asked.truth(replace(facts[0], views=tuple(facts[1:])))
-                except InputError as error:
-                    untold = [f"Nothing is drawn into the picture: {error}"]
-            asked = asked.after_calibration(output, truth)
-            predictions = asked.predictions(output, MOST_PREDICTIONS)[0]
-            marks = () if truth is None else tuple(asked.marks(output, truth)[0])
-        remarks = remarks or asked.remarks
-        azimuth = description.number("camera.azimuth")
-        linear = radiance * formation.gain
-        surfaces = renderer.surfaces(u) if aov else None
-        things = things_seen(renderer, u)
-        views.append(
-            View(
-                azimuth,
-                picture,
-                linear,
-                predictions,
-                marks,
-                surfaces,
-                output,
-                truth,
-                things,
-            )
-        )
-        progress.advance(1)
-    assert formation is not None
-    own = scene.description
-    warnings = (*space.notes(own), *sentences(space.moved), *untold, *remarks)
-    shown = replace(own, environment_spec=space.environment or own.environment_spec)
-    return Rendering(
-        shown, model.name, made.name, formation, spp, tuple(views), warnings
+
+
+def _render_view(
+    description: SceneDescription, model: Model, task: Task, settings: _ViewSettings
+) -> _RenderedView:
+    """Render one view, and predict with the model what it shows."""
+    description = framed(description, settings.size)
+    space = compose(settings.controls, description)
+    renderer = make_renderer(
+        description,
+        space,
+        settings.size,
+        settings.denoise,
+        settings.seed,
+        sampler=settings.sampler,
     )
+    formation = renderer.formation
+    u = _choose_configuration(space, settings.at)
+    with torch.no_grad():
+        radiance = renderer.radiance(
+            u, seeds.stream(settings.seed, "pictures"), settings.spp
+        )
+        image = to_8_bit(space.picture(u, formation.display(radiance)))
+        output = model(image)
+        truth = None
+        truth_error = ""
+        if task.varies:
+            facts = _make_view_facts(description, space, renderer, u, settings)
+            try:
+                truth = task.truth(facts)
+            except InputError as error:
+                truth_error = str(error)
+        task = task.after_calibration(output, truth)
+        predictions = task.predictions(output, MOST_PREDICTIONS)[0]
+        marks = () if truth is None else tuple(task.marks(output, truth)[0])
+    view = View(
+        azimuth=description.number("camera.azimuth"),
+        picture=image,
+        linear=radiance * formation.gain,
+        predictions=predictions,
+        marks=marks,
+        surfaces=renderer.surfaces(u) if settings.with_surfaces else None,
+        output=output,
+        truth=truth,
+        things=things_seen(renderer, u),
+    )
+    return _RenderedView(view, task, space, formation, truth_error)
+
+
+def _choose_configuration(space: Space, at: Tensor | None) -> Tensor:
+    """Return the configuration (d,) to render: `at`, or the start of the controls."""
+    u = space.start if at is None else torch.as_tensor(at, dtype=torch.float32)
+    if u.shape != space.start.shape:
+        raise InputError(
+            f"at: expected ({len(space.start)},) numbers, as `controls` have in "
+            f"this scene, got {tuple(u.shape)}"
+        )
+    return u
+
+
+def _make_view_facts(
+    description: SceneDescription,
+    space: Space,
+    renderer: Renderer,
+    u: Tensor,
+    settings: _ViewSettings,
+) -> Facts:
+    """Return the facts of a configuration (d,), with a view for each camera of a rig."""
+    facts, *camera_facts = [
+        facts_about(
+            description,
+            description.object_name,
+            settings.label,
+            partial(space.describe, u),
+            look,
+            settings.judge,
+        )
+        for look in looks_at(renderer, u, len(description.rig))
+    ]
+    return replace(facts, views=tuple(camera_facts))
 
 
 def check_judged(description: SceneDescription, judge: str) -> None:
-    """Refuse what no thing of a scene is called. Raises UnknownNameError, or InputError
-    for all of nothing.
+    """Check that a scene has the thing that is to be judged.
+
+    Raises:
+        UnknownNameError: nothing in the scene has that name.
+        InputError: all things are to be judged, and there is only the object.
     """
     if judge not in (OBJECT, ALL, *description.things):
         raise UnknownNameError(
@@ -363,111 +505,133 @@ def check_judged(description: SceneDescription, judge: str) -> None:
 def looks_at(
     renderer: Renderer, u: Tensor, cameras: int
 ) -> list[Callable[[], Surfaces]]:
-    """Return what looks at a configuration (d,): from the camera, and behind that from
-    each of a rig of so many.
+    """Return functions that render what is visible at a configuration (d,).
+
+    The first renders the view of the camera; the others those of the `cameras` of a rig.
     """
     return [
         partial(renderer.surfaces, u),
-        *(partial(renderer.surfaces, u, camera=number) for number in range(cameras)),
+        *(partial(renderer.surfaces, u, camera=index) for index in range(cameras)),
     ]
 
 
 def facts_about(
-    description: SceneDescription, name: str, label: str | None, values: Callable[[], Mapping[str, Value]],
-    look: Callable[[], Surfaces] | None = None, judge: str = OBJECT,
-) -> Facts:  # fmt: skip
-    """Return what a scene, whose object is called `name`, gives a task to judge by.
+    description: SceneDescription,
+    name: str,
+    label: str | None,
+    values: Callable[[], Mapping[str, Value]],
+    look: Callable[[], Surfaces] | None = None,
+    judge: str = OBJECT,
+) -> Facts:
+    """Return the facts of a scene by which a task judges predictions.
 
     Args:
+        description: the scene.
+        name: of its object.
         label: what is right, of the thing that is judged, or of the object where all
             are.
-        values: says the configuration; of the rest is said what the scene was given.
-        look: sees it.
-        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`;
-            another is an UnknownNameError.
+        values: describes the configuration; other parameters have the values of the
+            scene.
+        look: renders what the camera sees; it is called once at most.
+        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`.
+
+    Raises:
+        UnknownNameError: no thing has the name `judge`.
     """
-
-    def numbers() -> dict[str, float]:
-        said = {
-            **description.values,
-            **{key: value["value"] for key, value in values().items()},
-        }
-        return {
-            key: float(number)
-            for key, number in said.items()
-            if isinstance(number, (int, float))
-        }
-
     check_judged(description, judge)
-    things = description.things
-    looked = None if look is None else cache(look)
+    cached_look = None if look is None else cache(look)
 
-    def of(mesh: str, label: str | None) -> Facts:
-        sight = (
-            None
-            if looked is None
-            else lambda: sight_of(looked(), mesh, description.object.metres)
-        )
+    def collect_numbers() -> dict[str, float]:
+        configuration = {key: value["value"] for key, value in values().items()}
+        all_values = {**description.values, **configuration}
+        return {
+            key: float(value)
+            for key, value in all_values.items()
+            if isinstance(value, (int, float))
+        }
+
+    def make_thing_facts(mesh: str, thing_label: str | None) -> Facts:
+        sight = None
+        if cached_look is not None:
+            sight = partial(
+                _look_at, cached_look, mesh, metres=description.object.metres
+            )
         if mesh == OBJECT:
-            return Facts(name, label, description.object.label, numbers, sight)
-        return Facts(mesh, label, things[mesh].label, numbers, sight)
+            own_label = description.object.label
+            return Facts(name, thing_label, own_label, collect_numbers, sight)
+        own_label = description.things[mesh].label
+        return Facts(mesh, thing_label, own_label, collect_numbers, sight)
 
-    labelled = OBJECT if judge == ALL else judge
-    each = {
-        mesh: of(mesh, label if mesh == labelled else None)
-        for mesh in (OBJECT, *things)
+    labelled_mesh = OBJECT if judge == ALL else judge
+    single_facts = {
+        mesh: make_thing_facts(mesh, label if mesh == labelled_mesh else None)
+        for mesh in (OBJECT, *description.things)
     }
-    each = {
-        mesh: replace(
-            judged, others=tuple(other for name, other in each.items() if name != mesh)
+    facts_by_mesh = {}
+    for mesh, facts in single_facts.items():
+        others = tuple(
+            other for other_mesh, other in single_facts.items() if other_mesh != mesh
         )
-        for mesh, judged in each.items()
-    }
-    return replace(each[OBJECT], each=each) if judge == ALL else each[judge]
+        facts_by_mesh[mesh] = replace(facts, others=others)
+    if judge == ALL:
+        return replace(facts_by_mesh[OBJECT], each=facts_by_mesh)
+    return facts_by_mesh[judge]
+
+
+def _look_at(look: Callable[[], Surfaces], mesh: str, *, metres: float | None) -> Sight:
+    """Return what a task may know of one mesh, rendered when it is called."""
+    return sight_of(look(), mesh, metres)
 
 
 def sight_of(
     surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None
 ) -> Sight:
-    """Return what a task judges by, of what the camera sees: of the object, or of
-    another mesh; `metres` are those of the object, where they are known.
+    """Return what a task may know of what the camera sees: of one mesh, in metres.
+
+    `metres` is the size of the object, where it is known.
     """
     return Sight(surfaces.seen(mesh), surfaces.depth, surfaces.z_depth, metres)
 
 
 def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
-    """Return what the picture of a configuration (d,) shows of the object and each
-    thing beside it, by name; None where nothing stands beside it. See
-    `runs.results.ThingSeen`.
+    """Return what the image of a configuration (d,) shows of each thing, by name.
+
+    None where nothing stands beside the object. See `runs.results.ThingSeen`.
     """
     description = renderer.scene.made[0]
     if not description.things:
         return None
     names = (OBJECT, *description.things)
-    unseen: JsonObject = {
-        "box": None,
-        "pixels": 0,
-        "share": 0.0,
-        "truncated": None,
-        "distance": None,
-    }
-    shown: JsonObject = {
-        name: {"label": description.meshes[name].label, **unseen} for name in names
-    }
-    for seen in seen_things(renderer, u, names):
-        shown[seen.name] = {
-            "label": description.meshes[seen.name].label,
-            "box": [*seen.box],
-            "pixels": int(seen.mask.sum()),
-            "share": None if seen.share is None else round(seen.share, 4),
-            "truncated": seen.truncated,
-            "distance": round(seen.distance, 3),
+    labels = {name: description.meshes[name].label for name in names}
+    things: JsonObject = {
+        name: {
+            "label": labels[name],
+            "box": None,
+            "pixels": 0,
+            "share": 0.0,
+            "truncated": None,
+            "distance": None,
         }
-    return shown
+        for name in names
+    }
+    for thing in seen_things(renderer, u, names):
+        things[thing.name] = {
+            "label": labels[thing.name],
+            "box": [*thing.box],
+            "pixels": int(thing.mask.sum()),
+            "share": None if thing.share is None else round(thing.share, 4),
+            "truncated": thing.truncated,
+            "distance": round(thing.distance, 3),
+        }
+    return things
 
 
 def writable(path: str | Path, views: int) -> Path:
-    """Return the path of a picture that can be written, as far as its name says."""
+    """Return the path of an image if its name is one that can be written.
+
+    Raises:
+        InputError: another suffix, an .exr of several views, or a directory.
+    """
     file = Path(path)
     suffix = file.suffix.lower()
     if suffix not in PICTURES:
@@ -487,6 +651,7 @@ def writable(path: str | Path, views: int) -> Path:
 def _turned(
     description: SceneDescription, around: int | None
 ) -> Iterator[SceneDescription]:
+    """Yield the scene from `around` azimuths, or once as it is where that is None."""
     if around is None:
         yield description
         return
@@ -496,8 +661,7 @@ def _turned(
             f"{description.camera} is fixed; leave one "
             "of the two out"
         )
-    first = description.number("camera.azimuth")
-    for number in range(around):
-        yield description.with_values(
-            camera__azimuth=(first + 360.0 * number / around) % 360.0
-        )
+    first_azimuth = description.number("camera.azimuth")
+    for index in range(around):
+        azimuth = (first_azimuth + 360.0 * index / around) % 360.0
+        yield description.with_values(camera__azimuth=azimuth)

@@ -1,12 +1,13 @@
-"""Searches in which cameras move, by light kept on surfaces (docs/surface-light.md).
-Pictures are traced beside predicted ones: where these are too far off, the light is
-found anew for the present base colours, if they are searched; the second time in a row
-pictures are traced from there on, or predicted by matrices.
+"""Searches in which cameras move, predicted by stored light on surfaces.
+
+Predicted images are compared with traced ones. Where they are too far off, the light is
+computed again for the present base colors, if these are searched; the second time in a
+row images are traced from there on, or predicted by matrices (docs/surface-light.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -30,25 +31,29 @@ from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
 from advsearch.scene.transport.matrix import Tick
 
 WORTH = 32
-"""Pictures of a search from which on the light pays: it and a comparison take as long
-as some 25 rendered ones, or 45 where the first views do not decide.
+"""Images of a search from which on the light pays.
+
+Light and a comparison take as long as some 25 rendered images, or 45 where the first
+views do not decide.
 """
 # where light on surfaces has no advantage
 NO_CAMERA = Refusal("no camera moves", RefusalCause.NO_CAMERA)
 LIGHTS = 64  # environments in the bank, where they vary
-EVERY = 100
-TOGETHER = 8  # pictures that the model is asked about at once
+EVERY = 100  # evaluations from one comparison to the next, at first
+TOGETHER = 8  # images in a batch of the model
 AGAIN = 4
-"""Evaluations of a random search from which on cameras and environments come again:
-nothing learns from them, and what each camera sees is known then.
+"""Sets of conditions of a random search, which are used in turn.
+
+Nothing learns from its evaluations, and what each camera sees is stored.
 """
 
 
 def refusal_of_surface_light(
     problem: Problem, steps: int, policy: Policy[Any], specialise: bool
 ) -> Refusal | None:
-    """Return why light on surfaces does not predict a search; None if it may: how far
-    it is off is measured then.
+    """Return why light on surfaces does not predict a search; None if it may.
+
+    How far its predictions are off is measured only then.
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -72,65 +77,81 @@ def refusal_of_surface_light(
 
 @dataclass
 class SurfaceLight(PredictedSearch):
-    """The light on surfaces of a run whose searches look through many cameras, found
-    `at` (d,), or at the start. The numbers of u at `places` move, without these those
-    of cameras and environments.
+    """The light on surfaces of a run whose searches have many cameras.
+
+    Attributes:
+        at: (d,) configuration whose light is computed; None for the start.
+        places: indices of the coordinates of u that move; None for those of cameras and
+            environments.
     """
 
     way: ClassVar[str] = "surface light"
     at: Tensor | None = None
     places: Tensor | None = None
     _renderer: SurfaceRenderer | None = None
-    _lights: list[Tensor] = field(default_factory=list)
-    _made: int = 0
-    _next: int = 0
+    # coordinates of the conditions of the bank
+    _bank_conditions: list[Tensor] = field(default_factory=list)
+    _n_lights: int = 0
+    _next_comparison: int = 0
+    # what cameras see, by index of the conditions and begin of the batch
     _looks: dict[tuple[int, int], list[Look]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """See what numbers of the whole space change."""
+        """Find which coordinates move cameras, change environments and color surfaces."""
         problem = self.problem
-        renderer = self.problem.renderer
-        searched = problem.domain.dim
         space = problem.space
-        changes = {
-            control.name: surface_renderer.varied(renderer, [control.name])
+        n_searched = problem.domain.dim
+        self._inputs_of_control = {
+            control.name: surface_renderer.varied(problem.renderer, [control.name])
             for control in space.controls
         }
-
-        def changing(inputs: frozenset[str]) -> Tensor:
-            which = torch.zeros(len(space.start), dtype=torch.bool)
-            for group in space.groups:
-                which[group.coordinates] = bool(changes[group.control] & inputs)
-            return which
-
-        self._moving = changing(CAMERAS | {MAP})[:searched]
+        self._moving = self._find_coordinates(CAMERAS | {MAP})[:n_searched]
         if self.places is not None:
-            self._moving = torch.zeros(searched, dtype=torch.bool).index_fill_(
+            self._moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
                 0, self.places, True
             )
-        self._moves = bool(self._moving.any())
-        self._colored = bool(changing(frozenset({COLOR}))[:searched].any())
-        self.drawn = problem.conditions is not None and self._colored
-        # what is asked for inputs: without the base colour, where the searched controls
-        # set nothing else
-        self._asked = (
-            space
-            if self._moves
-            else replace(space, controls=space.controls[problem.searched or 0 :])
-        )
-        # of the conditions, what takes another light, and not only a brighter one
-        of_light = changing(frozenset({MAP}))
+        self._has_moving = bool(self._moving.any())
+        is_coloring = self._find_coordinates(frozenset({COLOR}))[:n_searched]
+        self._searches_colors = bool(is_coloring.any())
+        self.drawn = problem.conditions is not None and self._searches_colors
+        # The base color is an input of its own: where the searched controls set nothing
+        # else, the inputs of the conditions are enough.
+        self._input_space = space
+        if not self._has_moving:
+            conditions = space.controls[problem.searched or 0 :]
+            self._input_space = replace(space, controls=conditions)
+        self._needs_new_light = self._find_light_conditions()[n_searched:]
+
+    def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
+        """Return which coordinates of the full space change inputs, (d,) bool."""
+        space = self.problem.space
+        changes_inputs = torch.zeros(len(space.start), dtype=torch.bool)
+        for group in space.groups:
+            changes_inputs[group.coordinates] = bool(
+                self._inputs_of_control[group.control] & inputs
+            )
+        return changes_inputs
+
+    def _find_light_conditions(self) -> Tensor:
+        """Return which coordinates of the full space need another light, (d,) bool.
+
+        An environment that only becomes brighter needs none.
+        """
+        problem = self.problem
+        needs_new_light = self._find_coordinates(frozenset({MAP}))
+        if problem.conditions is None:
+            return needs_new_light
         start = problem.whole(problem.domain.start)
-        for group in space.groups if problem.conditions is not None else ():
-            if bool(of_light[group.coordinates].all()):
-                low = start.clone()
-                high = start.clone()
-                low[group.coordinates], high[group.coordinates] = 0.3, 0.8
-                darker, brighter = (
-                    Sketch.of(self._inputs(whole)[MAP]) for whole in (low, high)
-                )
-                of_light[group.coordinates] = darker.times(brighter) is None
-        self._of_light = of_light[searched:]
+        for group in problem.space.groups:
+            if bool(needs_new_light[group.coordinates].all()):
+                lower = start.clone()
+                lower[group.coordinates] = 0.3
+                upper = start.clone()
+                upper[group.coordinates] = 0.8
+                darker = Sketch.of(self._compute_inputs(lower)[MAP])
+                brighter = Sketch.of(self._compute_inputs(upper)[MAP])
+                needs_new_light[group.coordinates] = darker.times(brighter) is None
+        return needs_new_light
 
     @property
     def samples(self) -> int:
@@ -140,7 +161,7 @@ class SurfaceLight(PredictedSearch):
         if self.problem.conditions is None:
             return None
         return BankOfConditions(
-            made=self._made, dropped=self.renderer.dropped, grown=0, gap=None
+            made=self._n_lights, dropped=self.renderer.dropped, grown=0, gap=None
         )
 
     def size(self) -> tuple[int, int]:
@@ -148,12 +169,9 @@ class SurfaceLight(PredictedSearch):
 
     @property
     def too_far_off(self) -> Refusal | None:
-        first = self.deviations[0] if self.deviations else None
-        return (
-            None
-            if first is None or first.good
-            else Refusal(f"light on surfaces is {first.reason}")
-        )
+        if not self.deviations or self.deviations[0].good:
+            return None
+        return Refusal(f"light on surfaces is {self.deviations[0].reason}")
 
     def predicted(self, kind: str, evaluations: int) -> int:
         if "search" in self.ends and kind != "search":
@@ -162,32 +180,32 @@ class SurfaceLight(PredictedSearch):
         return super().predicted(kind, evaluations)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        """Find the light, under every environment of the bank, and see how far its
-        pictures are off.
-        """
+        """Compute the light under every condition of the bank, and compare its images."""
         problem = self.problem
-        at = problem.domain.start if self.at is None else self.at
+        u = problem.domain.start if self.at is None else self.at
         with self.timed(), torch.no_grad():
-            start = problem.whole(at)
+            full_u = problem.whole(u)
             self._renderer = SurfaceRenderer(
-                problem.renderer, start, seeds.stream(problem.seed, "surface light")
+                problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
             )
-            self._lights = [start[problem.domain.dim :]]
+            self._bank_conditions = [full_u[problem.domain.dim :]]
             if problem.conditions is not None:
                 seed = seeds.stream(problem.seed, "bank")
-                count = LIGHTS if bool(self._of_light.any()) else 1
-                self._lights = [
-                    stratified(problem.conditions, number, seed)
-                    for number in range(count)
+                n_conditions = LIGHTS if bool(self._needs_new_light.any()) else 1
+                self._bank_conditions = [
+                    stratified(problem.conditions, index, seed)
+                    for index in range(n_conditions)
                 ]
-            for numbers in self._lights:
-                self._renderer.kept_light(self._inputs(torch.cat([at, numbers])))
-                tick(LIGHTS // len(self._lights))
-            self._made = len(self._renderer.lights_kept) + self._renderer.dropped
-        self._compare(at, 0)
+            for condition in self._bank_conditions:
+                inputs = self._compute_inputs(torch.cat([u, condition]))
+                self._renderer.kept_light(inputs)
+                tick(LIGHTS // len(self._bank_conditions))
+            self._n_lights = len(self._renderer.lights_kept) + self._renderer.dropped
+        self._compare(u, 0)
 
     @property
     def renderer(self) -> SurfaceRenderer:
+        """The renderer that has the light; it is prepared on first use."""
         if self._renderer is None:
             self.prepare()
         assert self._renderer is not None
@@ -196,165 +214,198 @@ class SurfaceLight(PredictedSearch):
     def evaluate_all(
         self, queries: Sequence[Query], traced: Evaluate
     ) -> Iterator[Evaluation]:
-        """Answer queries of one search, or trials, by what else answers them from the
-        first that is not predicted.
+        """Evaluate queries of a search, or trials, in their order.
+
+        `traced` evaluates all queries from the first that is not predicted.
         """
-        ahead: dict[int, Tensor] = {}
-        for place, query in enumerate(queries):
+        # images of queries that were predicted in one batch, by position
+        predicted_images: dict[int, Tensor] = {}
+        for position, query in enumerate(queries):
             self.passed(query)
-            differences = (
-                query.gradient is True and self.problem.domain.gradient_cost > 0
-            )
-            if (
-                differences
-                or self.predicted(query.kind, query.number + 1) <= query.number
-            ):
-                yield from traced(queries[place:])
+            if self._must_trace(query):
+                yield from traced(queries[position:])
                 return
-            if (
-                place not in ahead
-                and self.problem.conditions is None
-                and not self._colored
-            ):
-                us = [
-                    later.u for later in queries[place : place + self.renderer.at_once]
-                ]
-                ahead = dict(enumerate(self.renderer.pictures(us), place))
-            yield self.evaluate(query, ahead.get(place))
+            can_batch = self.problem.conditions is None and not self._searches_colors
+            if can_batch and position not in predicted_images:
+                batch = queries[position : position + self.renderer.at_once]
+                images = self.renderer.pictures([batched.u for batched in batch])
+                predicted_images = dict(enumerate(images, position))
+            yield self.evaluate(query, predicted_images.get(position))
+
+    def _must_trace(self, query: Query) -> bool:
+        """Return whether a query is beyond those that are predicted."""
+        costs_renders = self.problem.domain.gradient_cost > 0
+        if query.gradient is True and costs_renders:
+            return True
+        return self.predicted(query.kind, query.number + 1) <= query.number
 
     def evaluate(self, query: Query, picture: Tensor | None = None) -> Evaluation:
-        """Answer a query; its picture (H, W, 3) may be there already."""
-        problem = self.problem
+        """Evaluate a query, with its image (H, W, 3) if that is predicted already."""
         if query.phase is None:
-            whole = problem.whole(query.u)
-            with torch.no_grad():
-                shown = to_8_bit(self.renderer(whole) if picture is None else picture)
-            kept = shown if query.keep else None
-            return Evaluation.of(
-                problem.judge(shown, whole), cost=0, predicted=RAYS, picture=kept
-            )
+            return self._evaluate_trial(query, picture)
         if picture is not None:
-            ((evaluation, _),), _ = problem.judged(
-                lambda at: picture[None], [query.u], query.u, False
-            )
-            kept = to_8_bit(picture) if query.keep else None
-            return replace(evaluation, cost=query.samples, predicted=RAYS, picture=kept)
-        again = (
+            return self._evaluate_image(query, picture)
+        return self._evaluate_over_conditions(query)
+
+    def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
+        """Evaluate a trial: judge the predicted image as a file would hold it."""
+        full_u = self.problem.whole(query.u)
+        with torch.no_grad():
+            rounded = to_8_bit(self.renderer(full_u) if image is None else image)
+        return Evaluation.of(
+            self.problem.judge(rounded, full_u),
+            cost=0,
+            predicted=RAYS,
+            picture=rounded if query.keep else None,
+        )
+
+    def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
+        """Evaluate a query of a search by its predicted image, without derivative."""
+        evaluated, _ = self.problem.judged(
+            lambda u: image[None], [query.u], query.u, False
+        )
+        ((evaluation, _),) = evaluated
+        return replace(
+            evaluation,
+            cost=query.samples,
+            predicted=RAYS,
+            picture=to_8_bit(image) if query.keep else None,
+        )
+
+    def _evaluate_over_conditions(self, query: Query) -> Evaluation:
+        """Evaluate a query of a search: the mean over conditions."""
+        problem = self.problem
+        # Conditions of a random search are used in turn, with what their cameras see.
+        reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
-            and not self._moves
+            and not self._has_moving
         )
-        number = query.number % AGAIN if again else query.number
-        wholes = [
-            torch.cat([query.u, numbers])
-            for numbers in self._drawn(query.kind, number, problem.draws)
+        index = query.number % AGAIN if reuses_conditions else query.number
+        conditions = self._choose_conditions(query.kind, index, problem.draws)
+        full_configurations = [
+            torch.cat([query.u, condition]) for condition in conditions
         ]
 
-        def predicted(some: slice, at: Tensor) -> Tensor:
-            return self._pictures(
-                wholes[some], at, (number, some.start) if again else None
-            )
+        def predict(batch: slice, u: Tensor) -> Tensor:
+            key = (index, batch.start) if reuses_conditions else None
+            return self._predict_images(full_configurations[batch], u, key)
 
         evaluation = problem.mean_under(
-            predicted, wholes, query.u, query.gradient, TOGETHER
+            predict, full_configurations, query.u, query.gradient, TOGETHER
         )
         evaluation = replace(evaluation, cost=query.samples, predicted=RAYS)
         if not query.keep:
             return evaluation
         with torch.no_grad():
-            return replace(
-                evaluation,
-                picture=to_8_bit(self._pictures([problem.whole(query.u)], query.u)[0]),
-            )
+            images = self._predict_images([problem.whole(query.u)], query.u)
+            return replace(evaluation, picture=to_8_bit(images[0]))
 
-    def _drawn(self, kind: str, number: int, count: int) -> list[Tensor]:
-        """The conditions of an evaluation: fresh cameras under environments of the
-        bank.
-        """
+    def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
+        """Return conditions of an evaluation: new cameras under lights of the bank."""
         problem = self.problem
         if problem.conditions is None:
-            return self._lights * count
+            return self._bank_conditions * count
         generator = torch.Generator().manual_seed(
             seeds.stream(problem.seed, f"surface {kind}", number)
         )
-        order = torch.randint(len(self._lights), (count,), generator=generator).tolist()
-        fresh = problem.conditions.sample(generator, count)
-        lights = [self._lights[number] for number in order]
+        n_lights = len(self._bank_conditions)
+        positions = torch.randint(n_lights, (count,), generator=generator).tolist()
+        new_conditions = problem.conditions.sample(generator, count)
         return [
-            torch.where(self._of_light, *both)
-            for both in zip(lights, fresh, strict=True)
+            torch.where(self._needs_new_light, self._bank_conditions[position], new)
+            for position, new in zip(positions, new_conditions, strict=True)
         ]
 
-    def _inputs(self, whole: Tensor) -> dict[str, Tensor]:
-        """What a configuration of the whole space sets in the scene; without the base
-        colour, where the searched controls set nothing else.
+    def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
+        """Return the scene inputs of a full configuration.
+
+        They lack the base color where the searched controls set nothing else.
         """
         with torch.no_grad():
-            inputs = self._asked.inputs(whole[len(whole) - len(self._asked.start) :])
+            n_coordinates = len(self._input_space.start)
+            inputs = self._input_space.inputs(full_u[len(full_u) - n_coordinates :])
             return self.problem.renderer.scene.assembly(inputs)
 
-    def _pictures(
-        self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None
+    def _predict_images(
+        self,
+        full_configurations: Sequence[Tensor],
+        u: Tensor,
+        key: tuple[int, int] | None = None,
     ) -> Tensor:
-        """Return pictures (n, H, W, 3) of u under conditions, with a graph. What the
-        cameras of a key see is kept.
+        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a graph.
+
+        What cameras see is stored under `key`, if there is one, for later calls.
         """
         color = self.renderer.color(self.problem.searched_space.inputs(u))
-        places = [torch.cat([u, whole[len(u) :]]) for whole in wholes]
-        inputs = [self._inputs(whole) for whole in wholes]
-        if key is not None and key not in self._looks:
-            self._looks[key] = list(self.renderer.looks(inputs))
-        looks = self.renderer.looks(inputs) if key is None else self._looks[key]
-        return self.renderer.shown(looks, inputs, color, places)
+        variable_configurations = [
+            torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
+        ]
+        inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
+        looks: Iterable[Look]
+        if key is None:
+            looks = self.renderer.looks(inputs)
+        else:
+            if key not in self._looks:
+                self._looks[key] = list(self.renderer.looks(inputs))
+            looks = self._looks[key]
+        return self.renderer.shown(looks, inputs, color, variable_configurations)
 
     def passed(self, query: Query) -> None:
-        """Compare where that is due: every `EVERY` evaluations where base colours are
-        searched, as their light gets old; otherwise after twice as many each time,
-        until predictions are too far off.
+        """Compare predictions where that is due.
+
+        That is every `EVERY` evaluations where base colors are searched, as their light
+        gets old; else after twice as many each time, until predictions are too far off.
         """
-        due = (
-            query.kind == "search"
-            and query.phase == "search"
-            and query.number >= (self._next or EVERY)
-        )
-        if not due or self.given_up:
+        if query.kind != "search" or query.phase != "search" or self.given_up:
             return
-        before = self.deviations[-1].good
-        good = self._compare(query.u, query.number).good
-        self._next = query.number + (
-            query.number if good and not self._colored else EVERY
-        )
-        if not good and not before:
+        if query.number < (self._next_comparison or EVERY):
+            return
+        was_accurate = self.deviations[-1].good
+        is_accurate = self._compare(query.u, query.number).good
+        interval = EVERY
+        if is_accurate and not self._searches_colors:
+            interval = query.number
+        self._next_comparison = query.number + interval
+        if is_accurate:
+            return
+        if not was_accurate:
             self.give_up("search", query.number)
-        elif not good and self._colored:
+        elif self._searches_colors:
             with self.timed():
                 self.renderer.renew(self.problem.whole(query.u))
             self.renewed = (self.renewed or 0) + 1
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
-        """Compare predicted pictures with traced ones, and keep what was found. The
-        first is that of u; in the others, searched cameras and environments are
-        anywhere.
+        """Compare predicted images with traced ones, and store the deviation.
+
+        The first view is that of u (d,); in the others, searched cameras and
+        environments are random.
         """
         problem = self.problem
         kind = "surface check"
         seed = seeds.stream(problem.seed, kind, index)
         with self.timed():
-            elsewhere = problem.domain.sample(
-                torch.Generator().manual_seed(seed), VIEWS
-            )
-            places = torch.where(self._moving, elsewhere, u)
-            places[0] = u
-            wholes = [
-                torch.cat(both)
-                for both in zip(places, self._drawn(kind, index, VIEWS), strict=True)
+            generator = torch.Generator().manual_seed(seed)
+            samples = problem.domain.sample(generator, VIEWS)
+            configurations = torch.where(self._moving, samples, u)
+            configurations[0] = u
+            conditions = self._choose_conditions(kind, index, VIEWS)
+            full_configurations = [
+                torch.cat([view_u, condition])
+                for view_u, condition in zip(configurations, conditions, strict=True)
             ]
-            drawn = self._moving if self._colored else torch.ones_like(self._moving)
+            is_random = self._moving
+            if not self._searches_colors:
+                is_random = torch.ones_like(self._moving)
 
-        def view(number: int) -> ComparedView:
-            noise = seeds.stream(seed, "view", number)
+        def compare_view(number: int) -> ComparedView:
             return problem.view(
-                self.renderer, wholes[number], noise, problem.spp, drawn=drawn
+                self.renderer,
+                full_configurations[number],
+                seeds.stream(seed, "view", number),
+                problem.spp,
+                drawn=is_random,
             )
 
-        return self.compare(view)
+        return self.compare(compare_view)

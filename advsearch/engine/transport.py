@@ -1,7 +1,9 @@
-"""Searches whose pictures are predicted; here: by a matrix of light transport, where
-nothing varies by chance. Every `EVERY` evaluations predictions are compared with traced
-pictures: where they are too far off (`engine.problem`), the matrix is made anew. The
-ranking and all trials trace paths.
+"""Searches whose images are predicted, and their simplest predictor: a matrix.
+
+The matrix of light transport predicts images where nothing varies by chance. Every
+`EVERY` evaluations predictions are compared with traced images: where they are too far
+off (`engine.acceptance`), the matrix is computed again. The ranking and all trials trace
+paths.
 """
 
 from __future__ import annotations
@@ -35,14 +37,16 @@ from advsearch.scene.transport.lights import (
 from advsearch.scene.transport.matrix import Tick
 
 WORTH = 16
-"""Evaluations from which a search pays for the matrix, which costs as much as some 6
-rendered ones with gradients (`benchmarks/transport.py`).
+"""Evaluations of a search from which on the matrix pays.
+
+It costs as much as some 6 rendered evaluations with gradients
+(`benchmarks/transport.py`).
 """
-# evaluations for each light from which a search pays for its basis picture
+# evaluations for each light from which on basis images pay
 WORTH_A_LIGHT = 8
-EVERY = 20
-FEWEST_SCORES = 4  # trials whose spread says something
-SPREAD = 1.64  # standard deviations under their mean above which 19 of 20 scores lie
+EVERY = 20  # evaluations from one comparison to the next
+FEWEST_SCORES = 4  # trials from which a standard deviation is estimated
+SPREAD = 1.64  # standard deviations below the mean above which 19 of 20 scores lie
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
@@ -56,8 +60,12 @@ ADVICE = {
 def refusal_of_matrices(
     problem: Problem, steps: int | None, specialise: bool
 ) -> Refusal | None:
-    """Return why a search of so many steps (None: of any number) is not predicted by
-    matrices; None if it is.
+    """Return why a search is not predicted by matrices; None if it is.
+
+    Args:
+        problem: of the search.
+        steps: its evaluations; None for any number.
+        specialise: the setting of this name.
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -67,115 +75,119 @@ def refusal_of_matrices(
         return Refusal(
             f"a matrix pays from {WORTH} evaluations on", RefusalCause.TOO_FEW_STEPS
         )
-    by_chance = (
-        problem.space.controls[problem.searched :]
-        if problem.conditions is not None
-        else ()
-    )
-    refusal = why_not(problem.renderer, [control.name for control in by_chance])
-    if refusal is None and problem.conditions is None and steps is not None:
-        worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
-        if steps < worth:
-            return Refusal(
-                f"basis pictures pay from {worth} evaluations on",
-                RefusalCause.TOO_FEW_STEPS,
-            )
-    return refusal
+    condition_names = []
+    if problem.conditions is not None:
+        conditions = problem.space.controls[problem.searched :]
+        condition_names = [control.name for control in conditions]
+    refusal = why_not(problem.renderer, condition_names)
+    if refusal is not None or problem.conditions is not None or steps is None:
+        return refusal
+    min_steps = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
+    if steps < min_steps:
+        return Refusal(
+            f"basis pictures pay from {min_steps} evaluations on",
+            RefusalCause.TOO_FEW_STEPS,
+        )
+    return None
 
 
 def remark(refusal: Refusal | None) -> str:
-    """Return what a user should know of a search that renders; empty where nothing else
-    is possible.
-    """
+    """Return advice for a search that renders; "" where nothing else is possible."""
     advice = "" if refusal is None else ADVICE.get(refusal.cause, "")
     if not advice:
         return ""
     costs = (
         "Each step of the search is rendered, which takes several times as long "
-        "as "
-        "predicting it"
+        "as predicting it"
     )
     return f"{costs}: {refusal}; {advice}."
 
 
 @dataclass
 class PredictedSearch(ABC):
-    """What predicts the pictures of a run's searches. All of it follows from the seed,
-    so that it can be made again.
+    """A predictor of the images of a run's searches.
+
+    All of it follows from the seed, so that a resumed run computes the same again.
+
+    Attributes:
+        way: method, for reports.
+        exact: whether equal configurations have equal objectives.
+        problem: of the searches.
+        steps: evaluations of a search; those after them belong to the ranking, and are
+            traced.
+        drawn: whether each evaluation draws conditions; see `Domain.drawn`.
+        deviations: from traced images, of each comparison.
+        traced: images that were traced, for the predictor and to compare it.
+        seconds: spent on both.
+        renewed: how often the predictor was computed again; None where it never is.
+        ends: by kind of search, the evaluation from which on images are traced, as
+            predictions were too far off.
+        given_up: why images are traced, as a sentence; None while they are predicted.
     """
 
-    way: ClassVar[str] = "matrix"  # how, in words
-    exact: ClassVar[bool] = False  # whether equal configurations have equal objectives
+    way: ClassVar[str] = "matrix"
+    exact: ClassVar[bool] = False
 
     problem: Problem
-    # evaluations of a search; what comes after them belongs to the ranking, and is
-    # traced
     steps: int
-    # whether each evaluation draws conditions; see `Domain.drawn`
     drawn: bool = field(default=False, kw_only=True)
-    # from traced pictures, in order
     deviations: list[Deviation] = field(default_factory=list, kw_only=True)
-    # pictures, for what predicts and to be compared
     traced: int = field(default=0, kw_only=True)
-    seconds: float = field(default=0.0, kw_only=True)  # spent on both
-    # how often it was made anew; None where it never is
+    seconds: float = field(default=0.0, kw_only=True)
     renewed: int | None = field(default=0, kw_only=True)
-    # by kind of search, the evaluation from which on pictures are traced, as predicted
-    # ones were too far off
     ends: dict[str, int] = field(default_factory=dict, kw_only=True)
-    given_up: str | None = field(default=None, kw_only=True)  # says so
+    given_up: str | None = field(default=None, kw_only=True)
 
     @property
     @abstractmethod
     def samples(self) -> int:
-        """Samples a pixel that are traced before the search can begin."""
+        """Samples per pixel that are traced before the search can begin."""
 
     @abstractmethod
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        """Make what predicts at the start of the search; told of samples a pixel as
-        they are traced.
+        """Compute the predictor at the start of the search.
+
+        `tick` is called with samples per pixel as they are traced.
         """
 
     @property
     def too_far_off(self) -> Refusal | None:
-        """Why it cannot be used, as far as images that were traced to prepare it tell;
-        None if it can.
-        """
+        """Why it cannot be used, by images that were traced to prepare it; None if it can."""
         return None
 
     @abstractmethod
     def passed(self, query: Query) -> None:
-        """Remember a query that was read back: compare, and make anew, what an
-        evaluation would have.
+        """Replay a query that was read from the store.
+
+        Comparisons and renewals happen as they did when it was evaluated.
         """
 
     @abstractmethod
     def evaluate(self, query: Query) -> Evaluation:
-        """Answer one query of the search itself."""
+        """Evaluate one query of the search itself."""
 
     def evaluate_all(
         self, queries: Sequence[Query], traced: Evaluate
     ) -> Iterator[Evaluation]:
-        """Answer queries of a search itself, each when it is asked for; `traced`
-        answers what is not predicted.
-        """
+        """Evaluate queries of a search lazily; `traced` evaluates those not predicted."""
         return map(self.evaluate, queries)
 
     @abstractmethod
     def size(self) -> tuple[int, int]:
-        """Entries of the matrices, for one colour channel, and bytes."""
+        """Return the entries of the matrices, for one color channel, and their bytes."""
 
     def conditions(self) -> BankOfConditions | None:
-        """What there is to say of conditions; None where nothing varies."""
+        """Return the state of a bank of conditions; None where nothing varies."""
         return None
 
     def predicted(self, kind: str, evaluations: int) -> int:
-        """How many of the first evaluations of a search were predicted."""
+        """Return how many of the first evaluations of a search were predicted."""
         return min(evaluations, self.ends.get(kind, evaluations))
 
     def compare(self, view: Callable[[int], ComparedView]) -> Deviation:
-        """Compare predictions with traced pictures, and keep what was found; see
-        `compared`.
+        """Compare predictions with traced images, and store the deviation.
+
+        `view` compares a single view; see `acceptance.compared`.
         """
         with self.timed():
             self.deviations.append(compared(view))
@@ -183,33 +195,45 @@ class PredictedSearch(ABC):
         return self.deviations[-1]
 
     def give_up(self, kind: str, number: int, where: str = "") -> None:
-        """Have pictures traced from an evaluation of a kind of search on."""
+        """Trace images from an evaluation of a kind of search on."""
         self.ends[kind] = number
-        why = (
+        reason = (
             f"pictures are rendered from evaluation {number}{where} on: predicted "
             "ones were too far off"
         )
-        self.given_up = self.given_up or why
+        self.given_up = self.given_up or reason
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        begun = time.perf_counter()
+        """Count the time of a block as spent on the predictor."""
+        started = time.perf_counter()
         yield
-        self.seconds += time.perf_counter() - begun
+        self.seconds += time.perf_counter() - started
 
     def summary(self) -> LinearTransport:
-        entries, size = self.size()
+        """Return what a result stores of the predictor."""
+        entries, n_bytes = self.size()
+        error = None
+        if self.deviations:
+            error = PredictionError.of(self.deviations[-1])
         return LinearTransport(
-            used=True, way=self.way, reason=self.given_up, conditions=self.conditions(), entries=entries, bytes=size,
-            seconds=self.seconds, renewed=self.renewed,
-            error=PredictionError.of(self.deviations[-1]) if self.deviations else None,
-        )  # fmt: skip
+            used=True,
+            way=self.way,
+            reason=self.given_up,
+            conditions=self.conditions(),
+            entries=entries,
+            bytes=n_bytes,
+            seconds=self.seconds,
+            renewed=self.renewed,
+            error=error,
+        )
 
 
 @dataclass
 class CleanMatrix:
-    """The matrix of the clean configuration, for attacks that differ in nothing but
-    their budget of change.
+    """The matrix of the clean configuration.
+
+    Attacks that differ only in their budget of change share it.
     """
 
     made: Predictor | None = None
@@ -217,26 +241,31 @@ class CleanMatrix:
 
 @dataclass
 class Transport(PredictedSearch):
-    """The matrices of a run's searches where nothing varies by chance; every search
-    begins with the `clean` one.
+    """The matrices of a run's searches where nothing varies by chance.
+
+    Attributes:
+        clean: the matrix with which every search begins.
     """
 
     exact: ClassVar[bool] = True
     clean: CleanMatrix = field(default_factory=CleanMatrix)
-    _optimism: float = 0.0
-    _present: dict[str, Predictor] = field(default_factory=dict)
+    # by how much predicted scores are above the lower end of those of trials
+    _score_bias: float = 0.0
+    # the latest matrix of each kind of search
+    _current: dict[str, Predictor] = field(default_factory=dict)
 
     @property
     def samples(self) -> int:
         return samples_to_collect(self.problem.renderer)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        self.clean.made = self.clean.made or self._made(
-            self.problem.domain.start, "start", 0, tick
-        )
+        if self.clean.made is None:
+            start = self.problem.domain.start
+            self.clean.made = self._make_predictor(start, "start", 0, tick)
 
     @property
     def start(self) -> Predictor:
+        """The matrix of the clean configuration."""
         self.prepare()
         assert self.clean.made is not None
         return self.clean.made
@@ -244,69 +273,78 @@ class Transport(PredictedSearch):
     def size(self) -> tuple[int, int]:
         return self.start.entries, self.start.bytes
 
-    def _made(
+    def _make_predictor(
         self, u: Tensor, kind: str, number: int, tick: Tick = lambda samples: None
     ) -> Predictor:
+        """Compute the matrix at u (d,)."""
         with self.timed():
             seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
-            made = predicting(self.problem.renderer, u, seed, tick)
-        self.traced += made.lights
-        return made
+            predictor = predicting(self.problem.renderer, u, seed, tick)
+        self.traced += predictor.lights
+        return predictor
 
     def passed(self, query: Query) -> None:
-        self._at(query)
+        self._update_predictor(query)
 
     def evaluate(self, query: Query) -> Evaluation:
-        present = self._at(query)
-        if present is None:
+        predictor = self._update_predictor(query)
+        if predictor is None:
             return self.problem.evaluate(query)
-        return replace(
-            self.problem.evaluated(query, query.u, query.seed, present.renderer)[0],
-            predicted=1,
+        evaluation, _ = self.problem.evaluated(
+            query, query.u, query.seed, predictor.renderer
         )
+        return replace(evaluation, predicted=1)
 
-    def _at(self, query: Query) -> Predictor | None:
-        """What predicts an evaluation, compared and made anew where that is due; None
-        where it is traced.
+    def _update_predictor(self, query: Query) -> Predictor | None:
+        """Return the predictor of a query; None where it is traced.
+
+        Where that is due, the predictor is compared with traced images and, if it is
+        too far off, computed again.
         """
         kind = query.kind
         number = query.number
         if query.phase != "search" or number >= self.predicted(kind, self.steps):
             return None
-        present = self._present.setdefault(kind, self.start)
+        predictor = self._current.setdefault(kind, self.start)
         if number == 0 or number % EVERY or not kind.startswith("search"):
-            return present
+            return predictor
         seed = seeds.stream(self.problem.seed, "transport check", number)
         deviation = self.compare(
             lambda view: self.problem.view(
-                present, query.u, seeds.stream(seed, "view", view), self.problem.spp
+                predictor,
+                query.u,
+                seeds.stream(seed, "view", view),
+                self.problem.spp,
             )
         )
         if deviation.good:
-            return present
-        # basis pictures of lights stay what they are: there is nothing to linearise
-        # again
+            return predictor
+        # Basis images of lights do not depend on u: nothing can be linearised again.
         if self.start.entries == 0:
             self.give_up(kind, number, f" of the {kind}")
             return None
-        self._present[kind] = self._made(query.u, kind, number)
+        self._current[kind] = self._make_predictor(query.u, kind, number)
         self.renewed = (self.renewed or 0) + 1
-        return self._present[kind]
+        return self._current[kind]
 
     def likely(self, u: Tensor) -> bool:
-        """Whether the picture that is predicted from the start would pass its trials,
-        as far as those of the last configuration tell.
+        """Return whether the predicted image of u (d,) would pass its trials.
+
+        That is judged by the scores of the trials of the last configuration.
         """
-        return self._score(u) > self._optimism
+        return self._predict_score(u) > self._score_bias
 
     def correct(self, u: Tensor, scores: Sequence[float]) -> None:
-        """Learn from the scores of a configuration's trials how much more than their
-        lower end its prediction says.
+        """Update the bias of predicted scores from those of a configuration's trials.
+
+        The bias is the predicted score minus the lower end of the trials' scores.
         """
         if len(scores) >= FEWEST_SCORES and all(map(math.isfinite, scores)):
-            lower = statistics.fmean(scores) - SPREAD * statistics.stdev(scores)
-            self._optimism = self._score(u) - lower
+            lower_end = statistics.fmean(scores) - SPREAD * statistics.stdev(scores)
+            self._score_bias = self._predict_score(u) - lower_end
 
-    def _score(self, u: Tensor) -> float:
+    def _predict_score(self, u: Tensor) -> float:
+        """Return the score of the image that is predicted from the start."""
         with torch.no_grad():
-            return self.problem.judge(to_8_bit(self.start(u)), u).score
+            image = to_8_bit(self.start(u))
+            return self.problem.judge(image, u).score

@@ -1,5 +1,7 @@
-"""Trials of configurations, kept as rows: of what was found, of different failures,
-also on other models.
+"""Trials of configurations, stored as rows.
+
+The trials verify what searches found and different failures, also on other models and
+under other conditions.
 """
 
 from __future__ import annotations
@@ -49,24 +51,33 @@ from advsearch.scene.color import to_8_bit
 from advsearch.scene.formation import next_count
 from advsearch.tasks import Judgement
 
-# of a configuration with more numbers than this, a trial's row does not hold the values
+# coordinates of a configuration up to which the row of a trial has its values
 MANY = 64
 
 
 def ladder_of(verify_spp: int | None, sampler: str) -> Sequence[int]:
-    """Return the samples per pixel that a verification climbs, as the sampler has them:
-    one, if it is stated.
+    """Return the samples per pixel that a verification may choose from, ascending.
+
+    It is a single count if `verify_spp` states one, rounded as the sampler needs it.
     """
     return LADDER if verify_spp is None else (next_count(sampler, verify_spp),)
 
 
 @dataclass
 class Verifier:
-    """Makes the trials of one run: sample count (of a ladder; a single one is taken as
-    it is), control group, adversarial configurations, and configurations one at a time.
-    Each group has as many trials as the last of `calibrates`; after those before, the
-    verdict may stand. What comes of them, pictures and the count of renders are in
-    `findings`. Rows say of a success where some prediction is `sought`.
+    """Runs the trials of one run, and collects their results.
+
+    It chooses the sample count, and tries the control group, adversarial
+    configurations, and single configurations.
+
+    Attributes:
+        journal: evaluates and stores the trials.
+        ladder: sample counts to choose from, ascending; a single one is not tested.
+        stages: of the progress of the run.
+        findings: results, images and the count of renders.
+        looks: numbers of trials, ascending, after which the verdict of a group may
+            stand; the last is the size of a group.
+        sought: whether rows have a success: whether a prediction is sought.
     """
 
     journal: Journal
@@ -77,13 +88,14 @@ class Verifier:
     sought: bool = True
     _clean_spp: int = 0
     _clean_kind: str = "control"
-    _asked: set[tuple[str, int]] = field(default_factory=set)
+    # kind and number of all trials that were rendered
+    _rendered: set[tuple[str, int]] = field(default_factory=set)
 
     @classmethod
     def open(
         cls, run: RunDirectory, problem: Problem, ladder: Sequence[int], stages: Stages
     ) -> Verifier:
-        """Return what makes the trials of a run in this process, and stores them."""
+        """Return a verifier that renders in this process and stores in a run directory."""
         return cls(Journal(run, Shared(problem)), ladder, stages)
 
     def __post_init__(self) -> None:
@@ -91,6 +103,7 @@ class Verifier:
 
     @property
     def count(self) -> int:
+        """Trials of a group."""
         return self.looks[-1]
 
     def evaluate_all(
@@ -100,57 +113,60 @@ class Verifier:
         in_samples: bool = False,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Evaluation]:
-        """Answer trials, keep their pictures, and count each once; the bar counts them,
-        or their samples a pixel. A `predictor` answers what it can in place of renders,
-        which alone are counted.
+        """Evaluate trials in order, store their images, and count each once.
+
+        Args:
+            queries: the trials.
+            in_samples: whether the progress bar counts samples per pixel, and not
+                trials.
+            predictor: evaluates what it can instead of renders. Only renders are
+                counted as such.
         """
-        made = (
-            None
-            if predictor is None
-            else partial(predictor.evaluate_all, traced=self.journal.traced)
-        )
-        queries = (
-            queries
-            if self.sought
-            else [replace(query, sought=False) for query in queries]
-        )
-        for query, evaluation in zip(
-            queries, self.journal.evaluate_all(queries, made), strict=True
-        ):
+        evaluate = None
+        if predictor is not None:
+            evaluate = partial(predictor.evaluate_all, traced=self.journal.traced)
+        if not self.sought:
+            queries = [replace(query, sought=False) for query in queries]
+        evaluations = self.journal.evaluate_all(queries, evaluate)
+        for query, evaluation in zip(queries, evaluations, strict=True):
+            trial = (query.kind, query.number)
             if evaluation.picture is not None:
-                self.findings.pictures[query.kind, query.number] = evaluation.picture
+                self.findings.pictures[trial] = evaluation.picture
             if evaluation.predicted:
                 self.findings.predicted_trials += 1
             else:
-                self._asked.add((query.kind, query.number))
-            self.findings.verification_renders = len(self._asked)
-            self.stages.progress.advance(
-                query.spp if in_samples else 1, **self.journal.traced.told
-            )
+                self._rendered.add(trial)
+            self.findings.verification_renders = len(self._rendered)
+            steps = query.spp if in_samples else 1
+            self.stages.progress.advance(steps, **self.journal.traced.told)
             yield evaluation
 
     def choose_spp(
         self, candidates: dict[str, Tensor], searched: int | None = None
     ) -> None:
-        """Raise the samples until more would not change the verdict: under the
-        conditions that the scene comes with, or until they would not change the share
-        of conditions, where these vary. There, searches that took so many samples bound
-        those of the check.
+        """Choose the sample count of the verification, and store it in the findings.
+
+        Samples are raised until more would not change the verdict: under the conditions
+        of the scene or, where conditions vary, until they would not change the fraction
+        of conditions under which the model is wrong.
+
+        Args:
+            candidates: configurations (d,) by name.
+            searched: samples that the searches took, which bound those of this choice
+                where conditions vary.
         """
-        over = self.problem.conditions is not None
+        varies = self.problem.conditions is not None
         ladder = self.ladder
-        trials = self.looks[0]
-        choose: Callable[..., SampleCount] = partial(choose_spp, trials=trials)
-        most = most_samples(len(candidates), ladder, trials)
-        if over:
-            if len(ladder) > 1:
-                ladder = OVER_LADDER
-                if searched is not None:
-                    ladder = affordable(
-                        ladder, (len(candidates) + 1) * self.count, searched
-                    )
-            choose = choose_rate_spp
-            most = CONDITIONS * len(candidates) * sum(ladder)
+        has_choice = len(ladder) > 1
+        n_trials = self.looks[0]
+        if varies:
+            choose: Callable[..., SampleCount] = choose_rate_spp
+            if has_choice:
+                ladder = self._condition_ladder(len(candidates), searched)
+            max_samples = CONDITIONS * len(candidates) * sum(ladder)
+        else:
+            choose = partial(choose_spp, trials=n_trials)
+            max_samples = most_samples(len(candidates), ladder, n_trials)
         if len(ladder) > 1:
             hint = (
                 "more and more samples a pixel until noise no longer moves the result "
@@ -158,36 +174,54 @@ class Verifier:
                 "`verify_spp=NUMBER` leaves it out"
             )
             title = "finding how many samples the check needs"
-            self.stages.begin("verification", title, most, hint=hint, at_most=True)
+            self.stages.begin(
+                "verification", title, max_samples, hint=hint, at_most=True
+            )
         evaluate = partial(self.evaluate_all, in_samples=True)
         margins = {
-            name: margins_of(evaluate, f"sample count {name}", u, keep=KEPT, drawn=over)
+            name: margins_of(
+                evaluate, f"sample count {name}", u, keep=KEPT, drawn=varies
+            )
             for name, u in candidates.items()
         }
         self.findings.sample_count = choose(
             margins, seed=self.problem.seed, ladder=ladder
         )
 
-    def try_clean(self) -> None:
-        """The control group: the clean configuration under the seeds that every other
-        group gets.
+    def _condition_ladder(
+        self, n_candidates: int, searched: int | None
+    ) -> Sequence[int]:
+        """Return the sample counts to choose from where conditions vary."""
+        if searched is None:
+            return OVER_LADDER
+        n_trials = (n_candidates + 1) * self.count
+        return affordable(OVER_LADDER, n_trials, searched)
 
-        A start that looked wrong at first has been through it before the search, at a
-        sample count of its own.
+    def try_clean(self) -> None:
+        """Run the trials of the control group, unless they were run at this count.
+
+        These are of the clean configuration, under the seeds of every other group. A
+        start that looked wrong at first is tried before the search, at a sample count of
+        its own, and then again.
         """
         if self.clean_tried:
             return
         self._clean_spp = self.findings.spp
-        self._clean_kind = (
-            "first control" if self.findings.search is None else "control"
-        )
+        is_before_search = self.findings.search is None
+        self._clean_kind = "first control" if is_before_search else "control"
         self.findings.clean = run_trials(
-            self.evaluate_all, self.problem.domain.start, spp=self._clean_spp, seed=self.problem.seed,
-            trials=self.looks[0], kind=self._clean_kind, keep=KEPT,
-        )  # fmt: skip
+            self.evaluate_all,
+            self.problem.domain.start,
+            spp=self._clean_spp,
+            seed=self.problem.seed,
+            trials=self.looks[0],
+            kind=self._clean_kind,
+            keep=KEPT,
+        )
 
     @property
     def clean_tried(self) -> bool:
+        """Whether the control group was tried at the present sample count."""
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
     def verified(
@@ -198,52 +232,82 @@ class Verifier:
         curtailed: bool = False,
         again: bool = False,
     ) -> Verification:
-        """Verify what one search found against the control group; `curtailed` where
-        only the verdict matters. A control group that has too few trials gets more.
-        `again`: in trials after all others, both groups anew.
+        """Verify the configuration that a search found against the control group.
+
+        A control group that has too few trials gets more.
+
+        Args:
+            kind: of the rows.
+            found: result of the search.
+            curtailed: whether only the verdict matters, and not the rate.
+            again: whether both groups get new trials, numbered after all others.
         """
-        checked = verify(
-            self.evaluate_all, self.problem.domain, found.best_u, claim=found.ending, spp=self.findings.spp,
-            seed=self.problem.seed, trials=self.looks, clean=() if again else self.findings.clean,
-            rule=self.problem.rule, kind=kind, control=self._clean_kind, keep=KEPT, curtailed=curtailed,
+        verification = verify(
+            self.evaluate_all,
+            self.problem.domain,
+            found.best_u,
+            claim=found.ending,
+            spp=self.findings.spp,
+            seed=self.problem.seed,
+            trials=self.looks,
+            clean=() if again else self.findings.clean,
+            rule=self.problem.rule,
+            kind=kind,
+            control=self._clean_kind,
+            keep=KEPT,
+            curtailed=curtailed,
             begin=self.count if again else 0,
-        )  # fmt: skip
+        )
         if not again:
-            self.findings.clean = checked.clean_trials
-        return checked
+            self.findings.clean = verification.clean_trials
+        return verification
 
     def trials(
-        self, kind: str, configurations: Mapping[int, Tensor], *, sought: bool = True,
+        self,
+        kind: str,
+        configurations: Mapping[int, Tensor],
+        *,
+        sought: bool = True,
         predictor: PredictedSearch | None = None,
-    ) -> Iterator[Judgement]:  # fmt: skip
-        """Try configurations once each, every one with a seed of its own, by their
-        numbers among those of a kind; a `predictor` as for `evaluate_all`.
+    ) -> Iterator[Judgement]:
+        """Try configurations (d,) once each, every one with a seed of its own.
+
+        Args:
+            kind: of the rows.
+            configurations: by their numbers among those of the kind.
+            sought: whether rows have a success.
+            predictor: as for `evaluate_all`.
         """
         problem = self.problem
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
             values = problem.describe(u, seed) if problem.domain.dim <= MANY else {}
-            queries.append(
-                Query(
-                    u,
-                    seed,
-                    kind,
-                    number,
-                    spp=self.findings.spp,
-                    values=values,
-                    sought=sought,
-                )
+            query = Query(
+                u,
+                seed,
+                kind,
+                number,
+                spp=self.findings.spp,
+                values=values,
+                sought=sought,
             )
+            queries.append(query)
         for evaluation in self.evaluate_all(queries, predictor=predictor):
             yield evaluation.said
 
     def trials_of(
-        self, kind: str, count: int, find_configuration: Callable[[int], Tensor], *, sought: bool = True,
+        self,
+        kind: str,
+        count: int,
+        find_configuration: Callable[[int], Tensor],
+        *,
+        sought: bool = True,
         predictor: PredictedSearch | None = None,
-    ) -> Iterator[Judgement]:  # fmt: skip
-        """Try configurations of a kind, numbered from 0, in batches that fit into
-        memory; see `trials`.
+    ) -> Iterator[Judgement]:
+        """Try configurations of a kind, numbered from 0, in batches that fit into memory.
+
+        `find_configuration` returns the configuration (d,) of a number; see `trials`.
         """
         for numbers in batches(0, count, most_at_once(self.problem.domain.dim)):
             configurations = {number: find_configuration(number) for number in numbers}
@@ -252,41 +316,60 @@ class Verifier:
             )
 
     def average(self, count: int) -> None:
-        """Try configurations drawn from the whole space and budget: how often the model
-        is wrong on average.
-        """
+        """Try random configurations: how often is the model wrong on average?"""
         problem = self.problem
         self.begin(
             "trying random configurations", count, name="average", flags="`average`"
         )
 
-        def draw(number: int) -> Tensor:
+        def sample_configuration(number: int) -> Tensor:
             generator = torch.Generator().manual_seed(
                 seeds.stream(problem.seed, "draw", number)
             )
             return problem.domain.sample(generator)[0]
 
-        self.findings.average = tuple(self.trials_of("average", count, draw))
+        trials = self.trials_of("average", count, sample_configuration)
+        self.findings.average = tuple(trials)
 
     def begin(
-        self, title: str, trials: int, *, name: str = "verification", flags: str = "`trials` or `verify_spp`",
+        self,
+        title: str,
+        trials: int,
+        *,
+        name: str = "verification",
+        flags: str = "`trials` or `verify_spp`",
         at_most: bool = False,
-    ) -> None:  # fmt: skip
-        most = "at most " if at_most else ""
-        hint = (
-            f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a "
-            f"pixel; {flags} shorten it"
-        )
+    ) -> None:
+        """Begin a stage of the progress that renders trials.
+
+        Args:
+            title: for the progress bar.
+            trials: how many there will be.
+            name: of the stage.
+            flags: settings that shorten it, for the hint.
+            at_most: whether there may be fewer.
+        """
+        bound = "at most " if at_most else ""
+        samples = plural(self.findings.spp, "sample")
+        hint = f"{bound}{trials} pictures of {samples} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
 
 
 @dataclass(frozen=True, eq=False)
 class RetrialCondition:
-    """What a configuration is tried under. Conditions of equal source are shown the
-    same picture before it is changed: (H, W, 3) sRGB in [0, 1], by the seed of its
-    trial; those of equal light get theirs from one linear radiance, as their scenes are
-    the same and only tone curves or models differ (None: this one renders by itself).
-    `change` goes from the picture and the seed of the trial to what the model is shown.
+    """A condition under which configurations are tried again.
+
+    Attributes:
+        name: of the condition.
+        problem: judges its images.
+        spp: samples per pixel.
+        source: conditions of equal source share the rendered image of a trial, (H, W,
+            3) sRGB in [0, 1].
+        change: from the rendered image and the seed of the trial to the model's image;
+            None for the image itself.
+        light: conditions of equal light share the linear radiance of a trial, as their
+            scenes are equal and only tone curves or models differ; None for a
+            condition that renders by itself.
     """
 
     name: str
@@ -298,122 +381,159 @@ class RetrialCondition:
 
 
 class Retrials:
-    """Tries the clean scene and adversarial ones under conditions, each in so many
-    trials; what the run has stored already is read back. Trial k has the same seed, of
-    a root that nothing else uses, for all of them. An executor's workers hold the
-    problems by the names of their conditions; without, pictures are made here.
+    """Tries the clean scene and adversarial ones again, under other conditions.
+
+    Trials that the run has stored are read. Trial k has the same seed for all
+    conditions.
+
+    Args:
+        conditions: that are tried.
+        run: stores the trials.
+        progress: counts them.
+        trials: of each configuration under each condition.
+        seed: root seed that nothing else uses.
+        executor: workers that hold the problems by the names of their conditions; None
+            to render in this process.
     """
 
     def __init__(
-        self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int,
+        self,
+        conditions: Sequence[RetrialCondition],
+        run: RunDirectory,
+        progress: Progress,
+        *,
+        trials: int,
+        seed: int,
         executor: Workers | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._progress = progress
-        self._count = trials
+        self._n_trials = trials
         self._seed = seed
-        first = Journal(run, Shared(conditions[0].problem))
+        first_journal = Journal(run, Shared(conditions[0].problem))
         self._journals = {
             condition.name: replace(
-                first, traced=Shared(condition.problem, executor, condition.name)
+                first_journal,
+                traced=Shared(condition.problem, executor, condition.name),
             )
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
-        self._lights: dict[tuple[Hashable, int, int], Tensor] = {}
-        self._sharing = Counter(
+        # shared images and radiances of `_shared_kind`, by source or light, seed and spp
+        self._images: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._shared_kind = ""
+        # how many conditions have each light
+        self._n_conditions_of_light = Counter(
             condition.light for condition in conditions if condition.light is not None
         )
-        self._pictured = ""
 
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
+        """Return the trials of the clean scene under a condition."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
-                partial(self._evaluations, "clean", condition), condition.problem.domain.start, spp=condition.spp,
-                seed=self._seed, trials=self._count, kind=f"clean under {condition.name}",
-            )  # fmt: skip
+                partial(self._evaluate_trials, "clean", condition),
+                condition.problem.domain.start,
+                spp=condition.spp,
+                seed=self._seed,
+                trials=self._n_trials,
+                kind=f"clean under {condition.name}",
+            )
         return self._clean[condition.name]
 
     def adversarial(
         self, kind: str, u: Tensor, condition: RetrialCondition
     ) -> Verification:
-        """Try a configuration (d,) under one condition, beside the clean scene; a claim
-        of nothing is never confirmed. Its rows are called "KIND under CONDITION".
+        """Try a configuration (d,) under one condition, compared with the clean scene.
+
+        Nothing is claimed, so that nothing is confirmed. Its rows have the kind "KIND
+        under CONDITION".
         """
         return verify(
-            partial(self._evaluations, kind, condition), condition.problem.domain, u, claim=Ending.NOT_VERIFIED,
-            spp=condition.spp, seed=self._seed, trials=self._count, clean=self.clean(condition),
-            rule=condition.problem.rule, kind=f"{kind} under {condition.name}",
-        )  # fmt: skip
+            partial(self._evaluate_trials, kind, condition),
+            condition.problem.domain,
+            u,
+            claim=Ending.NOT_VERIFIED,
+            spp=condition.spp,
+            seed=self._seed,
+            trials=self._n_trials,
+            clean=self.clean(condition),
+            rule=condition.problem.rule,
+            kind=f"{kind} under {condition.name}",
+        )
 
-    def _evaluations(
+    def _evaluate_trials(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        changed = partial(self._changed, kind, condition)
-        for evaluation in self._journals[condition.name].evaluate_all(queries, changed):
+        """Evaluate trials in order, by the journal of their condition."""
+        evaluate = partial(self._evaluate_new, kind, condition)
+        journal = self._journals[condition.name]
+        for evaluation in journal.evaluate_all(queries, evaluate):
             self._progress.advance(1)
             yield evaluation
 
-    def _changed(
+    def _evaluate_new(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Judge pictures as the condition changes them; those of the present
-        configuration are kept for others.
+        """Judge images as the condition changes them.
+
+        Images before the change are cached for other conditions of the same kind.
         """
-        if kind != self._pictured:
-            self._pictures.clear()
-            self._lights.clear()
-            self._pictured = kind
+        if kind != self._shared_kind:
+            self._images.clear()
+            self._radiances.clear()
+            self._shared_kind = kind
         problem = condition.problem
-        shared = self._journals[condition.name].traced
         keys = [(condition.source, query.seed, condition.spp) for query in queries]
-        new = [
-            replace(q, wanted="picture")
-            for q, key in zip(queries, keys, strict=True)
-            if key not in self._pictures
+        missing = [
+            replace(query, wanted="picture")
+            for query, key in zip(queries, keys, strict=True)
+            if key not in self._images
         ]
-        sent = iter(shared(new) if shared.executor is not None and len(new) > 1 else ())
+        evaluator = self._journals[condition.name].traced
+        has_workers = evaluator.executor is not None and len(missing) > 1
+        from_workers = iter(evaluator(missing) if has_workers else ())
         for query, key in zip(queries, keys, strict=True):
             machine = None
-            if key not in self._pictures:
-                evaluation = next(sent, None)
-                if evaluation is None or evaluation.picture is None:  # it is made here
-                    self._pictures[key] = self._rendered(condition, query.u, query.seed)
+            if key not in self._images:
+                rendered = next(from_workers, None)
+                if rendered is None or rendered.picture is None:
+                    image = self._render(condition, query.u, query.seed)
                 else:
-                    self._pictures[key], machine = (
-                        evaluation.picture,
-                        evaluation.machine,
-                    )
-            picture = self._pictures[key]
-            picture = (
-                picture
-                if condition.change is None
-                else condition.change(picture, query.seed)
-            )
-            said = problem.judge(to_8_bit(picture), problem.whole(query.u, query.seed))
-            yield Evaluation.of(said, machine=machine)
+                    image = rendered.picture
+                    machine = rendered.machine
+                self._images[key] = image
+            image = self._images[key]
+            if condition.change is not None:
+                image = condition.change(image, query.seed)
+            full_u = problem.whole(query.u, query.seed)
+            judgement = problem.judge(to_8_bit(image), full_u)
+            yield Evaluation.of(judgement, machine=machine)
 
-    def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
-        """As `Problem.picture`, from the radiance of other conditions with the same
-        light where there are any.
+    def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
+        """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
+
+        It is developed from the radiance of other conditions with the same light, if
+        there are any.
         """
         problem = condition.problem
-        key = (condition.light, seed, condition.spp)
-        if self._sharing[condition.light] < 2:
+        if self._n_conditions_of_light[condition.light] < 2:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
-        whole = problem.whole(u, seed)
+        full_u = problem.whole(u, seed)
+        key = (condition.light, seed, condition.spp)
         with torch.no_grad():
-            if key not in self._lights:
-                self._lights[key] = renderer.radiance(whole, seed, condition.spp)
-            return to_8_bit(
-                renderer.space.picture(
-                    whole, renderer.formation.display(self._lights[key])
-                )
-            )
+            if key not in self._radiances:
+                self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
+            displayed = renderer.formation.display(self._radiances[key])
+            return to_8_bit(renderer.space.picture(full_u, displayed))
 
 
 def kept_configuration(folder: Path, problem: Problem) -> torch.Tensor:
+    """Return the configuration (d,) that a run directory has stored.
+
+    Raises:
+        InputError: the scene has another number of coordinates now.
+    """
     u = torch.from_numpy(read_configuration(folder))
     if u.shape != problem.domain.start.shape:
         raise InputError(

@@ -1,20 +1,19 @@
-"""Intervals and tests of shares over units of several rows each, such as drives of
-several frames.
+"""Intervals and tests of rates over clusters (units) of several rows each.
 
-Rows of one unit are not independent; units are. All units weigh the same, however many
-rows each has. The share is the mean over units of the share of each: mean_u k_u / o_u,
-for units with o_u rows of which k_u count. (The pooled share, sum k_u / sum o_u, weighs
-a drive by its frames in view. It has no interval without a bound on o_u, and the
-largest o_u that was observed is none.) So each unit is one draw in [0, 1].
+A unit may be a drive of several frames. Rows of one unit are not independent; units
+are. All units weigh the same, however many rows each has. The rate is the mean over
+units of the rate of each: mean_u k_u / o_u, for units with o_u rows of which k_u count.
+(The pooled rate, sum k_u / sum o_u, weighs a drive by its frames in view. It has no
+interval without a bound on o_u, and the largest o_u that was observed is none.) So each
+unit is a sample in [0, 1].
 
 With m for the true mean, a gambler who stakes a fraction c of the capital at each unit
-on "more than m" wins nothing on
-average:
+on "more than m" wins nothing on average:
 
     K(m, c) = prod_u (1 - c + c k_u / (o_u m))
 
 So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like
-and however few there are. It holds too where each unit has a share of its own: the
+and however few there are. It holds too where each unit has a rate of its own: the
 product's mean is at most 1, by the inequality of the means. The stakes are those of
 `sequential.ConfidenceSequence`. Where each unit has one row, the exact tests of
 independent rows are used, which are sharper: Clopper and Pearson, Newcombe, McNemar.
@@ -38,123 +37,143 @@ Units = npt.NDArray[np.int64]
 
 
 def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
-    """Return the sums (m,) of values (n,) over each of the units that the rows (n,)
-    belong to, in their order.
+    """Return the sum (m,) of values (n,) over each unit, in the order of the units.
+
+    `units` (n,) are the units of the rows.
     """
-    _, places = np.unique(units, return_inverse=True)
-    return np.bincount(places.reshape(-1), np.asarray(values, dtype=np.float64)).astype(
-        np.float64
-    )
+    _, unit_index = np.unique(units, return_inverse=True)
+    weights = np.asarray(values, dtype=np.float64)
+    return np.bincount(unit_index.reshape(-1), weights).astype(np.float64)
 
 
 def mean_share(counted: npt.ArrayLike, of: npt.ArrayLike) -> float:
-    """Return the mean over units of the share of each: `counted` (n,) of the
-    predictions `of` (n,) of a unit; units without predictions are left out. NaN without
-    any.
+    """Return the mean rate over units; NaN if none has a row.
+
+    Args:
+        counted: (n,) rows of each unit that count.
+        of: (n,) rows of each unit; units without any are left out.
     """
-    k = np.asarray(counted, dtype=np.float64)
-    o = np.asarray(of, dtype=np.float64)
-    k = k[o > 0.0]
-    o = o[o > 0.0]
-    if not len(o):
+    n_counted = np.asarray(counted, dtype=np.float64)
+    n_rows = np.asarray(of, dtype=np.float64)
+    n_counted = n_counted[n_rows > 0.0]
+    n_rows = n_rows[n_rows > 0.0]
+    if not len(n_rows):
         return math.nan
-    if o.min() == o.max():
-        return float(k.sum() / o.sum())
-    return float((k / o).mean())
+    if n_rows.min() == n_rows.max():
+        return float(n_counted.sum() / n_rows.sum())
+    return float((n_counted / n_rows).mean())
 
 
 def share_interval(
     counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Return the interval of the mean over units of the share of each (`mean_share`),
-    whatever the number of units. Each has predictions, (n,) from 0, and one of them
-    some; `counted` are (n,) from 0 to `of`; the confidence is between 0 and 1.
+    """Return the interval of the mean rate over units, for any number of units.
+
+    Args:
+        counted: (n,) rows of each unit that count, from 0 to `of`.
+        of: (n,) rows of each unit, from 0; at least one has rows.
+        confidence: between 0 and 1.
+
+    Raises:
+        InputError: counts are out of range.
     """
-    k = np.asarray(counted, dtype=np.float64)
-    o = np.asarray(of, dtype=np.float64)
-    if (
-        k.shape != o.shape
-        or not o.size
-        or o.max() <= 0
-        or (k < 0).any()
-        or (k > o).any()
-    ):
+    n_counted = np.asarray(counted, dtype=np.float64)
+    n_rows = np.asarray(of, dtype=np.float64)
+    has_rows = n_counted.shape == n_rows.shape and n_rows.size and n_rows.max() > 0
+    if not has_rows or (n_counted < 0).any() or (n_counted > n_rows).any():
         raise InputError(
             "share: expected counts from 0 to the predictions of each "
             "unit, and one prediction at least"
         )
-    if o.max() == 1.0:
-        return clopper_pearson(round(k.sum()), round(o.sum()), confidence)
-    return _by_bets(k[o > 0.0] / o[o > 0.0], confidence)
+    if n_rows.max() == 1.0:
+        return clopper_pearson(round(n_counted.sum()), round(n_rows.sum()), confidence)
+    is_used = n_rows > 0.0
+    return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
 
 
-def _by_bets(shares: Numbers, confidence: float) -> tuple[float, float]:
-    """Return the interval of the mean of independent draws (n,) in [0, 1]."""
-    values, times = np.unique(shares, return_counts=True)
-    least = np.log(2.0 / (1.0 - confidence))
-    low = edge_of(lambda mean: log_capital(mean, values, times) < least)
-    return low, edge_of(
-        lambda mean: log_capital(1.0 - mean, 1.0 - values, times) >= least
-    )
+def _betting_interval(samples: Numbers, confidence: float) -> tuple[float, float]:
+    """Return the interval of the mean of independent samples (n,) in [0, 1], by bets."""
+    values, counts = np.unique(samples, return_counts=True)
+    threshold = np.log(2.0 / (1.0 - confidence))
+
+    def may_be_mean(mean: float) -> bool:
+        """Whether bets on "more than the mean" have not won."""
+        return bool(log_capital(mean, values, counts) < threshold)
+
+    def is_too_large(mean: float) -> bool:
+        """Whether bets on "less than the mean" have won."""
+        return bool(log_capital(1.0 - mean, 1.0 - values, counts) >= threshold)
+
+    return edge_of(may_be_mean), edge_of(is_too_large)
 
 
 def mean_interval(
     values: npt.ArrayLike, low: float, high: float
 ) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of independent numbers (n,) in a range that
-    is known beforehand: from the plan, never from the numbers.
+    """Return the 95 % interval of the mean of independent values (n,) in a range.
+
+    The range has to be known from the plan, and not from the values.
     """
-    numbers = np.asarray(values, dtype=np.float64)
+    samples = np.asarray(values, dtype=np.float64)
     if high <= low:
         return low, low
-    first, last = _by_bets(
-        np.clip((numbers - low) / (high - low), 0.0, 1.0), CONFIDENCE
-    )
-    return low + (high - low) * first, low + (high - low) * last
+    scaled = np.clip((samples - low) / (high - low), 0.0, 1.0)
+    lower, upper = _betting_interval(scaled, CONFIDENCE)
+    return low + (high - low) * lower, low + (high - low) * upper
 
 
 def most_shown(units: int) -> float:
-    """Return the lower end of a share's 95 % interval where so many units are right
-    throughout: the most to show.
+    """Return the lower bound of the 95 % interval of a rate if all units are right.
+
+    It is the largest that this number of units can show.
     """
-    return _by_bets(np.ones(units), CONFIDENCE)[0]
+    return _betting_interval(np.ones(units), CONFIDENCE)[0]
 
 
 def paired_by_unit(
     first: Any, second: Any, units: Units
 ) -> tuple[float, tuple[float, float], float]:
-    """Return how much more often the second of two outcomes (n,) happens than the first, the 95 % interval of that, and
-    how likely it is that chance parts them as far where neither happens more often, in (0, 1]; rows (n,) of one unit
-    are not independent, and all units weigh the same (`mean_share`). The interval is without 0 where that is at most
-    0.05."""
+    """Compare two outcomes of the same rows, which are clustered in units.
+
+    All units weigh the same (`mean_share`). Where each has a single row, the exact
+    tests of Newcombe and McNemar are used.
+
+    Args:
+        first, second: (n,) bool, whether each outcome happens.
+        units: (n,) unit of each row.
+
+    Returns:
+        How much more often the second outcome happens; the 95 % interval of that; and
+        the p-value, in (0, 1], of the hypothesis that none happens more often. The
+        interval is without 0 where the p-value is at most 0.05.
+    """
     first = np.asarray(first, dtype=bool)
     second = np.asarray(second, dtype=bool)
-    if len(np.unique(units)) == len(units):
-        both = (first & second).sum()
-        lost = (first & ~second).sum()
-        won = (~first & second).sum()
-        counts = int(both), int(lost), int(won), len(first) - int(both + lost + won)
-        return *paired_difference(*counts), mcnemar(counts[1], counts[2])
-    of = per_unit(np.ones(len(first)), units)
-    ahead = per_unit((1.0 + second - 1.0 * first) / 2.0, units)
-    low, high = _by_bets(ahead / of, CONFIDENCE)
-    once = np.ones(len(of))
-    most_won = max(
-        log_capital(0.5, ahead / of, once), log_capital(0.5, 1.0 - ahead / of, once)
-    )
-    difference = mean_share(per_unit(second, units), of) - mean_share(
-        per_unit(first, units), of
-    )
-    return (
-        difference,
-        (2 * low - 1, 2 * high - 1),
-        float(min(1.0, 2.0 * np.exp(-most_won))),
-    )
+    n_rows = len(first)
+    if len(np.unique(units)) == n_rows:
+        n_both = int((first & second).sum())
+        n_first = int((first & ~second).sum())
+        n_second = int((~first & second).sum())
+        n_neither = n_rows - (n_both + n_first + n_second)
+        difference, interval = paired_difference(n_both, n_first, n_second, n_neither)
+        return difference, interval, mcnemar(n_first, n_second)
+    unit_rows = per_unit(np.ones(n_rows), units)
+    # 0 where only the first happens, 1 where only the second does, else 1/2
+    unit_advantage = per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
+    lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
+    once = np.ones(len(unit_rows))
+    log_capital_second = log_capital(0.5, unit_advantage, once)
+    log_capital_first = log_capital(0.5, 1.0 - unit_advantage, once)
+    max_log_capital = max(log_capital_second, log_capital_first)
+    second_rate = mean_share(per_unit(second, units), unit_rows)
+    first_rate = mean_share(per_unit(first, units), unit_rows)
+    p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
+    return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
 
 
-# of right predictions on both sides, at which two shares are compared
+# rates, the same inside and outside, under which the bets of the test are computed
 SHARES = np.linspace(0.0, 1.0, 402)[1:-1]
-# how often units are dealt out anew, so that no probability is under 0.0001
+# permutations of units, so that no p-value is below 0.0001
 EXCHANGES = 9_999
 
 
@@ -165,67 +184,117 @@ def fewer_by_chance(
     rest: npt.ArrayLike,
     times: float = 1.0,
 ) -> float:
-    """Return how likely it is, in (0, 1], that so few predictions or fewer are right on
-    one side of a rule, if as many are right on the other.
+    """Return the one-sided p-value of fewer right predictions inside a rule.
 
-    Where each unit has one prediction that is Fisher's exact test, one-sided. Where all
-    units have as many and lie on one side each, units are dealt out to the sides anew.
-    Elsewhere, where the rule cuts through units or some have more predictions than
-    others, it is one over the least that bets on "fewer here than m, more there" have
-    made of 1, of all m: a bound, also where sides of a unit are alike. All units of a
-    side weigh the same (`mean_share`).
+    The hypothesis is that as large a part of the predictions is right outside. Where
+    each unit has a single prediction, this is Fisher's exact test. Where all units have
+    equally many and lie inside or outside, units are permuted. Elsewhere, where the rule
+    cuts through units or some have more predictions than others, it is a bound by bets
+    (`_betting_p_value`). All units weigh the same (`mean_share`).
 
     Args:
-        inside, of: (n,) of each unit, right predictions and predictions under the rule.
-        beside, rest: (n,) those elsewhere.
-        times: how many times there are each of these units.
+        inside, of: (n,) of each unit, right predictions and predictions inside.
+        beside, rest: (n,) of each unit, right predictions and predictions outside.
+        times: how many copies there are of each of these units.
     """
-    k, a, r, b = (
-        np.asarray(counts, dtype=np.float64) for counts in (inside, of, beside, rest)
-    )
-    if not a.any() or not b.any():
+    right_inside = np.asarray(inside, dtype=np.float64)
+    rows_inside = np.asarray(of, dtype=np.float64)
+    right_outside = np.asarray(beside, dtype=np.float64)
+    rows_outside = np.asarray(rest, dtype=np.float64)
+    if not rows_inside.any() or not rows_outside.any():
         return 1.0
-    if (a + b).max() == 1.0:
-        # takes half a second, and a search needs none of it
-        from scipy.stats import hypergeom
-
-        here, there, right, others = (
-            round(times * float(counts.sum())) for counts in (k, a, r, b)
+    unit_rows = rows_inside + rows_outside
+    if unit_rows.max() == 1.0:
+        return _fisher_p_value(
+            round(times * float(right_inside.sum())),
+            round(times * float(rows_inside.sum())),
+            round(times * float(right_outside.sum())),
+            round(times * float(rows_outside.sum())),
         )
-
-        return float(hypergeom.cdf(here, there + others, here + right, there))
-    is_cut = bool(((a > 0.0) & (b > 0.0)).any())
-    if not is_cut and len(np.unique(a + b)) == 1:
-        values, copies = np.unique(k + r, return_counts=True)
-        copies = np.round(times * copies).astype(np.int64)
-        dealt = round(times * float((a > 0).sum()))
-        rng = np.random.default_rng(0)
-        drawn = rng.multivariate_hypergeometric(
-            copies, min(dealt, int(copies.sum())), EXCHANGES, method="marginals"
+    is_inside = rows_inside > 0.0
+    is_cut = bool((is_inside & (rows_outside > 0.0)).any())
+    if not is_cut and len(np.unique(unit_rows)) == 1:
+        return _permutation_p_value(
+            right_inside + right_outside,
+            n_inside=round(times * float(is_inside.sum())),
+            n_right_inside=times * float(right_inside.sum()),
+            times=times,
         )
-        return float(
-            (1 + (drawn @ values <= times * k.sum() + 1e-9).sum()) / (1 + EXCHANGES)
-        )
-    # What a unit wins or loses on each side; half is staked on each where a unit can
-    # have both.
-    wrong_here = np.divide(a - k, a, out=np.zeros_like(a), where=a > 0.0)
-    right_there = np.divide(r, b, out=np.zeros_like(b), where=b > 0.0)
-    rows, copies = np.unique(
-        np.stack([wrong_here, a > 0.0, right_there, b > 0.0], axis=1),
-        axis=0,
-        return_counts=True,
+    wrong_inside = np.divide(
+        rows_inside - right_inside,
+        rows_inside,
+        out=np.zeros_like(rows_inside),
+        where=is_inside,
     )
-    wrong, is_here, right, is_there = (column[:, None] for column in rows.T)
-    bets = (0.5 if is_cut else 1.0) * (
-        wrong / (1.0 - SHARES) - is_here + right / SHARES - is_there
+    rate_outside = np.divide(
+        right_outside,
+        rows_outside,
+        out=np.zeros_like(rows_outside),
+        where=rows_outside > 0.0,
+    )
+    rates = np.stack(
+        [wrong_inside, is_inside, rate_outside, rows_outside > 0.0], axis=1
+    )
+    return _betting_p_value(rates, is_cut=is_cut, times=times)
+
+
+def _fisher_p_value(
+    right_inside: int, inside: int, right_outside: int, outside: int
+) -> float:
+    """Return the one-sided p-value of Fisher's exact test."""
+    # takes half a second, and a search needs none of it
+    from scipy.stats import hypergeom
+
+    right = right_inside + right_outside
+    return float(hypergeom.cdf(right_inside, inside + outside, right, inside))
+
+
+def _permutation_p_value(
+    unit_right: Numbers, *, n_inside: int, n_right_inside: float, times: float
+) -> float:
+    """Return the one-sided p-value of a permutation test over units of equal size.
+
+    Args:
+        unit_right: (n,) right predictions of each unit.
+        n_inside: units inside, copies included.
+        n_right_inside: their right predictions.
+        times: copies of each unit.
+    """
+    values, n_units = np.unique(unit_right, return_counts=True)
+    n_units = np.round(times * n_units).astype(np.int64)
+    rng = np.random.default_rng(0)
+    sampled_units = rng.multivariate_hypergeometric(
+        n_units, min(n_inside, int(n_units.sum())), EXCHANGES, method="marginals"
+    )
+    n_as_few = (sampled_units @ values <= n_right_inside + 1e-9).sum()
+    return float((1 + n_as_few) / (1 + EXCHANGES))
+
+
+def _betting_p_value(rates: Numbers, *, is_cut: bool, times: float) -> float:
+    """Return a bound of the p-value: one over the capital of bets.
+
+    The bets are on "fewer inside than m, more outside", and the smallest capital of all
+    m counts. It is a bound also where units differ. Half is staked inside and half
+    outside where a unit can have both.
+
+    Args:
+        rates: (n, 4) of each unit: the rate of wrong predictions inside, 1 if it has
+            any inside, the rate of right ones outside, 1 if it has any outside.
+        is_cut: whether a unit has predictions both inside and outside.
+        times: copies of each unit.
+    """
+    distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
+    wrong_inside, is_inside, right_outside, is_outside = (
+        column[:, None] for column in distinct_rates.T
+    )
+    stake_fraction = 0.5 if is_cut else 1.0
+    gains = stake_fraction * (
+        wrong_inside / (1.0 - SHARES) - is_inside + right_outside / SHARES - is_outside
     )
     with np.errstate(divide="ignore"):
-        won = [
-            times
-            * (copies[:, None] * np.log(np.maximum(1.0 + stake * bets, 0.0))).sum(
-                axis=0
-            )
-            for stake in STAKES
-        ]
-    least = (np.logaddexp.reduce(won, axis=0) - np.log(len(STAKES))).min()
-    return float(min(1.0, np.exp(-least)))
+        log_capitals = []
+        for stake in STAKES:
+            log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
+            log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
+    mean_log_capital = np.logaddexp.reduce(log_capitals, axis=0) - np.log(len(STAKES))
+    return float(min(1.0, np.exp(-mean_log_capital.min())))

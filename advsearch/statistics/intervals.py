@@ -1,4 +1,4 @@
-"""Confidence intervals of a share of independent trials."""
+"""Confidence intervals of a rate of independent trials."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ def clopper_pearson(
     1): low solves P(X >= k | low) = a/2 and high P(X <= k | high) = a/2, quantiles of
     beta distributions: B(a/2; k, n - k + 1), exactly 0 for k = 0, and B(1 - a/2; k + 1,
     n - k), exactly 1 for k = n. The interval covers the true rate at least as often as
-    it says, at every n (Clopper and Pearson 1934). Raises InputError where an argument
-    is out of range.
+    it says, at every n (Clopper and Pearson 1934).
+
+    Raises:
+        InputError: an argument is out of range.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -35,24 +37,23 @@ def clopper_pearson(
             f"confidence: expected a number between 0 and 1, got {confidence}"
         )
     tail = (1.0 - confidence) / 2.0
-    low = (
-        0.0
-        if successes == 0
-        else float(betaincinv(successes, trials - successes + 1, tail))
-    )
-    high = (
-        1.0
-        if successes == trials
-        else float(betaincinv(successes + 1, trials - successes, 1.0 - tail))
-    )
+    failures = trials - successes
+    low = 0.0
+    if successes:
+        low = float(betaincinv(successes, failures + 1, tail))
+    high = 1.0
+    if failures:
+        high = float(betaincinv(successes + 1, failures, 1.0 - tail))
     return low, high
 
 
 def wilson(share: Any, n: Any) -> tuple[Any, Any]:
-    """Return both ends of Wilson's score interval (1927) of shares of n, 95 %; numbers
-    or arrays.
+    """Return Wilson's 95 % score interval (1927) of rates of n trials.
+
+    Both are numbers or arrays, and so are the lower and upper bounds.
     """
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
-    middle = share + z * z / (2 * n)
-    half = z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
+    center = share + z * z / (2 * n)
+    half_width = z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
+    scale = 1 + z * z / n
+    return (center - half_width) / scale, (center + half_width) / scale

@@ -1,4 +1,4 @@
-"""Shares that fall along an axis: isotonic fit, and a test for where they do not."""
+"""Rates that fall along an axis: isotonic fit, and a test for where they do not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FALSE_ALARMS = 0.05
-"""Share of falling curves of which a dip is reported, at most."""
+"""Fraction of falling curves of which a dip is reported, at most."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Dip:
 def _fit_falling(
     right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Fit shares (m,) that do not rise, by isotonic regression."""
+    """Fit rates (m,) that do not rise, by isotonic regression."""
     from scipy.optimize import isotonic_regression  # takes a quarter of a second
 
     fitted: NDArray[np.float64] = isotonic_regression(
@@ -52,43 +52,48 @@ def _fit_falling(
 def find_dips(
     distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[Dip, ...]:
-    """Find distances, the nearest first, at which an object is seen less often than
-    beyond them.
+    """Find distances, the nearest first, at which an object is seen less than beyond.
 
     Each distance is compared with each run of distances right behind it by Fisher's
     exact test (one-sided), and the p-values are multiplied by how many comparisons
-    there are (Bonferroni). Where the shares fall, those beyond are at most the nearer
+    there are (Bonferroni). Where the rates fall, those beyond are at most the nearer
     one, which makes large differences only rarer: so one falling curve in twenty has a
-    dip that is shown, at most (`benchmarks/first_seen.py --simulated`). Listed are
-    those that are shown, and those that bring the estimate's line below the shares
-    beyond, which may be chance.
+    significant dip, at most (`benchmarks/first_seen.py --simulated`). Listed are
+    significant dips, and those that bring the estimate's line below the rates beyond,
+    which may be chance.
+
+    Args:
+        distances: m distances, ascending.
+        right: (m,) images that are right at each.
+        counts: (m,) images at each.
     """
     from scipy.stats import hypergeom  # takes half a second
 
     n_distances = len(distances)
-    comparisons = n_distances * (n_distances - 1) / 2.0
-    right_before, counts_before = (
-        np.concatenate([[0], np.cumsum(column)]) for column in (right, counts)
-    )
+    n_comparisons = n_distances * (n_distances - 1) / 2.0
+    right_before = np.concatenate([[0], np.cumsum(right)])
+    counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
-        far = np.arange(near + 2, n_distances + 1)
-        right_beyond = right_before[far] - right_before[near + 1]
-        counts_beyond = counts_before[far] - counts_before[near + 1]
-        total_right = right_beyond + right[near]
-        total = counts_beyond + counts[near]
-        p = hypergeom.cdf(right[near], total, total_right, counts[near])
-        lower = right[near] / counts[near] < right_beyond / counts_beyond
-        if not lower.any():
-            continue
-        best = int(np.argmin(np.where(lower, p, np.inf)))
-        dips.append(
-            Dip(
-                distance=float(distances[near]),
-                seen=(int(right[near]), int(counts[near])),
-                until=float(distances[near + 1 + best]),
-                beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-                p=min(1.0, float(p[best]) * comparisons),
-            )
+        end = np.arange(near + 2, n_distances + 1)
+        right_beyond = right_before[end] - right_before[near + 1]
+        counts_beyond = counts_before[end] - counts_before[near + 1]
+        p_values = hypergeom.cdf(
+            right[near],
+            counts_beyond + counts[near],
+            right_beyond + right[near],
+            counts[near],
         )
+        is_dip = right[near] / counts[near] < right_beyond / counts_beyond
+        if not is_dip.any():
+            continue
+        best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
+        dip = Dip(
+            distance=float(distances[near]),
+            seen=(int(right[near]), int(counts[near])),
+            until=float(distances[near + 1 + best]),
+            beyond=(int(right_beyond[best]), int(counts_beyond[best])),
+            p=min(1.0, float(p_values[best]) * n_comparisons),
+        )
+        dips.append(dip)
     return tuple(dips)

@@ -17,8 +17,9 @@ from advsearch.statistics.intervals import CONFIDENCE
 
 
 def edge_of(beyond: Callable[[float], bool]) -> float:
-    """Return where in (0, 1) a condition begins to hold, 0 or 1 where it holds
-    everywhere or nowhere.
+    """Return where in (0, 1) a monotone condition begins to hold, by bisection.
+
+    0 if it holds everywhere, 1 if it holds nowhere.
     """
     low = 1e-9
     high = 1.0 - 1e-9
@@ -27,14 +28,18 @@ def edge_of(beyond: Callable[[float], bool]) -> float:
     if not beyond(high):
         return 1.0
     for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if beyond(middle) else (middle, high)
+        center = 0.5 * (low + high)
+        if beyond(center):
+            high = center
+        else:
+            low = center
     return high
 
 
 STAKES = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125])
-"""Among which the capital is shared equally. Large ones decide soon where nearly all
-draws agree.
+"""Stakes among which the capital is split equally.
+
+Large ones decide soon where nearly all samples agree.
 """
 
 
@@ -47,7 +52,8 @@ class ConfidenceSequence:
     stakes a share c of what he has, on "more than m" or on "less than m", plays a fair
     game:
 
-        K_t(m, c) = prod_s (1 - c + c x_s / m)       and       prod_s (1 - c + c (1 - x_s) / (1 - m))
+        K_t(m, c) = prod_s (1 - c + c x_s / m)
+        L_t(m, c) = prod_s (1 - c + c (1 - x_s) / (1 - m))
 
     His capital, a mean over stakes c, exceeds 2 / a at some time with a probability of
     a / 2 at most (Ville 1939). So the m at which neither does are an interval that
@@ -83,64 +89,76 @@ class ConfidenceSequence:
 
     @property
     def mean(self) -> float:
-        return (
-            sum(value * count for value, count in self._counts.items()) / self.count
-            if self.count
-            else math.nan
-        )
+        """Mean of the samples; NaN if there are none."""
+        if not self.count:
+            return math.nan
+        return sum(value * count for value, count in self._counts.items()) / self.count
 
     def is_over(self, mean: float) -> bool:
-        """Whether the true mean is shown to be over a number in (0, 1)."""
-        return self._won(mean, self._counts)
+        """Return whether the true mean is shown to be over a number in (0, 1)."""
+        return self._has_won(mean, self._counts)
 
     def is_under(self, mean: float) -> bool:
-        """Whether the true mean is shown to be under a number in (0, 1)."""
-        return self._won(
-            1.0 - mean, {1.0 - value: count for value, count in self._counts.items()}
-        )
+        """Return whether the true mean is shown to be under a number in (0, 1)."""
+        mirrored = {1.0 - value: count for value, count in self._counts.items()}
+        return self._has_won(1.0 - mean, mirrored)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Both ends of the means that are not excluded; `is_over` and `is_under` are
-        monotone in the mean.
-        """
-        return edge_of(lambda mean: not self.is_over(mean)), edge_of(self.is_under)
+        """Lower and upper bound of the means that are not excluded.
 
-    def _won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        return bool(
-            capital(mean, counts) >= np.log(self.sides / (1.0 - self.confidence))
-        )
+        `is_over` and `is_under` are monotone in the mean.
+        """
+        lower = edge_of(lambda mean: not self.is_over(mean))
+        return lower, edge_of(self.is_under)
+
+    def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
+        threshold = np.log(self.sides / (1.0 - self.confidence))
+        return bool(capital(mean, counts) >= threshold)
 
 
 def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
-    """Return how many draws, all of one value over a mean in (0, 1), show that the true
-    one is over it, by one side of a `ConfidenceSequence`: no others show it sooner
-    where the value is 1.
+    """Return how many equal samples show that the true mean is over a number.
+
+    It is by one side of a `ConfidenceSequence`; where the value is 1, no other samples
+    show it sooner.
+
+    Args:
+        mean: the number, in (0, 1).
+        confidence: of the sequence.
+        value: of all samples, over `mean`.
     """
 
-    def shown(count: int) -> bool:
+    def is_enough(count: int) -> bool:
         return capital(mean, {value: count}) >= math.log(1.0 / (1.0 - confidence))
 
-    high = 1
-    while not shown(high):
-        high *= 2
-    return bisect_left(range(1, high + 1), True, key=shown) + 1
+    upper = 1
+    while not is_enough(upper):
+        upper *= 2
+    return bisect_left(range(1, upper + 1), True, key=is_enough) + 1
 
 
 def capital(mean: float, counts: Mapping[float, int]) -> float:
-    """Return the logarithm of what the bets on "more than `mean`" have made of 1, -inf
-    where all is lost.
+    """Return the logarithm of the capital that bets on "more than `mean`" have made.
+
+    It starts with 1; -inf where all is lost. `counts` has the samples in [0, 1].
     """
-    return log_capital(
-        mean, np.array(list(counts), dtype=np.float64), np.array(list(counts.values()))
-    )
+    values = np.array(list(counts), dtype=np.float64)
+    return log_capital(mean, values, np.array(list(counts.values())))
 
 
 def log_capital(
     mean: float, values: npt.NDArray[Any], times: npt.NDArray[Any]
 ) -> float:
-    """Return the same of draws (n,) in [0, 1], so many `times` each."""
+    """Return the logarithm of the capital; see `capital`.
+
+    Args:
+        mean: that the bets are on.
+        values: (n,) distinct samples in [0, 1].
+        times: (n,) how often each occurs.
+    """
     with np.errstate(divide="ignore"):
-        won = np.log(np.maximum(1.0 - STAKES + STAKES * (values / mean)[:, None], 0.0))
-        total = (times[:, None] * won).sum(axis=0)
-    return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
+        factors = 1.0 - STAKES + STAKES * (values / mean)[:, None]
+        log_factors = np.log(np.maximum(factors, 0.0))
+        log_capital_of_stake = (times[:, None] * log_factors).sum(axis=0)
+    return float(np.logaddexp.reduce(log_capital_of_stake) - np.log(len(STAKES)))

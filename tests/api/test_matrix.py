@@ -90,7 +90,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
             raise KeyboardInterrupt
         return real(*given)
 
-    monkeypatch.setattr(Retrials, "_rendered", stopped)
+    monkeypatch.setattr(Retrials, "_render", stopped)
     first = carried_out(tmp_path / "run")
     assert first.ending == "interrupted" and first.goes_on
     again = attack.run(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")

@@ -146,13 +146,13 @@ def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> Non
     """Where there is memory for two or three, the newest are kept and nothing fails."""
     monkeypatch.setattr(bank, "MOST_BYTES", 150_000)
     kept: list[list[int]] = []
-    drawn = Bank._drawn
+    drawn = Bank._choose_conditions
 
     def watched(self: Bank, kind: str, index: int) -> Any:
-        kept.append([one.number for one in self._held])
+        kept.append([one.number for one in self._conditions])
         return drawn(self, kind, index)
 
-    monkeypatch.setattr(Bank, "_drawn", watched)
+    monkeypatch.setattr(Bank, "_choose_conditions", watched)
     told = advsearch.attack("mug", **SMALL).summary.transport
     assert told is not None and told.conditions is not None and told.bytes is not None
     assert told.conditions.dropped == 10 - len(kept[-1]) and told.bytes <= 150_000
@@ -172,17 +172,17 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     generator = torch.Generator().manual_seed(1)
     u = problem.domain.sample(generator)[0]
     with torch.no_grad():
-        before, after = (made._pictures(made._held, at) for at in (problem.domain.start, u))
-        for one, change in zip(made._held, after - before, strict=True):
+        before, after = (made._predict_images(made._conditions, at) for at in (problem.domain.start, u))
+        for one, change in zip(made._conditions, after - before, strict=True):
             wholes = (torch.cat([at, one.numbers]) for at in (problem.domain.start, u))
             first, second = (problem.renderer(whole, seed=1, spp=64) for whole in wholes)
             assert float((change - second + first).square().mean()) < 0.1 * float((second - first).square().mean())
-    each = [made._evaluated([one], u, True) for one in made._held]
+    each = [made._evaluate_under([one], u, True) for one in made._conditions]
     values, gradients = torch.tensor([one.objective for one in each]), [one.gradient for one in each]
     weights = hard_first(values)
     assert float(weights.mean()) == pytest.approx(1.0) and int(weights.argmax()) == int(values.argmin())
     mean = sum(weight * one for weight, one in zip(weights, gradients, strict=True) if one is not None) / len(each)
-    torch.testing.assert_close(made._evaluated(made._held, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(made._evaluate_under(made._conditions, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
 
 
 def test_conditions_that_are_all_alike_count_the_same() -> None:

@@ -216,5 +216,5 @@ def test_a_random_search_looks_through_the_same_cameras_again() -> None:
     assert objective("baseline", 1) == objective("baseline", 5) != objective("baseline", 2)
     assert len({objective("search", number) for number in (1, 5, 9)}) == 3
     exposures = [group.coordinates for group in problem.space.groups if group.name == "environment.exposure"]
-    seen = {float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._drawn("search", n, 2)}
+    seen = {float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._choose_conditions("search", n, 2)}
     assert len(seen) == 18 and len(light.renderer.lights_kept) <= 4

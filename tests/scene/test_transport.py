@@ -236,7 +236,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
 
 def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores of 4 on average, 19 of 20 of them over 3.1; a prediction of 5 was 1.9 too good."""
-    monkeypatch.setattr(searching.Transport, "_score", lambda self, u: float(u))
+    monkeypatch.setattr(searching.Transport, "_predict_score", lambda self, u: float(u))
     problem: Any = None
     made = searching.Transport(problem, 1)
     assert made.likely(torch.tensor(0.1)) and not made.likely(torch.tensor(-0.1))

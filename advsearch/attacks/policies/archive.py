@@ -65,79 +65,95 @@ class ArchiveState:
     seen: policies.Observed | None = None
 
     def kept(self) -> ArchiveState:
-        """Let a copy of the archive take in what is evaluated of a generation; what
-        could not be has no cell.
+        """Return the state with a copy of the archive that has the generation so far.
+
+        What could not be evaluated has no cell.
         """
-        values = np.array(self.values)
-        finite = np.isfinite(values)
+        objectives = np.array(self.values)
+        is_finite = np.isfinite(objectives)
         archive = copy.deepcopy(self.archive)
-        if finite.any():
-            points = self.points[: len(values)][torch.from_numpy(finite)]
+        if is_finite.any():
+            points = self.points[: len(objectives)][torch.from_numpy(is_finite)]
             measures = points[:, self.spanned].double().numpy()
             archive.add(
                 points.numpy(),
-                values[finite],
+                objectives[is_finite],
                 measures,
-                wrong=np.array(self.wrong)[finite],
+                wrong=np.array(self.wrong)[is_finite],
             )
         return replace(self, archive=archive)
 
     def bred(self, samples: Tensor, rng: torch.Generator) -> Tensor:
-        """Return (n, d), each made of two kept ones and maybe out of bounds; options
-        are those of the first, now and then of a sample (n, d).
+        """Return offspring (n, d) of the archive, which may be out of bounds.
+
+        Each has two parents. Its options are those of the first, now and then of a
+        sample (n, d).
         """
         count, dim = samples.shape
-        archive = copy.deepcopy(self.archive)  # it draws with a generator of its own
-        drawn = archive.sample_elites((TOURNAMENT + 1) * count)
-        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, count))
-        best = (
-            torch.from_numpy(drawn["objective"])
-            .unflatten(0, (TOURNAMENT + 1, count))[1:]
-            .argmax(0)
-        )
-        first = kept[1 + best, torch.arange(count)]
-        second = kept[0]
+        # Sampling changes the generator of an archive.
+        archive = copy.deepcopy(self.archive)
+        elites = archive.sample_elites((TOURNAMENT + 1) * count)
+        shape = (TOURNAMENT + 1, count)
+        solutions = torch.from_numpy(elites["solution"]).unflatten(0, shape)
+        objectives = torch.from_numpy(elites["objective"]).unflatten(0, shape)
+        winner = objectives[1:].argmax(0)
+        first = solutions[1 + winner, torch.arange(count)]
+        second = solutions[0]
         noise = torch.randn(count, dim, generator=rng)
         noise[:, self.spanned] *= WIDER
-        along = LINE * torch.randn(count, 1, generator=rng)
-        points: Tensor = first + SIGMA * self.half * noise + along * (second - first)
-        anew = torch.rand(count, dim, generator=rng) < ANEW
+        line_step = LINE * torch.randn(count, 1, generator=rng)
+        offspring: Tensor = (
+            first + SIGMA * self.half * noise + line_step * (second - first)
+        )
+        is_resampled = torch.rand(count, dim, generator=rng) < ANEW
         for block, part in self.domain.parts():
             if block.options:
-                points[:, part] = torch.where(
-                    anew[:, part], samples[:, part], first[:, part]
+                offspring[:, part] = torch.where(
+                    is_resampled[:, part], samples[:, part], first[:, part]
                 )
-        return points
+        return offspring
 
     def likeliest(
         self, surrogate: policies.Surrogate, points: Tensor, count: int
     ) -> Tensor:
-        """Return (count, d) of the candidates (n, d), of different cells as long as
-        there are: those that most likely fail where nothing fails yet. Where something
-        does, being worse than it counts for `BETTER` as much.
+        """Return the most promising of the candidates (n, d), (count, d).
+
+        They are of different cells as long as there are enough: those that most likely
+        fail where nothing fails yet. Where something does, a larger objective than its
+        own counts for `BETTER` as much.
         """
         mean, deviation = surrogate.predict(surrogate.space.take(points))
-        kept = self.archive.data()
-        objective = torch.from_numpy(kept["objective"])
-        wrong = torch.from_numpy(kept["wrong"])
-        enough = float(objective[wrong].min() if bool(wrong.any()) else objective.max())
-        failing = dict(
-            zip(
-                kept["index"][kept["wrong"]].tolist(),
-                objective[wrong].tolist(),
-                strict=True,
-            )
+        elites = self.archive.data()
+        objectives = torch.from_numpy(elites["objective"])
+        is_wrong = torch.from_numpy(elites["wrong"])
+        wrong_objectives = objectives[is_wrong]
+        wrong_cells = elites["index"][elites["wrong"]].tolist()
+        objective_of_cell = dict(
+            zip(wrong_cells, wrong_objectives.tolist(), strict=True)
         )
-        cells = self.archive.index_of(points[:, self.spanned].double().numpy()).tolist()
-        to_beat = torch.tensor([failing.get(cell, enough) for cell in cells])
-        weight = torch.tensor([BETTER if cell in failing else 1.0 for cell in cells])
-        likely = weight * torch.special.ndtr((mean - to_beat) / deviation)
-        order = likely.argsort(descending=True, stable=True).tolist()
-        first = dict[int, int]()  # the likeliest of each cell, in order
-        for number in order:
-            first.setdefault(cells[number], number)
-        others = [number for number in order if first[cells[number]] != number]
-        return points[[*first.values(), *others][:count]]
+        threshold = float(
+            wrong_objectives.min() if bool(is_wrong.any()) else objectives.max()
+        )
+        measures = points[:, self.spanned].double().numpy()
+        cells = self.archive.index_of(measures).tolist()
+        to_beat = torch.tensor(
+            [objective_of_cell.get(cell, threshold) for cell in cells]
+        )
+        weight = torch.tensor(
+            [BETTER if cell in objective_of_cell else 1.0 for cell in cells]
+        )
+        promise = weight * torch.special.ndtr((mean - to_beat) / deviation)
+        order = promise.argsort(descending=True, stable=True).tolist()
+        return points[_one_per_cell_first(order, cells)[:count]]
+
+
+def _one_per_cell_first(order: list[int], cells: list[int]) -> list[int]:
+    """Return the order with the first candidate of each cell before all others."""
+    first_of_cell = dict[int, int]()
+    for index in order:
+        first_of_cell.setdefault(cells[index], index)
+    others = [index for index in order if first_of_cell[cells[index]] != index]
+    return [*first_of_cell.values(), *others]
 
 
 @dataclass(frozen=True)
@@ -214,11 +230,21 @@ class MapElites(Policy[ArchiveState]):
         from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
-            solution_dim=domain.dim, dims=dims, seed=seeds.stream(seed, "archive"),
-            ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
-            solution_dtype=np.float32, objective_dtype=np.float64, measures_dtype=np.float64,
+            solution_dim=domain.dim,
+            dims=dims,
+            seed=seeds.stream(seed, "archive"),
+            ranges=list(
+                zip(
+                    domain.lower[spanned].tolist(),
+                    domain.upper[spanned].tolist(),
+                    strict=True,
+                )
+            ),
+            solution_dtype=np.float32,
+            objective_dtype=np.float64,
+            measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
-        )  # fmt: skip
+        )
         first = [
             domain.begin[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
@@ -258,75 +284,90 @@ class MapElites(Policy[ArchiveState]):
         return state if len(values) < len(state.points) else self._next(state.kept())
 
     def failures(self, state: ArchiveState) -> policies.Failures:
-        """Return the cells whose configuration is a success; those of a generation that
-        is not whole yet count.
+        """Return the cells whose configuration is a success.
+
+        Those of a generation that is not complete yet count.
         """
         archive = state.kept().archive
-        over = tuple(state.spanned.tolist())
-        kept = archive.data()
-        wrong = np.flatnonzero(kept["wrong"])
-        at = archive.int_to_grid_index(kept["index"][wrong])
-        objectives = kept["objective"][wrong].tolist()
-        around = policies.wraps(state.domain)[state.spanned]
-        discrete = state.domain.options[state.spanned] > 0
-        listed = []
-        for number in policies.most_different(
-            torch.from_numpy(at / archive.dims), objectives, around, discrete
-        ):
-            ends = zip(over, archive.boundaries, at[number], strict=True)
+        measure_indices = tuple(state.spanned.tolist())
+        elites = archive.data()
+        wrong = np.flatnonzero(elites["wrong"])
+        grid_indices = archive.int_to_grid_index(elites["index"][wrong])
+        objectives = elites["objective"][wrong].tolist()
+        is_periodic = policies.wraps(state.domain)[state.spanned]
+        is_discrete = state.domain.options[state.spanned] > 0
+        chosen = policies.most_different(
+            torch.from_numpy(grid_indices / archive.dims),
+            objectives,
+            is_periodic,
+            is_discrete,
+        )
+        examples = []
+        for number in chosen:
             ranges = {
-                place: (float(edges[k]), float(edges[k + 1]))
-                for place, edges, k in ends
+                measure: (float(edges[cell]), float(edges[cell + 1]))
+                for measure, edges, cell in zip(
+                    measure_indices,
+                    archive.boundaries,
+                    grid_indices[number],
+                    strict=True,
+                )
             }
-            u = torch.from_numpy(kept["solution"][wrong[number]].copy())
-            listed.append(policies.FoundFailure(u, objectives[number], ranges))
+            u = torch.from_numpy(elites["solution"][wrong[number]].copy())
+            examples.append(policies.FoundFailure(u, objectives[number], ranges))
         return policies.Failures(
-            tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells)
+            tuple(examples),
+            measure_indices,
+            len(wrong),
+            len(elites["objective"]),
+            int(archive.cells),
         )
 
     def _next(self, state: ArchiveState) -> ArchiveState:
-        """Draw a generation; the archive belongs to nobody else yet."""
+        """Begin the next generation; no other state has the archive yet."""
         state = replace(state, generation=state.generation + 1, values=(), wrong=())
+        domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:
-            return replace(state, points=state.domain.sample(rng, self.population))
-        anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
-        samples = state.domain.sample(rng, self.population)
-        seen = state.seen
-        if seen is None:
-            children = [
-                state.domain.project(u) for u in state.bred(samples[anew:], rng)
-            ]
-            return replace(state, points=torch.stack([*samples[:anew], *children]))
+            return replace(state, points=domain.sample(rng, self.population))
+        n_new = int((torch.rand(self.population, generator=rng) < ANEW).sum())
+        samples = domain.sample(rng, self.population)
+        observations = state.seen
+        if observations is None:
+            offspring = [domain.project(u) for u in state.bred(samples[n_new:], rng)]
+            return replace(state, points=torch.stack([*samples[:n_new], *offspring]))
         with policies.one_thread():
-            surrogate, seen = seen.surrogate()
-            box = seen.space
-            moved = int(ELSEWHERE * CANDIDATES)
-            drawn = box.low + box.width * torch.rand(
-                CANDIDATES, box.count, generator=rng
+            surrogate, observations = observations.surrogate()
+            box = observations.space
+            uniform = torch.rand(CANDIDATES, box.count, generator=rng)
+            candidates = box.low + box.width * uniform
+            offspring_points = state.bred(candidates, rng)
+            # Some are moved to any cell.
+            n_moved = int(ELSEWHERE * CANDIDATES)
+            offspring_points[:n_moved, state.spanned] = candidates[
+                :n_moved, state.spanned
+            ]
+            x = box.tidy((offspring_points - box.low) / box.width)
+            points = state.likeliest(
+                surrogate, box.put(offspring_points, x), self.population - n_new
             )
-            bred = state.bred(drawn, rng)
-            bred[:moved, state.spanned] = drawn[:moved, state.spanned]  # to any cell
-            candidates = box.put(bred, box.tidy((bred - box.low) / box.width))
-            points = state.likeliest(surrogate, candidates, self.population - anew)
-        return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
+        points = torch.cat([samples[:n_new], points])
+        return replace(state, points=points, seen=observations)
 
     def _spanned(self, domain: policies.Domain) -> Tensor:
-        """Return (k,) positions of the parameters of these names; of the first two
-        without names.
-        """
+        """Return the indices (k,) of the parameters that span the archive."""
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
             return torch.arange(min(2, domain.dim))
-        places = {name: place for place, name in enumerate(domain.names)}
+        index_of_name = {name: index for index, name in enumerate(domain.names)}
         for name in names:
-            if name not in places:
+            if name not in index_of_name:
                 raise errors.UnknownNameError(
-                    "parameter in `over` of policy 'archive':", name, places
+                    "parameter in `over` of policy 'archive':", name, index_of_name
                 )
         if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
             raise InputError(
                 f"over: expected 1 to {MOST_SPANNED} different "
                 f"parameters, got {', '.join(names)}"
             )
-        return torch.tensor([places[name] for name in names])
+        return torch.tensor([index_of_name[name] for name in names])

@@ -93,11 +93,15 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Spending:
             until,
             "free" if domain.gradient_cost and domain.partial_gradients else True,
         )
-    ways = int((box.options == 0).sum())
-    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
-    until = math.ceil(UNTIL * steps) if ways <= LOW else screen
+    n_continuous = int((box.options == 0).sum())
+    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(n_continuous, 1)))
+    until = math.ceil(UNTIL * steps) if n_continuous <= LOW else screen
     cost = domain.gradient_cost
-    if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
+    if (
+        n_continuous
+        and PAYS * cost <= n_continuous
+        and PAYS * (1 + cost) <= steps - until
+    ):
         return Spending(steps, screen, until, True)
     return Spending(steps, math.ceil(SCREEN * steps), steps, True)
 
@@ -398,15 +402,15 @@ class Portfolio(Raced[Race]):
         searches = []
         errors = []
         for policy in self.policies:
-            whole = with_choices(policy, domain)
+            wrapped = with_choices(policy, domain)
             try:
-                whole.start(
+                wrapped.start(
                     domain, seeded(seed, 0), max(1, steps // len(self.policies))
                 )
             except InputError as error:
                 errors.append(error)
             else:
-                searches.append((whole, domain))
+                searches.append((wrapped, domain))
         if not searches:
             raise errors[0]
         return line_up(searches, steps, seed)

@@ -72,69 +72,83 @@ class Race:
         return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
 
     def begun(self: Racing, field: Iterable[int], number: int) -> Racing:
-        """Return the race at the beginning of a round, with equal shares for those that
-        are in it.
+        """Return the race at the beginning of a round.
+
+        Args:
+            field: the runners that are in it, which get equal renders.
+            number: index of the round.
         """
         field = tuple(field)
-        share = max(
-            1, (self.steps - self.spent) // (self.rounds - number) // len(field)
-        )
+        rounds_left = self.rounds - number
+        renders_each = max(1, (self.steps - self.spent) // rounds_left // len(field))
         runners = [
-            replace(runner, left=share if k in field else 0)
-            for k, runner in enumerate(self.runners)
+            replace(runner, left=renders_each if index in field else 0)
+            for index, runner in enumerate(self.runners)
         ]
         return replace(self, runners=tuple(runners), field=field, round=number)
 
     def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return up to n proposals of this round that do not wait for each other; none
-        where it is done.
+        """Return up to n proposals of this round that do not wait for each other.
+
+        There are none where the round is over.
         """
         runners = list(self.runners)
-        waiting = [k for k in self.field if self.runners[k].left]
-        each = -(-n // max(1, len(waiting)))
+        waiting = [k for k in self.field if runners[k].left]
+        proposals_each = -(-n // max(1, len(waiting)))
         proposals = dict[int, tuple[Proposal, ...]]()
-        taken = Counter[int]()
+        n_used = Counter[int]()
         batch = list[Proposal]()
-        asked = list[int]()
+        runner_of_proposal = list[int]()
         while waiting and len(batch) < n:
             k = max(waiting, key=lambda k: runners[k].left)  # the first of equals
-            runner = runners[k]
             if k not in proposals:
+                runner = runners[k]
                 proposals[k], state = runner.policy.propose(
-                    runner.state, min(each, runner.left)
+                    runner.state, min(proposals_each, runner.left)
                 )
-                runner = replace(runner, state=state)
+                # The runner is changed only where its proposals are used.
+                proposer = replace(runner, state=state)
+            else:
+                proposer = runners[k]
             if not proposals[k]:
-                # take out a search that has nothing more to propose; its share is for
-                # those left in the round
-                runners[k] = replace(runners[k], left=0, over=True)
-                others = [other for other in self.field if not runners[other].over]
-                for other in others:
-                    runners[other] = replace(
-                        runners[other],
-                        left=runners[other].left + runner.left // len(others),
-                    )
-            elif taken[k] == len(
-                proposals[k]
-            ):  # what it proposes next, these evaluations say
+                self._retire(runners, k)
+            elif n_used[k] == len(proposals[k]):
+                # What it proposes next depends on these evaluations.
                 break
             else:
-                wanted = proposals[k][taken[k]]
-                capped = replace(wanted, samples=min(runner.left, wanted.samples))
-                # there will be renders to use a gradient
-                later = self.round + 1 < self.rounds
-                batch.append(capped.affordable(runner.domain, runner.left + later))
-                asked.append(k)
-                taken[k] += 1
-                runners[k] = replace(
-                    runner, left=runner.left - batch[-1].cost(runner.domain)
-                )
+                proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
+                batch.append(proposal)
+                runner_of_proposal.append(k)
+                n_used[k] += 1
+                renders_left = proposer.left - proposal.cost(proposer.domain)
+                runners[k] = replace(proposer, left=renders_left)
             waiting = [k for k in self.field if runners[k].left]
-        for k, count in taken.items():
-            if count < len(proposals[k]):  # it shall not count on more than was taken
+        for k, count in n_used.items():
+            if count < len(proposals[k]):
+                # Its state must not count on more proposals than were used.
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
-        return tuple(batch), replace(self, runners=tuple(runners), asked=tuple(asked))
+        race = replace(self, runners=tuple(runners), asked=tuple(runner_of_proposal))
+        return tuple(batch), race
+
+    def _retire(self, runners: list[Runner], k: int) -> None:
+        """End a search that has nothing more to propose, in a list of runners.
+
+        Its renders go to those that are left in the round.
+        """
+        renders = runners[k].left
+        runners[k] = replace(runners[k], left=0, over=True)
+        others = [other for other in self.field if not runners[other].over]
+        for other in others:
+            renders_left = runners[other].left + renders // len(others)
+            runners[other] = replace(runners[other], left=renders_left)
+
+    def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:
+        """Return a proposal that the renders of its runner can pay."""
+        proposal = replace(proposal, samples=min(runner.left, proposal.samples))
+        # Before the last round there will be renders to use a gradient.
+        has_later_round = self.round + 1 < self.rounds
+        return proposal.affordable(runner.domain, runner.left + has_later_round)
 
 
 def count_rounds(runners: int) -> int:
@@ -194,26 +208,32 @@ class Raced(Policy[Racing]):
             if batch or all(runner.over for runner in runners):
                 return batch, state
             ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
-            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+            continuing = [
+                k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over
+            ]
             # nobody left who can go on: the rest is for whoever can
-            if state.round + 1 >= state.rounds or not able:
-                left = (k for k, runner in enumerate(runners) if not runner.over)
-                able = sorted(left, key=lambda k: -runners[k].best)[:1]
-            state = state.begun(able, min(state.round + 1, state.rounds - 1))
+            if state.round + 1 >= state.rounds or not continuing:
+                remaining = (k for k, runner in enumerate(runners) if not runner.over)
+                continuing = sorted(remaining, key=lambda k: -runners[k].best)[:1]
+            state = state.begun(continuing, min(state.round + 1, state.rounds - 1))
 
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
-        """Tell each search what came of its proposals, or of the first of them; both as
-        its own domain has them.
+        """Update each search with the evaluations of its proposals.
+
+        Both are as its own domain has them. There may be fewer evaluations than
+        proposals.
         """
-        by_runner = defaultdict[int, list[Any]](list)
-        for number, (u, evaluation) in zip(state.asked, evaluated, strict=False):
-            by_runner[number].append((u, evaluation))
+        evaluated_by_runner = defaultdict[int, list[Any]](list)
+        for k, (u, evaluation) in zip(state.asked, evaluated, strict=False):
+            evaluated_by_runner[k].append((u, evaluation))
         runners = list(state.runners)
-        for number, own in by_runner.items():
-            runner = runners[number]
-            best = max(evaluation.objective for _, evaluation in own)
-            told = runner.policy.update(runner.state, own)
-            runners[number] = replace(runner, state=told, best=max(runner.best, best))
+        for k, runner_evaluated in evaluated_by_runner.items():
+            runner = runners[k]
+            best = max(evaluation.objective for _, evaluation in runner_evaluated)
+            runner_state = runner.policy.update(runner.state, runner_evaluated)
+            runners[k] = replace(
+                runner, state=runner_state, best=max(runner.best, best)
+            )
         spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
         return replace(state, runners=tuple(runners), spent=spent, asked=())
 

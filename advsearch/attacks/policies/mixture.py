@@ -1,6 +1,4 @@
-"""The distribution of failures: learnt as a mixture, drawn from, and weighed to tell
-how large a share fails.
-"""
+"""Learn the distribution of failures as a mixture, and estimate the failure rate."""
 
 from __future__ import annotations
 
@@ -46,17 +44,17 @@ class Ranges:
     around: Tensor
 
     def away(self, x: Tensor, mean: Tensor) -> Tensor:
-        """Return how far x is from a mean; of an angle the shorter way, within a
-        half.
-        """
-        plain = x - mean
-        return torch.where(self.around, torch.remainder(plain + 0.5, 1.0) - 0.5, plain)
+        """Return the offset of x from a mean; of an angle the shorter, within a half."""
+        offset = x - mean
+        wrapped_offset = torch.remainder(offset + 0.5, 1.0) - 0.5
+        return torch.where(self.around, wrapped_offset, offset)
 
     def ends(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the offsets of the lower and upper bound of each range from a mean."""
         half = torch.full_like(mean, 0.5)
-        return torch.where(self.around, -half, -mean), torch.where(
-            self.around, half, 1.0 - mean
-        )
+        lower = torch.where(self.around, -half, -mean)
+        upper = torch.where(self.around, half, 1.0 - mean)
+        return lower, upper
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,84 +70,118 @@ class Components:
     options: Tensor
 
     def logs(self, x: Tensor, ranges: Ranges) -> Tensor:
-        """Return (n, k) logarithms of weight times density at (n, d) x, relative to the
-        even density.
+        """Return the logarithms (n, k) of weight times density of each component.
+
+        The density at x (n, d) is relative to the uniform density.
         """
-        low, high = (
-            torch.special.ndtr(end / self.deviations) for end in ranges.ends(self.means)
-        )
+        lower_offset, upper_offset = ranges.ends(self.means)
+        lower_cdf = torch.special.ndtr(lower_offset / self.deviations)
+        upper_cdf = torch.special.ndtr(upper_offset / self.deviations)
         scaled = ranges.away(x[:, None], self.means) / self.deviations
-        numbers = -0.5 * scaled.square() - torch.log(
-            self.deviations * math.sqrt(2.0 * math.pi) * (high - low)
+        log_density = -0.5 * scaled.square() - torch.log(
+            self.deviations * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
         )
-        chosen = (x * ranges.counts).long().clamp(max=self.options.shape[2] - 1)
-        picked = self.options.expand(len(x), *self.options.shape).gather(
-            3, chosen[:, None, :, None].expand(-1, len(self.weights), -1, 1)
+        option = (x * ranges.counts).long().clamp(max=self.options.shape[2] - 1)
+        probability = self.options.expand(len(x), *self.options.shape).gather(
+            3, option[:, None, :, None].expand(-1, len(self.weights), -1, 1)
         )
-        each = torch.where(
+        log_density = torch.where(
             ranges.counts > 0,
-            torch.log(picked[..., 0] * ranges.counts.clamp(min=1)),
-            numbers,
+            torch.log(probability[..., 0] * ranges.counts.clamp(min=1)),
+            log_density,
         )
-        return self.weights.log() + each.sum(dim=2)
+        return self.weights.log() + log_density.sum(dim=2)
 
     def draw(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
+        """Return one sample (d,) of the mixture, in fractions of each range."""
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean = self.means[k]
         deviation = self.deviations[k]
-        low, high = (torch.special.ndtr(end / deviation) for end in ranges.ends(mean))
-        at = torch.lerp(
-            low, high, torch.rand(len(mean), generator=generator, dtype=torch.float64)
-        )
-        x = mean + deviation * torch.special.ndtri(at)
-        x = torch.where(
-            ranges.around, torch.remainder(x, 1.0), x.nan_to_num(0.5).clamp(0.0, 1.0)
-        )
+        lower_offset, upper_offset = ranges.ends(mean)
+        lower_cdf = torch.special.ndtr(lower_offset / deviation)
+        upper_cdf = torch.special.ndtr(upper_offset / deviation)
+        uniform = torch.rand(len(mean), generator=generator, dtype=torch.float64)
+        cdf = torch.lerp(lower_cdf, upper_cdf, uniform)
+        x = mean + deviation * torch.special.ndtri(cdf)
+        wrapped = torch.remainder(x, 1.0)
+        clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
+        x = torch.where(ranges.around, wrapped, clipped)
         option = torch.multinomial(self.options[k], 1, generator=generator)[:, 0]
-        return torch.where(
-            ranges.counts > 0, (option + 0.5) / ranges.counts.clamp(min=1), x
-        )
+        option_center = (option + 0.5) / ranges.counts.clamp(min=1)
+        return torch.where(ranges.counts > 0, option_center, x)
 
     def maximised(
         self, x: Tensor, weights: Tensor, ranges: Ranges, even: Tensor
     ) -> Components:
-        """Return the components that make the weighted draws (n, d) x likelier, each
-        with its prior; `even` is that of options (k, d, most options).
+        """Return the components after one step of expectation and maximisation.
+
+        Args:
+            x: (n, d) samples, in fractions of each range.
+            weights: (n,) of the samples.
+            ranges: of the elements.
+            even: (k, d, most options) uniform probabilities of options, the prior.
         """
-        shared = self.logs(x, ranges).softmax(dim=1) * weights[:, None]
-        counts = shared.sum(dim=0)
-        portion = (shared / counts.clamp(min=1e-12)).T
-        away = ranges.away(x[:, None], self.means)
-        shift = torch.einsum("kn,nkd->kd", portion, away)
-        spread = torch.einsum("kn,nkd->kd", portion, (away - shift).square())
-        own = counts[:, None]
-        variance = ((own * spread + PRIOR * EVEN**2) / (own + PRIOR)).clamp(
-            max=0.999 * EVEN**2
+        responsibility = self.logs(x, ranges).softmax(dim=1) * weights[:, None]
+        counts = responsibility.sum(dim=0)
+        portion = (responsibility / counts.clamp(min=1e-12)).T
+        offset = ranges.away(x[:, None], self.means)
+        shift = torch.einsum("kn,nkd->kd", portion, offset)
+        spread = torch.einsum("kn,nkd->kd", portion, (offset - shift).square())
+        component_counts = counts[:, None]
+        means, deviations = self._divide_out_prior(
+            shift, spread, component_counts, ranges
         )
-        # the even one divided out
-        deviations = (
-            (1.0 / (1.0 / variance - 1.0 / EVEN**2)).sqrt().clamp(NARROWEST, FLAT)
-        )
-        means = self.means + shift
-        tilted = (deviations.square() * (means / variance - 0.5 / EVEN**2)).clamp(
-            0.0, 1.0
-        )
-        means = torch.where(ranges.around, torch.remainder(means, 1.0), tilted)
-        chosen = torch.nn.functional.one_hot(
+        one_hot_option = torch.nn.functional.one_hot(
             (x * ranges.counts).long().clamp(max=even.shape[2] - 1), even.shape[2]
         )
-        often = torch.einsum("kn,ndo->kdo", portion, chosen.double())
-        options = (own[..., None] * often + PRIOR * even) / (own[..., None] + PRIOR)
-        share = counts / counts.sum()
-        return Components(0.75 * share + 0.25 / len(share), means, deviations, options)
+        frequency = torch.einsum("kn,ndo->kdo", portion, one_hot_option.double())
+        option_counts = component_counts[..., None]
+        options = (option_counts * frequency + PRIOR * even) / (option_counts + PRIOR)
+        fraction = counts / counts.sum()
+        new_weights = 0.75 * fraction + 0.25 / len(fraction)
+        return Components(new_weights, means, deviations, options)
+
+    def _divide_out_prior(
+        self, shift: Tensor, spread: Tensor, counts: Tensor, ranges: Ranges
+    ) -> tuple[Tensor, Tensor]:
+        """Return means and deviations (k, d) without the uniform density.
+
+        Args:
+            shift: (k, d) from the old means to those of the samples.
+            spread: (k, d) variance of the samples.
+            counts: (k, 1) samples of each component.
+            ranges: of the elements.
+        """
+        variance = ((counts * spread + PRIOR * EVEN**2) / (counts + PRIOR)).clamp(
+            max=0.999 * EVEN**2
+        )
+        precision = 1.0 / variance - 1.0 / EVEN**2
+        deviations = (1.0 / precision).sqrt().clamp(NARROWEST, FLAT)
+        means = self.means + shift
+        tilted = deviations.square() * (means / variance - 0.5 / EVEN**2)
+        means = torch.where(
+            ranges.around, torch.remainder(means, 1.0), tilted.clamp(0.0, 1.0)
+        )
+        return means, deviations
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureState:
-    """Where the search stands: the mixtures of the generations in the window (None of
-    an even one), this generation's draws (n, d) and the latest `WINDOW` that were
-    evaluated (m, d), in shares of each range, and of all draws objective, failed,
-    unknown, weight and largest weight; see `failure_share`.
+    """State of the search.
+
+    Points are in fractions of each range.
+
+    Attributes:
+        domain: of the search.
+        seed: of its random numbers.
+        ranges: of the elements of u.
+        generation: index of the present generation.
+        learnt: mixtures of the generations in the window; None of a uniform one.
+        points: (n, d) samples of the present generation.
+        seen: (m, d) the latest `WINDOW` samples that were evaluated.
+        log: (t, 5) of all samples: objective, failed, unknown, weight and largest
+            weight; see `failure_share`.
+        told: samples of the present generation that were evaluated.
     """
 
     domain: policies.Domain
@@ -163,34 +195,53 @@ class MixtureState:
     told: int = 0
 
     def configuration(self, x: Tensor) -> Tensor:
-        return self.domain.project(
-            (self.domain.lower + x * (self.domain.upper - self.domain.lower)).float()
-        )
+        """Return the configuration (d,) of x, which is in fractions of each range."""
+        width = self.domain.upper - self.domain.lower
+        return self.domain.project((self.domain.lower + x * width).float())
 
     def telling(self, mixture: Components, k: int) -> dict[int, tuple[float, float]]:
-        """Return the ranges that tell a component apart: two deviations to both sides,
-        or the likeliest option.
+        """Return the ranges that distinguish a component, by index in u.
+
+        They reach two deviations to both sides, or are those of the most probable
+        option.
         """
         lower = self.domain.lower.double()
         width = (self.domain.upper - self.domain.lower).double()
         ranges: dict[int, tuple[float, float]] = {}
-        for place, count in enumerate(self.ranges.counts.tolist()):
-            if count:
-                likeliest = int(mixture.options[k, place].argmax())
-                ends = (likeliest / count, (likeliest + 1) / count)
-                telling = float(mixture.options[k, place, likeliest]) > TELLING
+        for index, n_options in enumerate(self.ranges.counts.tolist()):
+            if n_options:
+                bounds = self._option_bounds(mixture.options[k, index], n_options)
             else:
-                mean = float(mixture.means[k, place])
-                reach = 2.0 * float(mixture.deviations[k, place])
-                ends = (max(0.0, mean - reach), min(1.0, mean + reach))
-                across = bool(self.ranges.around[place]) and (
-                    mean - reach < 0.0 or mean + reach > 1.0
+                bounds = self._number_bounds(
+                    float(mixture.means[k, index]),
+                    float(mixture.deviations[k, index]),
+                    is_periodic=bool(self.ranges.around[index]),
                 )
-                telling = reach < 2.0 * TELLING * EVEN and not across
-            if telling:
-                low, high = (float(lower[place] + end * width[place]) for end in ends)
-                ranges[place] = low, high
+            if bounds is not None:
+                low, high = (float(lower[index] + x * width[index]) for x in bounds)
+                ranges[index] = (low, high)
         return ranges
+
+    @staticmethod
+    def _option_bounds(
+        probabilities: Tensor, n_options: int
+    ) -> tuple[float, float] | None:
+        """Return the range of the most probable option; None if it is not distinct."""
+        option = int(probabilities.argmax())
+        if not float(probabilities[option]) > TELLING:
+            return None
+        return option / n_options, (option + 1) / n_options
+
+    @staticmethod
+    def _number_bounds(
+        mean: float, deviation: float, *, is_periodic: bool
+    ) -> tuple[float, float] | None:
+        """Return the range of a number; None if it is wide, or goes through 0."""
+        reach = 2.0 * deviation
+        crosses_zero = is_periodic and (mean - reach < 0.0 or mean + reach > 1.0)
+        if crosses_zero or not reach < 2.0 * TELLING * EVEN:
+            return None
+        return max(0.0, mean - reach), min(1.0, mean + reach)
 
 
 @dataclass(frozen=True)
@@ -253,163 +304,185 @@ class Mixture(Policy[MixtureState]):
         state = MixtureState(
             domain, policies.draw_seed(generator), ranges, 0, (), nothing, nothing, log
         )
-        return self._drawn(state, None)
+        return self._begin_generation(state, None)
 
     def propose(
         self, state: MixtureState, n: int
     ) -> tuple[tuple[policies.Proposal, ...], MixtureState]:
-        return tuple(
-            policies.Proposal(state.configuration(x))
-            for x in state.points[state.told :][:n]
-        ), state
+        next_points = state.points[state.told :][:n]
+        configurations = [state.configuration(x) for x in next_points]
+        return tuple(policies.Proposal(u) for u in configurations), state
 
     def update(
         self, state: MixtureState, evaluated: policies.Evaluated
     ) -> MixtureState:
         points = state.points[state.told :][: len(evaluated)]
-        current = state.learnt[-1]
+        mixture = state.learnt[-1]
         with policies.one_thread():
-            weights = (1.0 / self._density(current, points, state.ranges)).tolist()
-        bound = 1.0 if current is None else 1.0 / self.even
+            weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
+        max_weight = 1.0 if mixture is None else 1.0 / self.even
         rows = [
             (
                 evaluation.objective,
                 evaluation.success,
                 not math.isfinite(evaluation.objective),
                 weight,
-                bound,
+                max_weight,
             )
             for (_, evaluation), weight in zip(evaluated, weights, strict=True)
         ]
-        log = torch.cat([state.log, torch.tensor(rows, dtype=torch.float64)])
         state = replace(
             state,
-            log=log,
+            log=torch.cat([state.log, torch.tensor(rows, dtype=torch.float64)]),
             seen=torch.cat([state.seen, points]),
             told=state.told + len(evaluated),
         )
-        return (
-            state
-            if state.told < self.population
-            else self._drawn(state, self._fitted(state))
-        )
+        if state.told < self.population:
+            return state
+        return self._begin_generation(state, self._fit(state))
 
     def failures(self, state: MixtureState) -> policies.Failures:
-        """Return a failure for each component that has some, and the share of all that
-        fail.
-        """
-        log = state.log[-len(state.seen) :]
-        current = state.learnt[-1]
-        failed = log[:, 1].bool() & ~log[:, 2].bool()
-        points = state.seen[failed]
-        objectives = log[failed, 0]
-        listed = []
-        nearest = torch.zeros(len(points))
-        order = [0] if len(points) else []
-        if current is not None and len(points):
-            weights = current.weights
-            nearest = current.logs(points, state.ranges).argmax(dim=1)
-            order = sorted(set(nearest.tolist()), key=lambda k: -float(weights[k]))
-        for k in order:
-            members = (nearest == k).nonzero().flatten()
-            worst = int(members[objectives[members].argmax()])
-            ranges = {} if current is None else state.telling(current, k)
-            listed.append(
-                policies.FoundFailure(
-                    state.configuration(points[worst]), float(objectives[worst]), ranges
-                )
-            )
-        whole = all(block.norm != "l2" for block in state.domain.blocks)
+        """Return a failure for each component that has some, and the failure rate."""
         with policies.one_thread():
-            share = policies.failure_share(
+            failure_rate = policies.failure_share(
                 state.log[:, 3],
                 state.log[:, 4],
                 state.log[:, 1] > 0,
                 state.log[:, 2] > 0,
             )
-        found = int((state.log[:, 1] * (1.0 - state.log[:, 2])).sum())
+        has_l2_block = any(block.norm == "l2" for block in state.domain.blocks)
+        n_failures = int((state.log[:, 1] * (1.0 - state.log[:, 2])).sum())
         return policies.Failures(
-            tuple(listed), (), found, len(state.log), None, share if whole else None
+            self._list_examples(state),
+            (),
+            n_failures,
+            len(state.log),
+            None,
+            None if has_l2_block else failure_rate,
         )
 
-    def _drawn(self, state: MixtureState, mixture: Components | None) -> MixtureState:
-        """Begin the next generation: its draws come from the mixture, and some of them
-        are even.
+    def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
+        """Return the worst failure in the window of each component that has some."""
+        log = state.log[-len(state.seen) :]
+        mixture = state.learnt[-1]
+        is_failure = log[:, 1].bool() & ~log[:, 2].bool()
+        points = state.seen[is_failure]
+        objectives = log[is_failure, 0]
+        if not len(points):
+            return ()
+        component_of_point = torch.zeros(len(points))
+        components = [0]
+        if mixture is not None:
+            weights = mixture.weights
+            component_of_point = mixture.logs(points, state.ranges).argmax(dim=1)
+            components = sorted(
+                set(component_of_point.tolist()), key=lambda k: -float(weights[k])
+            )
+        examples = []
+        for k in components:
+            members = (component_of_point == k).nonzero().flatten()
+            worst = int(members[objectives[members].argmax()])
+            u = state.configuration(points[worst])
+            ranges = {} if mixture is None else state.telling(mixture, k)
+            examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
+        return tuple(examples)
+
+    def _begin_generation(
+        self, state: MixtureState, mixture: Components | None
+    ) -> MixtureState:
+        """Begin the next generation: sample its points from a mixture.
+
+        Some of them are uniform; without a mixture all are.
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
-        counts = state.ranges.counts
+        n_options = state.ranges.counts
         points = torch.rand(
-            self.population, len(counts), generator=rng, dtype=torch.float64
+            self.population, len(n_options), generator=rng, dtype=torch.float64
         )
         points = torch.where(
-            counts > 0, policies.centre_of_option(points, counts.clamp(min=1)), points
+            n_options > 0,
+            policies.centre_of_option(points, n_options.clamp(min=1)),
+            points,
         )
         for row in range(self.population):
             if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
                 points[row] = mixture.draw(rng, state.ranges)
-        kept = WINDOW // self.population * self.population or self.population
-        learnt = (*state.learnt, mixture)[-(kept // self.population) - 1 :]
+        window = WINDOW // self.population * self.population or self.population
+        n_generations = window // self.population + 1
         return replace(
             state,
             generation=number,
             points=points,
-            learnt=learnt,
-            seen=state.seen[-kept:],
+            learnt=(*state.learnt, mixture)[-n_generations:],
+            seen=state.seen[-window:],
             told=0,
         )
 
     def _density(self, mixture: Components | None, x: Tensor, ranges: Ranges) -> Tensor:
-        """Return (n,) density of a generation at (n, d) x, relative to the even one."""
+        """Return the density (n,) of a generation at x (n, d), relative to uniform."""
         if mixture is None:
             return torch.ones(len(x), dtype=torch.float64)
-        return (
-            self.even
-            + (1.0 - self.even) * mixture.logs(x, ranges).logsumexp(dim=1).exp()
-        )
+        mixture_density = mixture.logs(x, ranges).logsumexp(dim=1).exp()
+        return self.even + (1.0 - self.even) * mixture_density
 
-    def _fitted(self, state: MixtureState) -> Components | None:
-        """Return the mixture fitted to the failures in the window; None where nothing
-        could be evaluated.
+    def _fit(self, state: MixtureState) -> Components | None:
+        """Return the mixture fitted to the failures in the window.
+
+        None where nothing could be evaluated.
         """
         log = state.log[-len(state.seen) :]
         ranges = state.ranges
-        known = ~log[:, 2].bool()
-        failed = known & log[:, 1].bool()
-        if int(failed.sum()) < FEWEST:
-            count = min(int(known.sum()), max(FEWEST, math.ceil(ELITE * len(log))))
-            failed[torch.where(known, log[:, 0], -math.inf).topk(count).indices] = True
-        x = state.seen[failed]
-        objectives = log[failed, 0]
-        if not len(x):
+        is_elite = self._find_elite(log)
+        points = state.seen[is_elite]
+        if not len(points):
             return None
         with policies.one_thread():
-            density = torch.stack(
-                [self._density(mixture, x, ranges) for mixture in state.learnt]
-            ).mean(dim=0)
-            weights = 1.0 / density
-            # they add up to what they are worth
+            densities = [
+                self._density(mixture, points, ranges) for mixture in state.learnt
+            ]
+            weights = 1.0 / torch.stack(densities).mean(dim=0)
+            # scaled to have the effective sample size as their sum
             weights *= weights.sum() / weights.square().sum()
-            picked = policies.most_different(
-                x,
-                objectives.tolist(),
+            center_index = policies.most_different(
+                points,
+                log[is_elite, 0].tolist(),
                 ranges.around,
                 ranges.counts > 0,
                 self.components,
             )
-            means = x[picked]
-            options = torch.ones(
-                len(means),
-                len(ranges.counts),
-                max(1, int(ranges.counts.max())),
-                dtype=torch.float64,
+            means = points[center_index]
+            even = self._uniform_options(len(means), ranges)
+            mixture = Components(
+                torch.full((len(means),), 1.0 / len(means), dtype=torch.float64),
+                means,
+                torch.full_like(means, 0.5 * EVEN),
+                even,
             )
-            options *= (
-                torch.arange(options.shape[2]) < ranges.counts.clamp(min=1)[:, None]
-            )
-            even = options / options.sum(dim=2, keepdim=True)
-            start = torch.full((len(means),), 1.0 / len(means), dtype=torch.float64)
-            mixture = Components(start, means, torch.full_like(means, 0.5 * EVEN), even)
             for _ in range(ROUNDS):
-                mixture = mixture.maximised(x, weights, ranges, even)
+                mixture = mixture.maximised(points, weights, ranges, even)
         return mixture
+
+    @staticmethod
+    def _find_elite(log: Tensor) -> Tensor:
+        """Return which samples a mixture is fitted to, (n,) bool.
+
+        These are the failures; where they are few, the largest objectives too.
+        """
+        is_known = ~log[:, 2].bool()
+        is_elite = is_known & log[:, 1].bool()
+        if int(is_elite.sum()) < FEWEST:
+            n_elite = max(FEWEST, math.ceil(ELITE * len(log)))
+            n_elite = min(int(is_known.sum()), n_elite)
+            objectives = torch.where(is_known, log[:, 0], -math.inf)
+            is_elite[objectives.topk(n_elite).indices] = True
+        return is_elite
+
+    @staticmethod
+    def _uniform_options(n_components: int, ranges: Ranges) -> Tensor:
+        """Return uniform probabilities of options, (k, d, most options)."""
+        n_elements = len(ranges.counts)
+        max_options = max(1, int(ranges.counts.max()))
+        options = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
+        options *= torch.arange(max_options) < ranges.counts.clamp(min=1)[:, None]
+        return options / options.sum(dim=2, keepdim=True)

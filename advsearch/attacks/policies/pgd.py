@@ -400,7 +400,8 @@ class Adam(Climbing):
     every step:
 
         m <- beta1 m + (1 - beta1) g,   v <- beta2 v + (1 - beta2) g^2
-        u <- P(u + rate * scale * m' / (sqrt(v') + tiny)),   m' = m / (1 - beta1^t), v' = v / (1 - beta2^t)
+        u <- P(u + rate * scale * m' / (sqrt(v') + tiny))
+        m' = m / (1 - beta1^t),   v' = v / (1 - beta2^t)
 
     `scale` is half of each number's range (half of what a ball leaves), so a step means
     the same in every block. The rate falls in a line from `step_size` to a twentieth of

@@ -214,7 +214,10 @@ class Observed:
         return replace(
             self,
             points=points,
-            values=(*self.values, *(one.objective for _, one in evaluated)),
+            values=(
+                *self.values,
+                *(evaluation.objective for _, evaluation in evaluated),
+            ),
         )
 
     def surrogate(self) -> tuple[Surrogate, Observed]:
@@ -231,11 +234,11 @@ class Observed:
         scales = self.scales
         fitted = self.fitted
         if scales is None or n - fitted >= max(REFIT, fitted // 10):
-            kept = _best_and_latest(values, MEMORY)
-            scales = _best_scales(self.space, self.points[kept], values[kept])
+            used = _best_and_latest(values, MEMORY)
+            scales = _best_scales(self.space, self.points[used], values[used])
             fitted = n
-        kept = _best_and_latest(values, self.memory)
-        surrogate = fit(self.space, self.points[kept], values[kept], scales)
+        used = _best_and_latest(values, self.memory)
+        surrogate = fit(self.space, self.points[used], values[used], scales)
         return surrogate, replace(self, scales=scales, fitted=fitted)
 
 

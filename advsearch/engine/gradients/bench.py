@@ -1,6 +1,4 @@
-"""Takes gradients of a loss by different estimators on one renderer, repeatably and
-each stored where it is named.
-"""
+"""Compute gradients of a loss by different estimators on one renderer."""
 
 from __future__ import annotations
 
@@ -22,65 +20,69 @@ from advsearch.scene.renderer import Renderer
 Loss = Callable[[Tensor], Tensor]
 """From a picture (H, W, 3) sRGB to a number, by differentiable torch operations."""
 
-# share of a full turn by which periodic coordinates are off their start where gradients
+# fraction of a full turn between the start of periodic coordinates and where gradients
 # are measured
 TURNED = 0.0317
 
 
 def interior_point(renderer: Renderer, share: float = 0.12) -> Tensor:
-    """Return a point to measure at: the start, but continuous coordinates with a range
-    at least `share` off its ends.
+    """Return the point (d,) at which gradients are measured, near the start.
 
+    Continuous coordinates with a range are at least `share` of it off its bounds.
     Periodic ones are turned a little: starts are often symmetric. Groups with a norm
-    ball stay at their start, and so do discrete choices. But what starts at the end of
-    its range as a whole, as a projector's black picture does, is measured in the
-    middle: at the end there is a bend, and no difference to either side.
+    ball stay at their start, and so do discrete choices. But a group that starts at a
+    bound with all its coordinates, as a projector's black image does, is measured in
+    the middle: at the bound there is a kink, and no difference to either side.
     """
     u = renderer.start.clone()
     for group in renderer.plan.groups:
+        coordinates = group.coordinates
         if group.valid and group.size <= 64 and not group.periodic:
-            u[group.coordinates] = u[group.coordinates].clamp(share, 1.0 - share)
-        part = u[group.coordinates]
-        if (
-            group.valid
-            and group.size > 64
-            and bool(((part == 0.0) | (part == 1.0)).all())
-        ):
-            u[group.coordinates] = 0.5
+            u[coordinates] = u[coordinates].clamp(share, 1.0 - share)
+        if group.valid and group.size > 64:
+            values = u[coordinates]
+            if bool(((values == 0.0) | (values == 1.0)).all()):
+                u[coordinates] = 0.5
         if group.periodic:
-            u[group.coordinates] = (u[group.coordinates] + TURNED).remainder(1.0)
+            u[coordinates] = (u[coordinates] + TURNED).remainder(1.0)
     return u
 
 
 def restrict_plan(
     plan: GradientPlan, names: Collection[str], estimator: str | None = None
 ) -> GradientPlan:
-    """Return the plan with the groups of these names differentiated, by an estimator or
-    as planned, and no others.
+    """Return the plan with only the named groups differentiated.
+
+    They have the given estimator, or that of the plan.
     """
-    chosen = {
-        group.name: (estimator or group.estimator) if group.name in names else "none"
-        for group in plan.groups
-    }
-    return replace(
-        plan,
-        groups=tuple(
-            replace(group, estimator=chosen[group.name]) for group in plan.groups
-        ),
-    )
+    groups = []
+    for group in plan.groups:
+        group_estimator = "none"
+        if group.name in names:
+            group_estimator = estimator or group.estimator
+        groups.append(replace(group, estimator=group_estimator))
+    return replace(plan, groups=tuple(groups))
 
 
 Keep = Callable[[str, Callable[[], Any]], Any]
-"""From the name of a measurement, and what makes it, to a JSON value: one that is known
-already, or what it makes.
+"""From the name of a measurement, and the function that measures, to its JSON value.
+
+The value may have been stored by an earlier run.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Where derivatives are measured: of a loss of the picture at u (d,), with `spp`
-    samples a pixel and noise from a root `seed`. `keep` is asked for each measurement;
-    `tick` is told the samples of each gradient that is done.
+    """Computes gradients of a loss of the image at one configuration.
+
+    Attributes:
+        renderer: renders the image.
+        loss: of the image.
+        u: (d,) configuration.
+        seed: root seed of the noise.
+        spp: samples per pixel.
+        keep: called for each measurement, which it may store.
+        tick: called with the samples of each gradient that is computed.
     """
 
     renderer: Renderer
@@ -92,53 +94,63 @@ class Bench:
     tick: Callable[[int], object] = lambda samples: None
 
     def gradient(self, plan: GradientPlan, seed: int) -> Tensor:
-        """Return one gradient (d,) by a plan, under noise of its own."""
-        before = self.renderer.plan
+        """Return one gradient (d,) by a plan, under the noise of a seed."""
+        plan_before = self.renderer.plan
         self.renderer.plan = plan
         try:
-            return self.renderer.gradient(self.loss, self.u, seed, self.spp)[1]
+            _, gradient = self.renderer.gradient(self.loss, self.u, seed, self.spp)
+            return gradient
         finally:
-            self.renderer.plan = before
+            self.renderer.plan = plan_before
 
     def gradients(
         self, plan: GradientPlan, stream: str, repeats: int, place: str | None = None
     ) -> tuple[Tensor, float]:
-        """Return gradients (repeats, d) by a plan, zero where it takes no derivative,
-        and the median seconds of one; the seed of each is its number in a stream. Each
-        is kept where a `place` names them.
+        """Return several gradients by a plan, and the median seconds of one.
+
+        Args:
+            plan: how derivatives are computed.
+            stream: of seeds; each gradient has the seed of its index.
+            repeats: how many gradients.
+            place: name under which each is stored; None to store none.
+
+        Returns:
+            Gradients (repeats, d), zero where the plan has no derivative, and seconds.
         """
-        parts = [
+        slices = [
             group.coordinates for group in plan.groups if group.estimator != "none"
         ]
-
-        def timed(number: int) -> dict[str, Any]:
-            begun = time.perf_counter()
-            gradient = self.gradient(plan, seeds.stream(self.seed, stream, number))
-            taken = torch.cat([gradient[part] for part in parts])
-            numbers = base64.b64encode(
-                taken.to(torch.float32).numpy().tobytes()
-            ).decode("ascii")
-            return {"seconds": time.perf_counter() - begun, "numbers": numbers}
-
-        several = torch.zeros(repeats, len(self.u))
-        times = []
-        for number in range(repeats):
-            measure = partial(timed, number)
-            kept = (
-                measure()
-                if place is None
-                else self.keep(f"{place} gradient {number}", measure)
-            )
-            numbers = torch.frombuffer(
-                bytearray(base64.b64decode(kept["numbers"])), dtype=torch.float32
-            )
-            for part, values in zip(
-                parts,
-                numbers.split([part.stop - part.start for part in parts]),
-                strict=True,
-            ):
-                several[number, part] = values
-            times.append(kept["seconds"])
+        sizes = [coordinates.stop - coordinates.start for coordinates in slices]
+        gradients = torch.zeros(repeats, len(self.u))
+        seconds = []
+        for index in range(repeats):
+            measure = partial(self._measure_gradient, plan, stream, index)
+            if place is None:
+                measurement = measure()
+            else:
+                measurement = self.keep(f"{place} gradient {index}", measure)
+            buffer = bytearray(base64.b64decode(measurement["numbers"]))
+            derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
+            for coordinates, values in zip(slices, derivatives, strict=True):
+                gradients[index, coordinates] = values
+            seconds.append(measurement["seconds"])
             if place is not None:
                 self.tick(self.spp)
-        return several, statistics.median(times)
+        return gradients, statistics.median(seconds)
+
+    def _measure_gradient(
+        self, plan: GradientPlan, stream: str, index: int
+    ) -> dict[str, Any]:
+        """Return the derivatives of a gradient as JSON, with the seconds that it took."""
+        started = time.perf_counter()
+        gradient = self.gradient(plan, seeds.stream(self.seed, stream, index))
+        derivatives = torch.cat(
+            [
+                gradient[group.coordinates]
+                for group in plan.groups
+                if group.estimator != "none"
+            ]
+        )
+        float32_bytes = derivatives.to(torch.float32).numpy().tobytes()
+        numbers = base64.b64encode(float32_bytes).decode("ascii")
+        return {"seconds": time.perf_counter() - started, "numbers": numbers}

@@ -114,9 +114,12 @@ def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
 
 
 def compare_with_reference(
-    estimate: Estimate, reference: Reference, others: Sequence[Reference] = (), probe: Probe | None = None,
+    estimate: Estimate,
+    reference: Reference,
+    others: Sequence[Reference] = (),
+    probe: Probe | None = None,
     spp: int = 0,
-) -> Measured:  # fmt: skip
+) -> Measured:
     """Say how good an estimate is along a probe, from so many samples a pixel:
     "reference unusable" where the reference's noise exceeds `LOUD` and doubt
     (`CONFIDENCE` standard errors of both) covers the error; "biased" where the error of
@@ -144,13 +147,23 @@ def compare_with_reference(
         return value / size if size > 0.0 else math.inf if value else 0.0
 
     return Measured(
-        quantity="derivative", control=probe.group.control if probe else "",
-        parameter=probe.name.partition(".")[2] if probe else "", estimator=estimate.estimator, factor=estimate.factor,
-        spp=spp, repeats=estimate.repeats, seconds=estimate.seconds, status=status,
-        error=relative(math.hypot(difference, estimate.noise)), bias=relative(difference),
-        doubt=relative(doubt) if size > 0.0 else 0.0, noise=relative(estimate.noise) if size > 0.0 else math.inf,
-        value=estimate.value, reference=reference.value, reference_error=relative(reference.noise),
-    )  # fmt: skip
+        quantity="derivative",
+        control=probe.group.control if probe else "",
+        parameter=probe.name.partition(".")[2] if probe else "",
+        estimator=estimate.estimator,
+        factor=estimate.factor,
+        spp=spp,
+        repeats=estimate.repeats,
+        seconds=estimate.seconds,
+        status=status,
+        error=relative(math.hypot(difference, estimate.noise)),
+        bias=relative(difference),
+        doubt=relative(doubt) if size > 0.0 else 0.0,
+        noise=relative(estimate.noise) if size > 0.0 else math.inf,
+        value=estimate.value,
+        reference=reference.value,
+        reference_error=relative(reference.noise),
+    )
 
 
 def as_planned(group: Group) -> list[tuple[str, float]]:
@@ -325,11 +338,15 @@ def measure_estimates(
 
 
 def measure_derivatives(
-    bench: Bench, *, reference_spp: int, seeds_of_reference: tuple[int, int],
+    bench: Bench,
+    *,
+    reference_spp: int,
+    seeds_of_reference: tuple[int, int],
     reference_factors: Sequence[float] = (1.0,),
-    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned, repeats: tuple[int, int] = (6, 8),
+    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned,
+    repeats: tuple[int, int] = (6, 8),
     stage: Callable[[str, int], None] = lambda name, steps: None,
-) -> Iterator[Measured]:  # fmt: skip
+) -> Iterator[Measured]:
     """Measure the derivative by each parameter of a renderer's space beside differences
     of many samples.
 
@@ -385,9 +402,12 @@ def measure_derivatives(
 
 
 def _try_estimators(
-    bench: Bench, probes: Sequence[Probe], references: Mapping[str, Reference], tries: Sequence[tuple[str, float]],
+    bench: Bench,
+    probes: Sequence[Probe],
+    references: Mapping[str, Reference],
+    tries: Sequence[tuple[str, float]],
     repeats: tuple[int, int],
-) -> Iterator[Measured]:  # fmt: skip
+) -> Iterator[Measured]:
     """Yield how estimators agree with references along probes; other steps are tried
     where none was `ok` before.
     """

@@ -1,7 +1,10 @@
-"""Chooses estimators (least squared error x time), steps and sample counts (the
-cheapest with a cosine of `GOAL` with the converged gradient of the model's own loss,
-docs/gradients.md) and bounces of light (as many as change the picture: paths of other
-lengths with one seed are the same, cut off earlier) by measurement on the scene.
+"""Choose how gradients are computed, by measurements on the scene.
+
+- Estimators: those with the least squared error x time.
+- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL` with the
+  converged gradient of the model's own loss (docs/gradients.md).
+- Bounces of light: as many as change the image. Paths of other lengths with one seed
+  are the same, cut off earlier.
 """
 
 from __future__ import annotations
@@ -9,8 +12,9 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,9 +55,10 @@ of the working one's, only makes the measured cosine smaller: what is called `ok
 
 
 def status_of(cosine: float, converged: float) -> GradientStatus:
-    """Return whether a cosine with the converged gradient is good enough; "reference
-    unusable" where the converged ones don't agree well enough (`converged` is the
-    smallest cosine of two of them) to tell.
+    """Return whether a cosine with the converged gradient is good enough.
+
+    It is "reference unusable" where `converged`, the smallest cosine of two converged
+    gradients, is too small to tell.
     """
     if not converged >= TELLS:
         return "reference unusable"
@@ -65,8 +70,9 @@ def status_of(cosine: float, converged: float) -> GradientStatus:
 def comparable_sets(
     groups: Iterable[Group],
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return sets of groups of one control that have the same valid estimators, and
-    those of these that are worth comparing on each set.
+    """Return sets of groups of one control that have the same valid estimators.
+
+    With each set come those of the estimators that are worth comparing on it.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
@@ -80,18 +86,19 @@ def comparable_sets(
 def contested(
     plan: GradientPlan, *, every: bool = False
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return groups of one control with the estimators to compare on them, where there
-    is more than one and none was forced: wherever several are valid (`every`), or only
-    where the interior adjoint is preferred so far: over poses, the model's loss is so
-    rough that none has won, and over shapes the material form is the quietest.
+    """Return groups of one control with the estimators to compare on them.
+
+    There is more than one estimator, and none was forced. If `every`, these are all such
+    groups; else only those for which the interior adjoint is preferred so far: over
+    poses, the model's loss is so rough that no estimator has won, and over shapes the
+    material form is the quietest.
     """
-    open_groups = [
-        group
-        for group in plan.groups
-        if not group.is_forced
-        and group.valid
-        and (every or group.valid[0] == "adjoint")
-    ]
+    open_groups = []
+    for group in plan.groups:
+        if group.is_forced or not group.valid:
+            continue
+        if every or group.valid[0] == "adjoint":
+            open_groups.append(group)
     return [
         (groups, estimators)
         for groups, estimators in comparable_sets(open_groups)
@@ -99,196 +106,231 @@ def contested(
     ]
 
 
-REPEATS = 3  # gradients that are taken of everything that is compared
+REPEATS = 3  # gradients that are computed with each estimator or setting
 
 
 def plan_gradients(plan: GradientPlan, *, every: bool = False) -> int:
-    return REPEATS * sum(
-        len(candidates) for _, candidates in contested(plan, every=every)
+    """Return how many gradients `measured_plan` computes."""
+    n_estimators = sum(
+        len(estimators) for _, estimators in contested(plan, every=every)
     )
+    return REPEATS * n_estimators
 
 
 def measured_plan(
     bench: Bench, *, repeats: int = REPEATS, every: bool = False, counted: bool = False
 ) -> GradientPlan:
-    """Return the renderer's plan, which is not changed, with every contested choice
-    made by measurement. If `counted`, the renders that an estimator needs stand for its
-    time (`ADJOINT_RENDERS` for an adjoint), so that the choice is the same on a busy
-    machine.
+    """Return the renderer's plan with every contested choice made by measurement.
+
+    The plan of the renderer itself is not changed.
+
+    Args:
+        bench: computes the gradients.
+        repeats: gradients with each estimator.
+        every: as for `contested`.
+        counted: whether the renders that an estimator needs stand for its time
+            (`ADJOINT_RENDERS` for an adjoint), so that the choice is the same on a busy
+            machine.
     """
     plan = bench.renderer.plan
-
-    def scores_of(
-        groups: Sequence[Group], candidates: Sequence[str]
-    ) -> dict[str, float]:
-        """Squared error x seconds. The reference is the mean of the differences among
-        the candidates, whose own noise is taken off the others' errors.
-        """
-        measured = dict[str, Tensor]()
-        seconds = dict[str, float]()
-        noise = dict[str, float]()
-        for estimator in candidates:
-            alone = restrict_plan(plan, {group.name for group in groups}, estimator)
-            place = f"{groups[0].name} by {estimator}"
-            several, seconds[estimator] = bench.gradients(alone, "plan", repeats, place)
-            if counted:
-                seconds[estimator] = (
-                    1.0
-                    + alone.renders
-                    + (ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0)
-                )
-            measured[estimator] = several
-            noise[estimator] = float(
-                (several - several.mean(dim=0)).square().sum() / max(1, repeats - 1)
-            )
-        judge = next(
-            estimator for estimator in candidates if estimator in BY_DIFFERENCES
-        )
-        scores = dict[str, float]()
-        truth = measured[judge].mean(dim=0)
-        for estimator, several in measured.items():
-            error = (
-                float((several - truth).square().sum(dim=1).mean())
-                - noise[judge] / repeats
-            )
-            error = noise[judge] if estimator == judge else max(error, noise[estimator])
-            scores[estimator] = error * seconds[estimator]
-        return scores
-
-    for groups, candidates in contested(plan, every=every):
-        scores = scores_of(groups, candidates)
+    for groups, estimators in contested(plan, every=every):
+        scores = _score_estimators(bench, plan, groups, estimators, repeats, counted)
         best = min(scores, key=lambda name: scores[name])
-        reason = (
-            f"least squared error x {'renders' if counted else 'time'}, measured "
-            f"at {bench.spp} samples"
-        )
-        if scores[best] > 0.0:
-            others = ", ".join(
-                f"{name} {score / scores[best]:.3g}"
-                for name, score in scores.items()
-                if name != best
-            )
-            reason += f" (others, as multiples of it: {others})"
-        elif not any(
-            scores.values()
-        ):  # a loss that is flat here, as of a detector that sees nothing
-            reason = (
-                "as preferred: none of them has an error, measured at "
-                f"{bench.spp} samples"
-            )
-        chosen = {
+        reason = _explain_scores(scores, best, bench.spp, counted)
+        group_by_name = {
             group.name: replace(group, estimator=best, reason=reason, measured=scores)
             for group in groups
         }
         plan = replace(
-            plan, groups=tuple(chosen.get(group.name, group) for group in plan.groups)
+            plan,
+            groups=tuple(group_by_name.get(group.name, group) for group in plan.groups),
         )
     return plan
 
 
+def _score_estimators(
+    bench: Bench,
+    plan: GradientPlan,
+    groups: Sequence[Group],
+    estimators: Sequence[str],
+    repeats: int,
+    counted: bool,
+) -> dict[str, float]:
+    """Return squared error x seconds of each estimator on groups of one control.
+
+    The reference is the mean of the differences among the estimators, whose own noise is
+    subtracted from the errors of the others.
+    """
+    group_names = {group.name for group in groups}
+    gradients_of = dict[str, Tensor]()
+    seconds_of = dict[str, float]()
+    noise_of = dict[str, float]()
+    for estimator in estimators:
+        single_plan = restrict_plan(plan, group_names, estimator)
+        label = f"{groups[0].name} by {estimator}"
+        gradients, seconds = bench.gradients(single_plan, "plan", repeats, label)
+        if counted:
+            adjoint_renders = ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
+            seconds = 1.0 + single_plan.renders + adjoint_renders
+        deviation = gradients - gradients.mean(dim=0)
+        gradients_of[estimator] = gradients
+        seconds_of[estimator] = seconds
+        noise_of[estimator] = float(deviation.square().sum() / max(1, repeats - 1))
+    reference = next(name for name in estimators if name in BY_DIFFERENCES)
+    reference_gradient = gradients_of[reference].mean(dim=0)
+    scores = dict[str, float]()
+    for estimator, gradients in gradients_of.items():
+        squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
+        error = float(squared_distance) - noise_of[reference] / repeats
+        if estimator == reference:
+            error = noise_of[reference]
+        else:
+            error = max(error, noise_of[estimator])
+        scores[estimator] = error * seconds_of[estimator]
+    return scores
+
+
+def _explain_scores(
+    scores: Mapping[str, float], best: str, spp: int, counted: bool
+) -> str:
+    """Return why an estimator was chosen, for the plan."""
+    # A loss may be flat here, as that of a detector that detects nothing.
+    if not any(scores.values()):
+        return f"as preferred: none of them has an error, measured at {spp} samples"
+    cost = "renders" if counted else "time"
+    reason = f"least squared error x {cost}, measured at {spp} samples"
+    if scores[best] > 0.0:
+        others = ", ".join(
+            f"{name} {score / scores[best]:.3g}"
+            for name, score in scores.items()
+            if name != best
+        )
+        reason += f" (others, as multiples of it: {others})"
+    return reason
+
+
 def cosine_samples(plan: GradientPlan, *, counts: Sequence[int] = COUNTS) -> int:
-    """Return the samples a pixel that the gradients of `cosines` take in all, at
-    most.
-    """
+    """Return how many samples per pixel the gradients of `cosines` take at most, in all."""
     each = REPEATS * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
-    return each * sum(len(factors) for _, factors in _controls_of(plan))
+    return each * sum(len(factors) for _, factors in _list_controls(plan))
 
 
-def _controls_of(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
-    """The groups of each control that are differentiated, and the steps that are tried
-    of them.
-    """
-    differentiated = [group for group in plan.groups if group.estimator != "none"]
-    names = dict.fromkeys(group.control for group in differentiated)
-    controls = [
-        [group for group in differentiated if group.control == name] for name in names
-    ]
-    by_steps = [
-        any(group.estimator in BY_DIFFERENCES for group in groups)
-        for groups in controls
-    ]
-    return [
-        (groups, FACTORS if steps else FACTORS[:1])
-        for groups, steps in zip(controls, by_steps, strict=True)
-    ]
+def _list_controls(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
+    """Return the differentiated groups of each control, and the step factors to try."""
+    groups_of_control: dict[str, list[Group]] = {}
+    for group in plan.groups:
+        if group.estimator != "none":
+            groups_of_control.setdefault(group.control, []).append(group)
+    controls = list[tuple[list[Group], Sequence[float]]]()
+    for groups in groups_of_control.values():
+        has_steps = any(group.estimator in BY_DIFFERENCES for group in groups)
+        controls.append((groups, FACTORS if has_steps else FACTORS[:1]))
+    return controls
 
 
 def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measured]:
-    """Measure, control by control, the cosine of working gradients with the converged
-    one at the same step.
+    """Measure the cosine of working gradients with the converged one, for each control.
 
-    Sample counts are tried in their order until one reaches the goal at a step; then
-    the next step follows. `cosine_samples` bounds the samples of all gradients.
+    Both have the same step. Sample counts are tried in their order until one reaches the
+    goal at a step; then the next step follows. `cosine_samples` bounds the samples of
+    all gradients.
     """
-    base = bench.renderer.plan
-
-    def rows_at(
-        plan: GradientPlan, groups: Sequence[Group], factor: float
-    ) -> Iterator[Measured]:
-        control = groups[0].control
-        estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
-        place = f"{control} x {factor:g}"
-
-        def converged(spp: int) -> tuple[Tensor, float]:
-            several, _ = replace(bench, spp=spp).gradients(
-                plan, "converged", WITNESSES, f"{place} converged {spp}"
-            )
-            agreements = torch.tensor(
-                [_cosine(*pair) for pair in itertools.combinations(several, 2)]
-            )
-            return several.mean(dim=0), float(agreements.min())  # NaN if one is
-
-        many = CONVERGED
-        truth, agreement = converged(many)
-        for spp in counts:
-            if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
-                many = AGAIN * CONVERGED
-                truth, agreement = converged(many)
-            several, seconds = replace(bench, spp=spp).gradients(
-                plan, "working", REPEATS, f"{place} {spp}"
-            )
-            mean = statistics.fmean(_cosine(gradient, truth) for gradient in several)
-            yield Measured(
-                quantity="gradient", control=control, estimator=estimators, factor=factor, spp=spp, repeats=REPEATS,
-                cosine=mean, reference_cosine=agreement, seconds=seconds, status=status_of(mean, agreement),
-            )  # fmt: skip
-            if mean >= GOAL:
-                break
-
-    for groups, factors in _controls_of(base):
-        reached = False
-        tried = list[GradientPlan]()
+    base_plan = bench.renderer.plan
+    for groups, factors in _list_controls(base_plan):
+        group_names = {group.name for group in groups}
+        is_reached = False
+        tried_plans = list[GradientPlan]()
         for factor in factors:
-            if factor == FACTORS[-1] and reached:
+            if factor == FACTORS[-1] and is_reached:
                 break
-            plan = restrict_plan(
-                base.with_steps(factor), {group.name for group in groups}
-            )
-            if plan in tried:  # no step can be wider
+            plan = restrict_plan(base_plan.with_steps(factor), group_names)
+            if plan in tried_plans:  # no step can be wider
                 continue
-            tried.append(plan)
-            for row in rows_at(plan, groups, factor):
-                reached = reached or row.status == "ok"
+            tried_plans.append(plan)
+            for row in _measure_cosines(bench, plan, groups, factor, counts):
+                is_reached = is_reached or row.status == "ok"
                 yield row
 
 
-def _cosine(one: Tensor, other: Tensor) -> float:
-    size = float(one.norm() * other.norm())
-    return float(one @ other) / size if size > 0.0 else float("nan")
+def _measure_cosines(
+    bench: Bench,
+    plan: GradientPlan,
+    groups: Sequence[Group],
+    factor: float,
+    counts: Sequence[int],
+) -> Iterator[Measured]:
+    """Measure the cosine of one control at one step, by sample count up to the goal."""
+    control = groups[0].control
+    estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
+    label = f"{control} x {factor:g}"
+    converged_spp = CONVERGED
+    converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
+    for spp in counts:
+        is_short = agreement < GOAL or spp > CONVERGED
+        if converged_spp == CONVERGED and is_short:
+            converged_spp = AGAIN * CONVERGED
+            converged, agreement = _converged_gradient(
+                bench, plan, label, converged_spp
+            )
+        gradients, seconds = replace(bench, spp=spp).gradients(
+            plan, "working", REPEATS, f"{label} {spp}"
+        )
+        cosine = statistics.fmean(
+            _cosine(gradient, converged) for gradient in gradients
+        )
+        yield Measured(
+            quantity="gradient",
+            control=control,
+            estimator=estimators,
+            factor=factor,
+            spp=spp,
+            repeats=REPEATS,
+            cosine=cosine,
+            reference_cosine=agreement,
+            seconds=seconds,
+            status=status_of(cosine, agreement),
+        )
+        if cosine >= GOAL:
+            break
+
+
+def _converged_gradient(
+    bench: Bench, plan: GradientPlan, label: str, spp: int
+) -> tuple[Tensor, float]:
+    """Return the mean (d,) of converged gradients, and the smallest cosine of two."""
+    gradients, _ = replace(bench, spp=spp).gradients(
+        plan, "converged", WITNESSES, f"{label} converged {spp}"
+    )
+    agreements = torch.tensor(
+        [
+            _cosine(first, second)
+            for first, second in itertools.combinations(gradients, 2)
+        ]
+    )
+    # the minimum of a tensor is NaN if a value is
+    return gradients.mean(dim=0), float(agreements.min())
+
+
+def _cosine(first: Tensor, second: Tensor) -> float:
+    """Return the cosine of two gradients (d,); NaN if one is zero."""
+    norms = float(first.norm() * second.norm())
+    return float(first @ second) / norms if norms > 0.0 else float("nan")
 
 
 def tuned(
     plan: GradientPlan, table: Sequence[Measured]
 ) -> tuple[GradientPlan, int | None]:
-    """Return the plan with each control's step chosen from measured cosines, and the
-    sample count that all then need.
+    """Return the plan with each control's step chosen from measured cosines.
 
     Of the settings that reach the goal, the one with the fewest samples wins (all take
     as many renders), of equal ones that with the greatest cosine; where none does, the
-    one with the greatest cosine, and the reason says so. The sample count is None where
-    nothing was measured.
+    one with the greatest cosine, and the reason says so.
+
+    Returns:
+        The plan, and the sample count that all controls then need; None where nothing
+        was measured.
     """
-    counts = []
+    sample_counts = []
     measured = [
         (row, row.cosine)
         for row in table
@@ -296,145 +338,189 @@ def tuned(
     ]
     for control in dict.fromkeys(row.control for row, _ in measured):
         rows = [(row, cosine) for row, cosine in measured if row.control == control]
-        chosen, cosine = max(rows, key=lambda measured: measured[1])
-        shortfall = f": below {GOAL:g}, the best that was found"
-        if chosen.reference_cosine is not None and chosen.reference_cosine < TELLS:
-            shortfall = (
-                ": which says little, two converged ones have "
-                f"{chosen.reference_cosine:.2f}"
-            )
-        if good := [(row, cosine) for row, cosine in rows if row.status == "ok"]:
-            shortfall = ""
-            (chosen, cosine) = min(
-                good, key=lambda measured: (measured[0].spp, -measured[1])
-            )
-        counts.append(chosen.spp)
-        said = (
-            f"cosine {cosine:.2f} with the converged gradient at {chosen.spp} samples"
+        best, cosine = _choose_setting(rows)
+        sample_counts.append(best.spp)
+        remark = (
+            f"cosine {cosine:.2f} with the converged gradient at {best.spp} samples "
+            f"and {best.factor:g} x the step{_describe_shortfall(best)}"
         )
-        said += f" and {chosen.factor:g} x the step{shortfall}"
+        scaled_groups = plan.with_steps(best.factor).groups
         groups = tuple(
-            replace(group, step=scaled.step, reason=f"{group.reason}; {said}")
+            replace(group, step=scaled.step, reason=f"{group.reason}; {remark}")
             if group.control == control
             else group
-            for group, scaled in zip(
-                plan.groups, plan.with_steps(chosen.factor).groups, strict=True
-            )
+            for group, scaled in zip(plan.groups, scaled_groups, strict=True)
         )
         plan = replace(plan, groups=groups)
-    return plan, max(counts) if counts else None
+    return plan, max(sample_counts) if sample_counts else None
 
 
-# segments of the shortest path tried: light that reaches the camera from a surface that
-# it falls on
+def _choose_setting(
+    rows: Sequence[tuple[Measured, float]],
+) -> tuple[Measured, float]:
+    """Return the cheapest setting that reaches the goal, or the one nearest to it."""
+    good_rows = [(row, cosine) for row, cosine in rows if row.status == "ok"]
+    if good_rows:
+        return min(good_rows, key=lambda pair: (pair[0].spp, -pair[1]))
+    return max(rows, key=lambda pair: pair[1])
+
+
+def _describe_shortfall(row: Measured) -> str:
+    """Return why a setting does not reach the goal, for a reason; "" if it does."""
+    if row.status == "ok":
+        return ""
+    agreement = row.reference_cosine
+    if agreement is not None and agreement < TELLS:
+        return f": which says little, two converged ones have {agreement:.2f}"
+    return f": below {GOAL:g}, the best that was found"
+
+
+# segments of the shortest path: from a lamp to a surface and on to the camera
 SHORTEST = 2
-# root-mean-square change of the displayed picture, in 8-bit levels, that a search
-# accepts
+# accepted root-mean-square change of the displayed image, in 8-bit levels
 BOUND = 0.5
 
 
 def measured_bounces(
-    renderer: Renderer, configurations: Sequence[Tensor], *, seed: int, spp: int, bound: float = BOUND,
+    renderer: Renderer,
+    configurations: Sequence[Tensor],
+    *,
+    seed: int,
+    spp: int,
+    bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
-) -> PathLength:  # fmt: skip
-    """Return the shortest paths whose pictures agree with those of the full length to
-    within a bound, all with the same noise; and what was measured, from the full length
-    downwards to the first that misses the bound.
+) -> PathLength:
+    """Measure the shortest light paths whose images agree with those of full length.
+
+    All images have the same noise. Path lengths are tried from the full one downwards,
+    to the first whose image differs by more than the bound.
+
+    Args:
+        renderer: renders the images.
+        configurations: full configurations (d,).
+        seed: of the noise.
+        spp: samples per pixel.
+        bound: accepted change of the image, see `BOUND`.
+        tick: called after each image of a configuration.
     """
-    # a denoiser would spread a change over its neighbours
-    raw = renderer.like(denoiser="none")
-    full = raw.scene.max_depth
-    noises = [seeds.stream(seed, "half", half) for half in range(2)]
+    # A denoiser would spread a change over its neighbors.
+    renderer = renderer.like(denoiser="none")
+    full_depth = renderer.scene.max_depth
+    noise_seeds = [seeds.stream(seed, "half", half) for half in range(2)]
 
-    def pictures(u: Tensor, depth: int) -> list[tuple[Tensor, Tensor]]:
-        rendered = []
-        for noise in noises:
-            with torch.no_grad(), raw.scene.shorter(depth):
-                radiance = raw.radiance(u, noise, spp)
-                rendered.append(
-                    (radiance, raw.space.picture(u, raw.formation.display(radiance)))
-                )
+    def render(u: Tensor, depth: int) -> list[_Rendering]:
+        renderings = []
+        for noise_seed in noise_seeds:
+            renderings.append(_render_with_depth(renderer, u, noise_seed, spp, depth))
             tick()
-        return rendered
+        return renderings
 
-    wholes = [pictures(u, full) for u in configurations]
+    full_renderings = [render(u, full_depth) for u in configurations]
     cuts = []
-    chosen = full
-    for depth in range(full - 1, SHORTEST - 1, -1):
-        light = levels = 0.0
-        for u, whole in zip(configurations, wholes, strict=True):
-            shorter = pictures(u, depth)
-            first, second = (
-                long[1] - short[1] for long, short in zip(whole, shorter, strict=True)
-            )
-            # the product of two independent differences has no noise in its mean
-            bias = float((first * second).mean().clamp_min(0.0).sqrt())
-            all_of_it, left = (
-                sum(float(radiance.mean()) for radiance, _ in both)
-                for both in (whole, shorter)
-            )
-            light = max(light, 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0)
-            levels = max(levels, 255.0 * bias)
+    chosen_depth = full_depth
+    for depth in range(full_depth - 1, SHORTEST - 1, -1):
+        light = 0.0
+        levels = 0.0
+        for u, full in zip(configurations, full_renderings, strict=True):
+            lost_light, changed_levels = _compare_depths(full, render(u, depth))
+            light = max(light, lost_light)
+            levels = max(levels, changed_levels)
         cuts.append(PathCut(depth=depth, light=light, levels=levels))
         if not levels <= bound:
             break
-        chosen = depth
-    said = []
-    for cut in cuts:
-        if cut.depth == chosen:
-            said.append(
-                f"paths of {chosen} segments leave out {cut.light:.2%} of the light, "
-                "which moves the picture by "
-                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
-            )
-        elif cut.depth < chosen:
-            said.append(
-                f"{cut.depth} would leave out {cut.light:.2%} and move it by "
-                f"{cut.levels:.2f}"
-            )
-    reason = "; ".join(said) or f"all {full} segments"
+        chosen_depth = depth
     return PathLength(
-        depth=chosen,
-        full=full,
+        depth=chosen_depth,
+        full=full_depth,
         cuts=cuts,
         configurations=len(configurations),
-        reason=reason,
+        reason=_explain_depth(cuts, chosen_depth, full_depth),
     )
 
 
-DRAWS = 2  # configurations, beside the clean one, that the measurement looks at
-BOUNCE_SPP = 4  # samples a pixel: the same paths are compared, so that few are enough
-# renders of a search from which the measurement pays; each path length costs a
+class _Rendering(NamedTuple):
+    """Linear radiance (H, W, 3) and the displayed image (H, W, 3) of it."""
+
+    radiance: Tensor
+    image: Tensor
+
+
+def _render_with_depth(
+    renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int
+) -> _Rendering:
+    """Render u (d,) with light paths of at most `depth` segments."""
+    with torch.no_grad(), renderer.scene.shorter(depth):
+        radiance = renderer.radiance(u, seed, spp)
+        displayed = renderer.formation.display(radiance)
+        return _Rendering(radiance, renderer.space.picture(u, displayed))
+
+
+def _compare_depths(
+    full: Sequence[_Rendering], shorter: Sequence[_Rendering]
+) -> tuple[float, float]:
+    """Return the fraction of light that shorter paths lose, and the change in levels.
+
+    Each has two renderings with independent noise.
+    """
+    first, second = (
+        full_rendering.image - shorter_rendering.image
+        for full_rendering, shorter_rendering in zip(full, shorter, strict=True)
+    )
+    # The product of two independent differences has no noise in its mean.
+    bias = float((first * second).mean().clamp_min(0.0).sqrt())
+    full_light = sum(float(rendering.radiance.mean()) for rendering in full)
+    light = sum(float(rendering.radiance.mean()) for rendering in shorter)
+    lost_light = 1.0 - light / full_light if full_light > 0.0 else 0.0
+    return lost_light, 255.0 * bias
+
+
+def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
+    """Return why a path length was chosen."""
+    texts = []
+    for cut in cuts:
+        if cut.depth == depth:
+            texts.append(
+                f"paths of {depth} segments leave out {cut.light:.2%} of the light, "
+                "which moves the picture by "
+                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+            )
+        elif cut.depth < depth:
+            texts.append(
+                f"{cut.depth} would leave out {cut.light:.2%} and move it by "
+                f"{cut.levels:.2f}"
+            )
+    return "; ".join(texts) or f"all {full_depth} segments"
+
+
+DRAWS = 2  # random configurations that are measured beside the clean one
+BOUNCE_SPP = 4  # samples per pixel: the same paths are compared, so that few suffice
+# renders of a search from which on the measurement pays; each path length costs a
 # compilation
 WORTH_BOUNCES = 200
 
 
 def most_pictures(problem: Problem) -> int:
-    return (1 + DRAWS) * 2 * (1 + problem.renderer.scene.max_depth - SHORTEST)
+    """Return how many images `bounces_of` renders at most."""
+    n_depths = 1 + problem.renderer.scene.max_depth - SHORTEST
+    return (1 + DRAWS) * 2 * n_depths
 
 
 def bounces_of(
     problem: Problem, seed: int, tick: Callable[[], None] = lambda: None
 ) -> PathLength:
-    """Measure the bounces that a problem's search needs, over its clean configuration
-    and random ones of its space.
+    """Measure the bounces of light that a problem's search needs.
+
+    It is measured on the clean configuration and random ones of its domain.
     """
-    drawn = [
-        problem.domain.sample(
-            torch.Generator().manual_seed(seeds.stream(seed, "bounces", number))
-        )[0]
-        for number in range(DRAWS)
-    ]
-    conditions = [
-        seeds.stream(seed, "conditions of bounces", number) for number in range(DRAWS)
-    ]
-    wholes = [problem.whole(problem.domain.start)]
-    wholes += [
-        problem.whole(u, draw) for u, draw in zip(drawn, conditions, strict=True)
-    ]
+    full_configurations = [problem.whole(problem.domain.start)]
+    for index in range(DRAWS):
+        generator = torch.Generator().manual_seed(seeds.stream(seed, "bounces", index))
+        u = problem.domain.sample(generator)[0]
+        draw = seeds.stream(seed, "conditions of bounces", index)
+        full_configurations.append(problem.whole(u, draw))
     return measured_bounces(
         problem.renderer,
-        wholes,
+        full_configurations,
         seed=seeds.stream(seed, "bounces"),
         spp=BOUNCE_SPP,
         tick=tick,
