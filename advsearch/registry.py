@@ -141,12 +141,13 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
 
 def get_first_doc_line(entry: Any) -> str:
-    """Return the first line of the docstring of an object; empty for plain values."""
+    """Return the summary of an object's docstring, on one line; empty for plain values."""
     is_documented = inspect.isroutine(entry) or inspect.isclass(entry)
     documented = entry if is_documented else type(entry)
     if documented.__module__ == "builtins":
         return str(entry) if isinstance(entry, str) else ""
-    return (inspect.getdoc(documented) or "").partition("\n")[0]
+    summary = (inspect.getdoc(documented) or "").partition("\n\n")[0]
+    return " ".join(summary.split())
 
 
 def imported(place: str) -> Any:
@@ -197,5 +198,5 @@ def get_experiment_help(name: str) -> str:
     if isinstance(built_in, BuiltIn):
         return built_in.help
     docstring = inspect.getdoc(get_experiment(name).function) or ""
-    summary = docstring.partition("\n")[0].rstrip(".")
+    summary = " ".join(docstring.partition("\n\n")[0].split()).rstrip(".")
     return summary[:1].lower() + summary[1:]
