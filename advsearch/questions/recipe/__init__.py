@@ -23,7 +23,7 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
     view=shown,
 )
 def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:
-    """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
+    """Run a recipe: an experiment of several runs, with figures of them (docs/recipes.md).
 
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
