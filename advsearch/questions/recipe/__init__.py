@@ -22,7 +22,7 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
     choice_description="advsearch.questions.recipe.description:describe",
     view=shown,
 )
-def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:
+def recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     """Run a recipe: an experiment of several runs, with figures of them (docs/recipes.md).
 
     Args:
@@ -30,4 +30,4 @@ def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:
     """
     from advsearch.questions.recipe.carry_out import carried_out  # imports torch
 
-    return carried_out(asked)
+    return carried_out(context)

@@ -81,40 +81,42 @@ OUTER = ("object", "environment", rates.MODEL, rates.PREDICTION, rates.PART)
 ANY = "*"
 
 
-def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
+def carried_out(context: RunContext[RecipeConfig]) -> RecipeResult:
     """Run a recipe, except for the parts that are already finished.
 
     Raises:
         InputError: before anything is written, if the recipe or its settings are wrong.
     """
-    config = asked.config
+    config = context.config
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    recipe = _load_recipe(asked)
+    recipe = _load_recipe(context)
     runs = planned(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
-    if _read_noted_recipe(asked) is None:
+    if _read_noted_recipe(context) is None:
         check_described(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
-    asked.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
+    context.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
 
-    done, warnings = _carried_out(runs, asked)
-    figures_made = list[RecipeFigure]()
+    done, warnings = _run_parts(runs, context)
+    recipe_figures = list[RecipeFigure]()
     if any(result.goes_on for _, result in done):
-        asked.ending = results.INTERRUPTED
+        context.ending = results.INTERRUPTED
     elif config.photographs is not None:
-        photographed = _photographed(recipe, [run for run, _ in done])
-        warnings += _take(Path(config.photographs), photographed, asked.run)
-    if asked.ending != results.INTERRUPTED:
-        figures_made = list(_figures(recipe, config, done, asked.run))
+        photographed = _select_photographed(recipe, [run for run, _ in done])
+        warnings += _add_photographs(
+            Path(config.photographs), photographed, context.run
+        )
+    if context.ending != results.INTERRUPTED:
+        recipe_figures = list(_write_figures(recipe, config, done, context.run))
     for _, result in done:
         warnings += getattr(result, "warnings", ())
-    return _make_result(recipe, done, figures_made, warnings, asked)
+    return _make_result(recipe, done, recipe_figures, warnings, context)
 
 
-def _read_noted_recipe(asked: RunContext[RecipeConfig]) -> dict[str, Any] | None:
+def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | None:
     """Read the recipe that a resumed run began with, None of a new run."""
-    resumed = asked.resumed
+    resumed = context.resumed
     # a run that was stopped at once has no store or has not noted its recipe
     if resumed is None or not Store.is_in(resumed):
         return None
@@ -122,25 +124,25 @@ def _read_noted_recipe(asked: RunContext[RecipeConfig]) -> dict[str, Any] | None
         return store.noted(NOTE) or None
 
 
-def _load_recipe(asked: RunContext[RecipeConfig]) -> Recipe:
+def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
     """Load the recipe: as a resumed run began with it, or by its name or file."""
-    noted = _read_noted_recipe(asked)
+    noted = _read_noted_recipe(context)
     if noted is None:
-        return description.read_recipe(asked.config.recipe)
+        return description.read_recipe(context.config.recipe)
     return description.recipe_of(
-        noted, f"{asked.resumed}: the recipe that it began with"
+        noted, f"{context.resumed}: the recipe that it began with"
     )
 
 
 def _make_result(
     recipe: Recipe,
     done: Sequence[DoneRun],
-    figures_made: list[RecipeFigure],
+    recipe_figures: list[RecipeFigure],
     warnings: Sequence[str],
-    asked: RunContext[RecipeConfig],
+    context: RunContext[RecipeConfig],
 ) -> RecipeResult:
     """Make the result of a recipe; a resumed run adds the seconds it took before."""
-    config = asked.config
+    config = context.config
     recipe_settings = description.made_of(recipe, config).settings
     defaults = {
         "object": "",
@@ -163,7 +165,7 @@ def _make_result(
         )
         for run, result in done
     ]
-    result = asked.result(
+    result = context.result(
         RecipeResult,
         recipe=config.recipe,
         title=recipe.title,
@@ -174,12 +176,12 @@ def _make_result(
         model=",".join(names["model"]),
         controls=list(dict.fromkeys(controls)),
         parts=parts,
-        figures=figures_made,
+        figures=recipe_figures,
         warnings=list(dict.fromkeys(warnings)),
     )
     # a run that was killed has no summary with seconds
-    if asked.resumed is not None and (asked.resumed / "summary.json").is_file():
-        previous = read_result(asked.resumed)
+    if context.resumed is not None and (context.resumed / "summary.json").is_file():
+        previous = read_result(context.resumed)
         result.seconds["total"] += getattr(previous, "seconds", {"total": 0.0})["total"]
     return result
 
@@ -191,7 +193,7 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
         InputError: if something that the recipe describes cannot work.
     """
     if config.photographs is not None:
-        photographed = _photographed(recipe, planned(recipe, config))
+        photographed = _select_photographed(recipe, planned(recipe, config))
         if not photographed:
             raise InputError(
                 f"photographs: {config.recipe} keeps no pictures to compare them with; "
@@ -333,7 +335,9 @@ def _check_column(
         )
 
 
-def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun]:
+def _select_photographed(
+    recipe: Recipe, runs: Sequence[PlannedRun]
+) -> list[PlannedRun]:
     """Select the runs that photographs are compared with.
 
     They are sweeps with configurations of their own that store all images, with which
@@ -349,8 +353,8 @@ def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun
     return selected
 
 
-def _carried_out(
-    runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]
+def _run_parts(
+    runs: Sequence[PlannedRun], context: RunContext[RecipeConfig]
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
 
@@ -361,12 +365,12 @@ def _carried_out(
     left_out = list[str]()
     for number, run in enumerate(runs, start=1):
         config = run.config
-        asked.progress.message(
+        context.progress.message(
             f"run {number} of {len(runs)}: {run.part}, {config.object}"
         )
         if run.around is not None:
             search: Any = read_result(
-                RunDirectory.locate_part(asked.run.path, run.around)
+                RunDirectory.locate_part(context.run.path, run.around)
             )
             if search.distribution is None:
                 left_out.append(
@@ -376,7 +380,7 @@ def _carried_out(
                 )
                 continue
             config = around(config, search.distribution, search.configuration or {})
-        result = asked.run_part(run.name, config)
+        result = context.run_part(run.name, config)
         done.append((run, result))
         if result.goes_on:
             break
@@ -407,24 +411,39 @@ def around(
             for known in workbench.CONTROLS[control].parameters
             if known.name == parameter_name
         )
-        bounds = (searched[name].low, searched[name].high, mean.value)
-        if parameter.log:
-            lower, upper, center = (math.log(value) for value in bounds)
-        else:
-            lower, upper, center = (float(value) for value in bounds)
-        half_width = math.sqrt(3.0) * deviation * (upper - lower)
-        if parameter.periodic and upper - lower >= TURN:
-            half_width = min(half_width, TURN / 2)
-            sampled = [center - half_width, center + half_width]
-        else:
-            sampled = [max(center - half_width, lower), min(center + half_width, upper)]
-        if parameter.log:
-            sampled = [math.exp(bound) for bound in sampled]
-        controls.setdefault(control, {})[parameter_name] = sampled
+        controls.setdefault(control, {})[parameter_name] = _range_around(
+            mean.value, deviation, (searched[name].low, searched[name].high), parameter
+        )
     return config.model_copy(update={"controls": controls, "sampler": "random"})
 
 
-def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list[str]:
+def _range_around(
+    mean: float, deviation: float, search_range: tuple[float, float], parameter: Any
+) -> list[float]:
+    """Return the range of a uniform distribution, inside the range of the search.
+
+    Args:
+        mean: mean of the distribution.
+        deviation: standard deviation as a fraction of the search's range.
+        search_range: bounds of the search.
+        parameter: the parameter, which may be logarithmic or periodic.
+    """
+    to_scale = math.log if parameter.log else float
+    lower, upper, center = (to_scale(value) for value in (*search_range, mean))
+    half_width = math.sqrt(3.0) * deviation * (upper - lower)
+    if parameter.periodic and upper - lower >= TURN:
+        half_width = min(half_width, TURN / 2)
+        bounds = [center - half_width, center + half_width]
+    else:
+        bounds = [max(center - half_width, lower), min(center + half_width, upper)]
+    if parameter.log:
+        return [math.exp(bound) for bound in bounds]
+    return bounds
+
+
+def _add_photographs(
+    folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory
+) -> list[str]:
     """Add photographs to the runs that they are compared with.
 
     Args:
@@ -457,11 +476,14 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list
     return missing
 
 
-def _figures(
-    recipe: Recipe, config: RecipeConfig, done: Sequence[DoneRun], kept: RunDirectory
+def _write_figures(
+    recipe: Recipe,
+    config: RecipeConfig,
+    done: Sequence[DoneRun],
+    recipe_run: RunDirectory,
 ) -> Iterator[RecipeFigure]:
     """Write the images of all figures of a recipe, and yield their content."""
-    rows = _read_frame(recipe, done, kept)
+    rows = _read_frame(recipe, done, recipe_run)
     number = 0
     # all options are read before the first figure is made
     kinds = [read_options(described, config.recipe) for described in recipe.figures]
@@ -469,11 +491,13 @@ def _figures(
         for figure in make(rows, kind, options):
             number += 1
             for suffix, data in files_of(figure).items():
-                kept.write_file(f"images/figure-{number}.{suffix}", data)
+                recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
             yield RecipeFigure.of({"figure": kind, **vars(figure)})
 
 
-def _read_frame(recipe: Recipe, done: Sequence[DoneRun], kept: RunDirectory) -> Rows:
+def _read_frame(
+    recipe: Recipe, done: Sequence[DoneRun], recipe_run: RunDirectory
+) -> Rows:
     """Read the rows of all runs into one frame."""
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
@@ -489,7 +513,7 @@ def _read_frame(recipe: Recipe, done: Sequence[DoneRun], kept: RunDirectory) -> 
                 surfaces[run.name] = result.surface
         workers = getattr(run.config, WORKERS, None)
         more = {} if workers is None else {WORKERS: workers}
-        folder = RunDirectory.locate_part(kept.path, run.name)
+        folder = RunDirectory.locate_part(recipe_run.path, run.name)
         for part, kinds in row_kinds.items():
             part_rows, part_units = read_rows(
                 part, folder, result, run.config.seed, kinds, **more
@@ -502,7 +526,7 @@ def _read_frame(recipe: Recipe, done: Sequence[DoneRun], kept: RunDirectory) -> 
         units=units,
         surfaces=surfaces,
         cores=workbench.cores(),
-        folder=kept.path,
+        folder=recipe_run.path,
     )
 
 

@@ -62,7 +62,7 @@ class Part(_Described):
 
     @field_validator("settings")
     @classmethod
-    def _not_own(cls, value: Settings) -> Settings:
+    def _reject_per_run_settings(cls, value: Settings) -> Settings:
         """Reject settings that are the same for all parts."""
         for name in (*OF_THE_COMMAND, "object", "label"):
             if name in value:
@@ -105,7 +105,7 @@ class Recipe(_Described):
 
     @field_validator("settings")
     @classmethod
-    def _no_place(cls, value: Settings) -> Settings:
+    def _reject_command_settings(cls, value: Settings) -> Settings:
         """Reject settings that belong to the command line."""
         for name in OF_THE_COMMAND:
             if name in value:
@@ -116,7 +116,7 @@ class Recipe(_Described):
 
     @field_validator("parts")
     @classmethod
-    def _names(cls, value: dict[str, Part]) -> dict[str, Part]:
+    def _check_part_names(cls, value: dict[str, Part]) -> dict[str, Part]:
         """Check the names of parts, and that parts refer to earlier ones only."""
         earlier = list[str]()
         for name, part in value.items():
@@ -264,15 +264,7 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     recipe = made_of(recipe, config)
     runs = list[PlannedRun]()
     for name, part in recipe.parts.items():
-        part_settings = {**recipe.settings, **part.settings}
-        defaults = {"object": ""}
-        if part.command == "attack":
-            defaults["environment"] = SceneConfig.default_environment
-            defaults["model"] = "reference"
-        axes = {
-            axis: names_listed(part_settings.get(axis) or default)
-            for axis, default in defaults.items()
-        }
+        axes = _list_axes(recipe, part)
         for index, values in enumerate(product(*axes.values())):
             value_of_axis = dict(zip(axes, values, strict=True))
             run_config = _make_run_config(recipe, name, index, value_of_axis, config)
@@ -290,6 +282,19 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
             f"{len(runs)}; name fewer objects"
         )
     return runs
+
+
+def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
+    """Return the settings of a part whose values are combined to its runs."""
+    defaults = {"object": ""}
+    if part.command == "attack":
+        defaults["environment"] = SceneConfig.default_environment
+        defaults["model"] = "reference"
+    part_settings = {**recipe.settings, **part.settings}
+    return {
+        axis: names_listed(part_settings.get(axis) or default)
+        for axis, default in defaults.items()
+    }
 
 
 def _make_run_config(

@@ -159,18 +159,12 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
 
     Its sentences also say which of both cues predicts the predictions better.
     """
-    rows_of_texture = rates.by(rows, options.texture)
     names_texture = dict[str, Any]()
-    for texture, texture_rows in rows_of_texture.items():
-        classes = set(options.classes.get(texture, ()))
-        # the full prediction, or a name in a list of names
-        names = texture_rows[rates.PREDICTION].map(
-            lambda label: {label.strip(), *map(str.strip, label.split(","))}
-        )
-        names_texture[texture] = ~names.map(classes.isdisjoint)
     by_shape = dict[str, Tally]()
     by_texture = dict[str, Tally]()
-    for texture, texture_rows in rows_of_texture.items():
+    for texture, texture_rows in rates.by(rows, options.texture).items():
+        classes = options.classes.get(texture, ())
+        names_texture[texture] = _names_class(texture_rows[rates.PREDICTION], classes)
         by_shape[texture] = Tally.over(texture, texture_rows)
         by_texture[texture] = Tally.over(texture, texture_rows, names_texture[texture])
 
@@ -178,7 +172,7 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
         "The prediction is the object, whatever its texture: "
         f"{Tally.over('', rows).told('so')}."
     ]
-    with_classes = [name for name in rows_of_texture if options.classes.get(name)]
+    with_classes = [name for name in names_texture if options.classes.get(name)]
     if with_classes:
         flags = pd.concat([names_texture[name] for name in with_classes])
         total = Tally.over("", rows.loc[flags.index], flags)
@@ -188,23 +182,26 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
         )
         if not total.share:
             text.append("A model that has no class for a texture cannot name it.")
-    text.append(_which(predicted(rows, options)))
+    text.append(_compare_cues(predicted(rows, options)))
     text += rates.extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
     )
-    table = [
-        [name, *by_shape[name].cells, by_texture[name].times]
-        for name in rows_of_texture
-    ]
-    heads = [options.texture, "the object", *rates.COUNT, "the texture"]
     return MadeFigure(
         "Predictions by shape and by texture",
         text,
-        heads,
-        table,
+        [options.texture, "the object", *rates.COUNT, "the texture"],
+        [[name, *by_shape[name].cells, by_texture[name].times] for name in by_shape],
         lambda figure: _draw_cues(figure, by_shape, by_texture),
-        (6.0, 1.7 + 0.27 * len(rows_of_texture)),
+        (6.0, 1.7 + 0.27 * len(by_shape)),
     )
+
+
+def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
+    """Return which predictions (n,) are one of the classes, in full or in a list."""
+    names = predictions.map(
+        lambda label: {label.strip(), *map(str.strip, label.split(","))}
+    )
+    return ~names.map(set(classes).isdisjoint)
 
 
 def _draw_cues(
@@ -271,15 +268,21 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
                 same_texture += other_labels
         n_samples = min(len(same_shape), len(same_texture))
         if n_samples:
-            n_predicted = []
-            for cue in (same_shape, same_texture):
-                sample = generator.sample(cue, n_samples)
-                n_predicted.append(labels.count(rates.most_frequent(sample)[0][0]))
-            counts.append((len(labels), n_predicted[0], n_predicted[1]))
+            by_shape = _most_frequent_of_sample(same_shape, n_samples, generator)
+            by_texture = _most_frequent_of_sample(same_texture, n_samples, generator)
+            counts.append(
+                (len(labels), labels.count(by_shape), labels.count(by_texture))
+            )
     return counts
 
 
-def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
+def _most_frequent_of_sample(
+    labels: Sequence[str], n_samples: int, generator: random.Random
+) -> str:
+    return rates.most_frequent(generator.sample(labels, n_samples))[0][0]
+
+
+def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
     """Describe by how many percentage points the shape predicts better.
 
     Predictions about one pair of object and texture are dependent: the interval is a
@@ -354,34 +357,29 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
 
     If all predictions are the same, it shows the margin of the right label instead.
     """
-    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
-    sums = amounts.sum(axis=1, keepdims=True)
+    mixtures = _read_mixtures(rows, options)
     names = [rates.bare(name) for name in options.shares]
-    mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
     main_ingredient = mixtures.argmax(axis=1)  # (n,)
     corners = all_triangles(options.side)
     triangles = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
     in_triangle = [(triangles == triangle).to_numpy() for triangle in corners]
 
     ranking = rates.most_frequent(rows[rates.PREDICTION])
-    margin = rows["margin"].astype(float).to_numpy()
-    margins = {
-        name: margin[(main_ingredient == index) & ~np.isnan(margin)]
-        for index, name in enumerate(names)
-    }
+    margins = _margins_by_ingredient(rows, names, main_ingredient)
     by_margin = len(ranking) == 1 and min(map(len, margins.values())) >= 2
-    panels = dict[str, list[float | None]]()
+    ranking = ranking[: options.most]
     if by_margin:
-        label = ranking[0][0]
-        panels[label] = _mean_by_triangle(margin, in_triangle)
-        text, heads, table = _describe_margins(label, margins)
+        text, heads, table = _describe_margins(ranking[0][0], margins)
     else:
-        for label, _ in ranking[: options.most]:
-            is_label = (rows[rates.PREDICTION] == label).to_numpy()
-            panels[label] = _mean_by_triangle(is_label, in_triangle)
         text, heads, table = _describe_ingredients(
-            rows, ranking[: options.most], names, main_ingredient
+            rows, ranking, names, main_ingredient
         )
+    panels = dict[str, list[float | None]]()
+    for label, _ in ranking:
+        values = (rows[rates.PREDICTION] == label).to_numpy()
+        if by_margin:
+            values = rows["margin"].astype(float).to_numpy()
+        panels[label] = _mean_by_triangle(values, in_triangle)
     n_empty = sum(not is_inside.any() for is_inside in in_triangle)
     if n_empty:
         text.append(
@@ -392,10 +390,28 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
     def draw(figure: Any) -> None:
         _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
 
+    size = (max(2.4 * len(panels), 4.8), 3.5)
     title = f"Predictions over {', '.join(names)}"
-    return MadeFigure(
-        title, text, heads, table, draw, (max(2.4 * len(panels), 4.8), 3.5)
-    )
+    return MadeFigure(title, text, heads, table, draw, size)
+
+
+def _read_mixtures(rows: Rows, options: TernaryOptions) -> Doubles:
+    """Return the amounts of three ingredients (n, 3), divided by their sum."""
+    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
+    total = amounts.sum(axis=1, keepdims=True)
+    return amounts / np.where(total == 0.0, 1.0, total)
+
+
+def _margins_by_ingredient(
+    rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
+) -> dict[str, Doubles]:
+    """Return the known margins of the mixtures in which each ingredient is largest."""
+    margin = rows["margin"].astype(float).to_numpy()
+    is_known = ~np.isnan(margin)
+    return {
+        name: margin[(main_ingredient == index) & is_known]
+        for index, name in enumerate(names)
+    }
 
 
 def _mean_by_triangle(
@@ -413,7 +429,7 @@ def _describe_margins(
     label: str, margins: Mapping[str, Doubles]
 ) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
     """Describe the margins by main ingredient: sentences, heads and rows of a table."""
-    text = [MEANINGLESS.format(label), _told_leads(margins)]
+    text = [MEANINGLESS.format(label), _compare_margins(margins)]
     heads = [
         "where most is",
         "pictures",
@@ -421,7 +437,7 @@ def _describe_margins(
         "standard error",
     ]
     table: list[list[rates.Cell]] = [
-        [name, len(values), float(values.mean()), _error(values)]
+        [name, len(values), float(values.mean()), _standard_error(values)]
         for name, values in margins.items()
     ]
     return text, heads, table
@@ -470,7 +486,7 @@ def _draw_panels(
     """Draw a ternary diagram for each prediction, with one or several color bars."""
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
-        triangles = _panel(axes, prediction, values, corners, names)
+        triangles = _draw_panel(axes, prediction, values, corners, names)
         known = [value for value in values if value is not None]
         lower = min([*known, 0.0])
         upper = 1.0
@@ -530,24 +546,24 @@ def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
     return corners
 
 
-def _told_leads(leads: Mapping[str, Doubles]) -> str:
+def _compare_margins(margins: Mapping[str, Doubles]) -> str:
     """Compare the smallest and the largest mean margin by normal intervals.
 
     For the comparison they are widened for a choice among all (Bonferroni).
     """
-    smallest = min(leads, key=lambda name: leads[name].mean())
-    largest = max(leads, key=lambda name: leads[name].mean())
+    smallest = min(margins, key=lambda name: margins[name].mean())
+    largest = max(margins, key=lambda name: margins[name].mean())
     descriptions = []
     for name in (smallest, largest):
-        lower, upper = _mean_interval(leads[name])
+        lower, upper = _mean_interval(margins[name])
         descriptions.append(
-            f"{name}: {leads[name].mean():.3g} "
-            f"(95 % interval {lower:.3g} to {upper:.3g}, {len(leads[name])} pictures)"
+            f"{name}: {margins[name].mean():.3g} "
+            f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins[name])} pictures)"
         )
-    widened = f"their intervals, widened for having been chosen among {len(leads)},"
+    widened = f"their intervals, widened for having been chosen among {len(margins)},"
     verdict = f"No difference is shown: {widened} overlap"
-    _, upper_of_smallest = _mean_interval(leads[smallest], len(leads))
-    lower_of_largest, _ = _mean_interval(leads[largest], len(leads))
+    _, upper_of_smallest = _mean_interval(margins[smallest], len(margins))
+    lower_of_largest, _ = _mean_interval(margins[largest], len(margins))
     if upper_of_smallest < lower_of_largest:
         verdict = f"The difference is shown: {widened} do not overlap"
     return (
@@ -559,17 +575,17 @@ def _told_leads(leads: Mapping[str, Doubles]) -> str:
 def _mean_interval(values: Doubles, n_compared: int = 1) -> tuple[float, float]:
     """Return the normal interval of a mean, widened for a choice among `n_compared`."""
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
-    half_width = NormalDist().inv_cdf(1.0 - alpha) * _error(values)
+    half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
     mean = values.mean()
     return mean - half_width, mean + half_width
 
 
-def _error(values: Doubles) -> float:
+def _standard_error(values: Doubles) -> float:
     """Compute the standard error of the mean of values (n,)."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
-def _panel(
+def _draw_panel(
     axes: Any,
     label: str,
     values: Sequence[float | None],

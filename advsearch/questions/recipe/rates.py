@@ -403,15 +403,16 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
-    baseline = dict[str, list[Tally]]()
-    if options.beside and len(baseline_rows):
-        name = options.names.get(options.beside, options.beside)
-        baseline[name] = _count_series("", baseline_rows, series_values, options)
+    bars = dict(cells)
 
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
-    for name, tallies in baseline.items():
+    if options.beside and len(baseline_rows):
+        name = options.names.get(options.beside, options.beside)
+        tallies = _count_series("", baseline_rows, series_values, options)
         text += _compare_with_baseline(name, tallies, totals, series, verb)
+        # the baseline comes first
+        bars = {name: tallies, **cells}
 
     def draw(figure: Any) -> None:
         if options.form == "lines":
@@ -419,17 +420,16 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
             unit = unit_of(rows, options.by).strip()
             _draw_rate_lines(figure, cells, series, positions, unit, options)
         else:
-            _draw_rates(figure, {**baseline, **cells}, cells, series, options)
+            _draw_rates(figure, bars, cells, series, options)
 
-    title = f"{'Error' if options.wrong else 'Accuracy'} by {_split_columns(options)}"
     series_column = [options.series] if options.series else []
     return MadeFigure(
-        title,
+        f"{'Error' if options.wrong else 'Accuracy'} by {_split_columns(options)}",
         text,
         [options.by, *series_column, verb, *COUNT],
-        _tabulate_rates({**baseline, **cells}, totals, series, options),
+        _tabulate_rates(bars, totals, series, options),
         draw,
-        _choose_size(len(baseline) + len(cells), len(cells), len(series), options),
+        _choose_size(len(bars), len(cells), len(series), options),
     )
 
 
@@ -448,7 +448,7 @@ def _count_cells(
 
     Bars of names are sorted by the fraction of the first series, the highest first.
     """
-    groups, bin_centers = _groups(rows, options)
+    groups, bin_centers = _group_rows(rows, options)
     cells = dict[str, list[Tally]]()
     for value, group_rows in groups.items():
         name = options.names.get(value, value)
@@ -648,21 +648,14 @@ def _draw_rate_lines(
         figure.legend(loc="outside lower center", ncols=min(len(series), 3))
 
 
-def _groups(
+def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
     """Split rows by a column's values, or by bins; also return the centers of bins."""
     if options.bins is None and options.form != "lines":
         return by(rows, options.by), None
-    values = numbers(rows, options.by)
+    values = _read_binned_values(rows, options)
     n_bins = options.bins or BINS
-    unit = unit_of(rows, options.by)
-    if options.away_from is not None:
-        values = (values - options.away_from).abs()
-        if options.turn is not None:  # the shorter way round
-            values = np.minimum(
-                values % options.turn, options.turn - values % options.turn
-            )
     lower, upper = options.range or (values.min(), values.max())
     if not upper > lower:
         raise InputError(
@@ -676,11 +669,23 @@ def _groups(
     groups = dict[str, Rows]()
     centers = list[float]()
     for index, (start, end) in enumerate(pairwise(edges)):
-        start_text = wording.figure_value(start)
-        end_text = wording.figure_value(end)
-        groups[f"{start_text} to {end_text}{unit}"] = rows[bin_index == index]
+        bounds = f"{wording.figure_value(start)} to {wording.figure_value(end)}"
+        name = bounds + unit_of(rows, options.by)
+        groups[name] = rows[bin_index == index]
         centers.append((start + end) / 2)
     return groups, centers
+
+
+def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
+    """Return the column that is binned, or its distances from a value."""
+    values = numbers(rows, options.by)
+    if options.away_from is None:
+        return values
+    distance = (values - options.away_from).abs()
+    if options.turn is None:
+        return distance
+    # the shorter way round a circle
+    return np.minimum(distance % options.turn, options.turn - distance % options.turn)
 
 
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
@@ -786,53 +791,55 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
             "figures: agreement: expected predictions of a part "
             f"{options.of[0]!r}, got none"
         )
+    objects = [ALL, *renderings["object"].unique()]
+    bars: dict[str, list[Tally]] = {name: [] for name in objects}
     text = list[str]()
     table = list[list[Cell]]()
     series = list[str]()
-    bars: dict[str, list[Tally]] = {
-        thing: [] for thing in (ALL, *renderings["object"].unique())
-    }
     for part in (PHOTOGRAPHS, *options.of[1:]):
         part_rows = rows[rows[PART] == part]
-        name = options.names.get(part, part)
-        pairs = _pair_rows(part_rows, renderings)
-        n_unpaired = len(part_rows) - len(pairs)
         if part == PHOTOGRAPHS and part_rows.empty:
             text.append(NO_PHOTOGRAPHS)
             continue
+        pairs = _pair_rows(part_rows, renderings)
+        n_unpaired = len(part_rows) - len(pairs)
         if part != PHOTOGRAPHS and n_unpaired:
             raise InputError(
                 f"figures: agreement: expected {part} to have the "
                 f"configurations of {options.of[0]}"
             )
-        series.append(name)
-        for thing, tallies in bars.items():
-            object_pairs = pairs
-            if thing != ALL:
-                object_pairs = pairs[pairs["object"] == thing]
-            tally, cells = _count_agreement(thing, object_pairs)
+        series_name = options.names.get(part, part)
+        series.append(series_name)
+        for name, tallies in bars.items():
+            object_pairs = pairs if name == ALL else pairs[pairs["object"] == name]
+            tally, cells = _count_agreement(name, object_pairs)
             tallies.append(tally)
-            table.append([name, thing, *cells])
-            if thing == ALL and len(pairs):
-                text.append(_describe_agreement(name, tally, pairs))
+            table.append([series_name, name, *cells])
+        if len(pairs):
+            text.append(_describe_agreement(series_name, bars[ALL][-1], pairs))
         if part == PHOTOGRAPHS:
             text += _describe_photographs(len(pairs), n_unpaired)
 
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        shares = {
-            thing: [tally.drawn for tally in tallies] for thing, tallies in bars.items()
-        }
-        figures.draw_shares(axes, shares, series)
-        axes.set(xlabel="share that agrees, with 95 % interval")
-        figure.legend(loc="outside lower center", ncols=1)
-
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
-    heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT]
-    size = 6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)
     return MadeFigure(
-        "Renderings and other pictures of the same", text, heads, table, draw, size
+        "Renderings and other pictures of the same",
+        text,
+        ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT],
+        table,
+        lambda figure: _draw_agreement(figure, bars, series),
+        (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
+
+
+def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
+    """Draw bars of the fraction of pairs that agree, for all and for each object."""
+    axes = figure.subplots()
+    shares = {
+        name: [tally.drawn for tally in tallies] for name, tallies in bars.items()
+    }
+    figures.draw_shares(axes, shares, series)
+    axes.set(xlabel="share that agrees, with 95 % interval")
+    figure.legend(loc="outside lower center", ncols=1)
 
 
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
@@ -871,7 +878,7 @@ def _describe_agreement(name: str, tally: Tally, pairs: Rows) -> str:
     return (
         f"Renderings and {name}: "
         f"{tally.told('right about both or wrong about both')}. "
-        f"{_where(True, pairs)} {_where(False, pairs)} "
+        f"{_describe_where(True, pairs)} {_describe_where(False, pairs)} "
         f"The prediction is the same in {n_same} of {len(pairs)} "
         f"({wording.percent(n_same / len(pairs))})."
     )
@@ -891,7 +898,7 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
     return text
 
 
-def _where(right: bool, pairs: Rows) -> str:
+def _describe_where(right: bool, pairs: Rows) -> str:
     """Describe the other image of pairs whose rendering was predicted right or wrong."""
     verb = "right" if right else "wrong"
     selected = pairs[pairs["correct rendered"] == right]
@@ -912,7 +919,9 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
     # grouping leaves out the rows of sweeps that do not set the workers
-    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(_rate)
+    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(
+        _compute_throughput
+    )
     rates_by_count = {
         int(workers): run_rates.droplevel(0)
         for workers, run_rates in runs.groupby(level=0)
@@ -956,13 +965,13 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     for workers, run_rates in rates_by_count.items():
         sentence = (
             f"{wording.count(workers, 'worker')}: "
-            f"{_spread(run_rates)} pictures a second"
+            f"{_format_spread(run_rates)} pictures a second"
         )
         gains = _compute_gains(run_rates, rates_by_count)
         if workers > fewest and len(gains):
             efficiency = 100 * gains.median() * fewest / workers
             sentence += (
-                f", {_spread(gains)} times as many as "
+                f", {_format_spread(gains)} times as many as "
                 f"{wording.count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
             )
         text.append(f"{sentence}.")
@@ -1019,7 +1028,7 @@ def _draw_scaling(
     figure.legend(loc="outside lower center", ncols=2)
 
 
-def _rate(times: Any) -> float:
+def _compute_throughput(times: Any) -> float:
     """Compute images per second from the times (n,) when the rows of a run were stored.
 
     The first quarter is left out, in which workers load. Rows of one batch are stored
@@ -1038,7 +1047,7 @@ def _rate(times: Any) -> float:
     return float((times > start).sum() / (times[-1] - start))
 
 
-def _spread(values: Any) -> str:
+def _format_spread(values: Any) -> str:
     """Format the median of values, and their range if there are several."""
     median = f"{values.median():.3g}"
     if len(values) < 2:

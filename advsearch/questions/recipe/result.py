@@ -124,13 +124,13 @@ class RecipeConfig(Config):
 
     @field_validator("photographs")
     @classmethod
-    def _folder_from_anywhere(cls, value: str | None) -> str | None:
+    def _resolve_photographs(cls, value: str | None) -> str | None:
         """Make the path absolute, since a run is resumed from any directory."""
         return None if value is None else str(Path(value).expanduser().resolve())
 
     @field_validator("label")
     @classmethod
-    def _labels_with_names(cls, value: dict[str, str]) -> dict[str, str]:
+    def _check_labels(cls, value: dict[str, str]) -> dict[str, str]:
         """Reject empty labels and zero bytes."""
         for name, label in value.items():
             if not label.strip(" ,\t\n") or "\0" in name + label:
@@ -217,7 +217,7 @@ def shown(result: RecipeResult) -> ShownResult:
     ):
         image = f"images/figure-{number}.png"
         sections.append(ResultPart(figure.title, text, figure=image))
-        rows = [list(map(_cell, figure.columns, row)) for row in figure.rows]
+        rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
         sections.append(
             ResultPart(
                 "The numbers", heads=figure.columns, rows=rows, folded=True, only="page"
@@ -263,7 +263,7 @@ def _shorten_names(names: str) -> str:
     return ", ".join(map(wording.short_name, names.split(",")))
 
 
-def _cell(column: str, value: Cell) -> str:
+def _format_cell(column: str, value: Cell) -> str:
     """Format a cell of a figure's numbers."""
     if column in SHARES:
         return wording.percent(value) if isinstance(value, (int, float)) else ""
