@@ -193,7 +193,6 @@ def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
 
 
 # ---- pictures
-# -------------------------------------------------------------------------------------------------------
 
 REFERENCE_SAMPLER = "multijitter"
 """Unbiased as all of them, and a reference of a given error is reached in less than

@@ -182,7 +182,6 @@ cases("radiometric", leave_plateau, [
 
 
 # ---- surfaces
-# -------------------------------------------------------------------------------------------------------
 
 
 def make_glass_ball() -> dict[str, dict[str, object]]:
@@ -272,7 +271,6 @@ def texels_at_the_ends() -> Outcome:
 
 
 # ---- light that is thrown
-# --------------------------------------------------------------------------------------------
 
 SIDE = 8  # texels along the picture of a projector
 WHOLE = [1.0] * (3 * SIDE**2)
@@ -315,7 +313,6 @@ def project_through_glass() -> Outcome:
 
 
 # ---- meshes, places and views
-# ---------------------------------------------------------------------------------------
 
 # a square that faces +x
 QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
@@ -526,7 +523,6 @@ for control, name in (
 
 
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds
-# ------------------------------------------
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
@@ -583,7 +579,6 @@ def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
     ]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # Cases of controls whose scales differ by a million, and of noise.
 #
 # A search works in the unit box, so a control's unit cannot reach it. What can is how
