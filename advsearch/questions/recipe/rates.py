@@ -721,7 +721,7 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 
 
 def _draw_lines(
-    axes: Any, cells: Cells, series: Sequence[str], middles: Sequence[float]
+    axes: Any, cells: Cells, series: Sequence[str], bin_positions: Sequence[float]
 ) -> None:
     """Draw the fractions of each series, with their 95 % intervals as bands."""
     for index, name in enumerate(series):
@@ -729,7 +729,7 @@ def _draw_lines(
         shares = list[float | None]()
         lower = list[float]()
         upper = list[float]()
-        for position, tallies in zip(middles, cells.values(), strict=True):
+        for position, tallies in zip(bin_positions, cells.values(), strict=True):
             tally = tallies[index]
             if not tally.total:
                 continue

@@ -872,7 +872,7 @@ def _make_evidence_run(
             "conditions": conditions,
             "photographs": conditions_of(result, photo_rows),
             "domain": {name: part.text for name, part in domain.items()},
-            "not_shown": _describe_not_shown(
+            "not_shown": _describe_limits(
                 claims_of_photographs, domain, bool(weighted)
             ),
         }
@@ -939,7 +939,7 @@ def _remark_quick(folder: Path) -> list[str]:
     return [QUICK] if is_quick else []
 
 
-def _describe_not_shown(
+def _describe_limits(
     claims_of_photographs: Sequence[views.Claim],
     domain: Mapping[str, DomainPart],
     is_weighted: bool,

@@ -114,19 +114,19 @@ class Trial:
         return self.passed >= self.seconds
 
     def claim(
-        self, asked: ClaimResult, claim: AnyClaim, config: SceneConfig
+        self, pending: ClaimResult, claim: AnyClaim, config: SceneConfig
     ) -> ClaimResult:
         """Test a claim, and return its result.
 
         Args:
-            asked: the result without a verdict.
+            pending: the result without a verdict.
             claim: what is claimed.
             config: settings of its pictures, or of its search.
         """
         if isinstance(claim, ShareClaim | NoWorseClaim):
-            return self._test_by_pictures(asked, claim, config)
+            return self._test_by_pictures(pending, claim, config)
         assert isinstance(config, AttackConfig)
-        return self._test_by_search(asked, config)
+        return self._test_by_search(pending, config)
 
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
@@ -357,16 +357,16 @@ class Trial:
                 return
 
     def counterexample(
-        self, asked: ClaimResult, example: Counterexample, config: AttackConfig
+        self, pending: ClaimResult, example: Counterexample, config: AttackConfig
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 
         Args:
-            asked: the result without a verdict.
+            pending: the result without a verdict.
             example: the counterexample.
             config: settings that it is tested with.
         """
-        pending = asked.model_copy(
+        pending = pending.model_copy(
             update={
                 "statement": f"{config.model} is right where it said {example.said}"
             }
