@@ -455,26 +455,7 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
         return {}
     n_columns = min(2, len(panels))
     n_rows = math.ceil(len(panels) / n_columns)
-    machine = result.machine
-    points = result.points
     (height, width) = result.image_formation.resolution
-    threads = ", ".join(
-        f"{count} {name} thread" + "s" * (count != 1)
-        for name, count in machine.threads.items()
-    )
-    max_repeats = max(point.repeats for point in points)
-    seconds = f"of the last of {max_repeats} repeats at most"
-    if max_repeats > WARM_UP + 1:
-        seconds = f"medians of at most {max_repeats - WARM_UP} interleaved repeats"
-    legend = "Filled: known" + (
-        ", with its 95 % interval." if any(point.interval for point in points) else "."
-    )
-    if not all(point.known for point in points):
-        legend += " Open, with an arrow: at most this, the reference is no better."
-    caption = (
-        f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
-        f"{seconds}.\n{legend}"
-    )
     headline = (
         f"{result.object} in {result.environment}, {result.model}, {width} x "
         f"{height} pixels"
@@ -486,9 +467,33 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
             axes.set_title(title)
             _draw_errors(axes, panel_points, result)
         figure.suptitle(headline, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        caption = _make_caption(result)
         figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
 
     return figures.drawn(draw, (PANEL[0] * n_columns, PANEL[1] * n_rows + 0.8))
+
+
+def _make_caption(result: PrecisionResult) -> str:
+    """Describe the machine, the repeats and the markers of the diagrams."""
+    machine = result.machine
+    threads = ", ".join(
+        f"{count} {name} thread" + "s" * (count != 1)
+        for name, count in machine.threads.items()
+    )
+    max_repeats = max(point.repeats for point in result.points)
+    seconds = f"of the last of {max_repeats} repeats at most"
+    if max_repeats > WARM_UP + 1:
+        seconds = f"medians of at most {max_repeats - WARM_UP} interleaved repeats"
+    legend = "Filled: known"
+    if any(point.interval for point in result.points):
+        legend += ", with its 95 % interval"
+    legend += "."
+    if not all(point.known for point in result.points):
+        legend += " Open, with an arrow: at most this, the reference is no better."
+    return (
+        f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
+        f"{seconds}.\n{legend}"
+    )
 
 
 def _draw_errors(
@@ -504,73 +509,73 @@ def _draw_errors(
             (point for point in points if point.estimator == name),
             key=lambda point: point.spp,
         )
-        label = name
         slope = slopes.get((line[0].quantity, line[0].control, name))
-        if slope is not None:  # and theory where that disagrees
-            theory_remark = (
-                f" (not {slope.theory:.2f})" if slope.agrees is False else ""
-            )
-            label = f"{name}  {slope.slope:.2f}{theory_remark}".replace(
-                " -", f" {MINUS}"
-            )
-        _draw_line(axes, line, number, label)
+        _draw_line(axes, line, number, _make_label(name, slope))
     axes.set(
         xscale="log",
         yscale="log",
         xlabel="seconds of processor time",
         ylabel="relative error, %",
     )
-    low = min(point.seconds for point in points)
-    high = max(point.seconds for point in points)
-    if high >= 1.5 * low:  # theory: a dashed line of slope -1/2 under the points
-        theory_scale = (
-            PERCENT
-            * min(point.rms * math.sqrt(point.seconds) for point in points)
-            * 0.8
-        )
-        center = math.sqrt(low * high)
-        axes.plot(
-            [low, high],
-            [theory_scale / math.sqrt(low), theory_scale / math.sqrt(high)],
-            color=GREY,
-            linewidth=1.0,
-            linestyle="--",
-        )
-        axes.annotate(
-            f"{MINUS}1/2",
-            (center, theory_scale / math.sqrt(center)),
-            fontsize=8,
-            color=GREY,
-            ha="right",
-            va="top",
-        )
+    _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
     goal = result.goal * PERCENT
-    (low, high) = axes.get_ylim()
-    if low < goal < high:
+    (lower, upper) = axes.get_ylim()
+    if lower < goal < upper:
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
-        coordinates = ("axes fraction", "data")
         axes.annotate(
             f"{goal:g} %",
             (1.0, goal),
-            xycoords=coordinates,
+            xycoords=("axes fraction", "data"),
             ha="right",
             va="bottom",
             fontsize=8,
         )
     axes.grid(True, which="major")
-    legend_style: dict[str, Any] = {
-        "bbox_to_anchor": (1.0, 1.0),
-        "borderaxespad": 0.2,
-        "handlelength": 1.6,
-    }
-    legend_style |= {
-        "title": "slope against samples",
-        "title_fontsize": 8,
-        "alignment": "left",
-    }
-    axes.legend(loc="upper left", **legend_style)
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        handlelength=1.6,
+        title="slope against samples",
+        title_fontsize=8,
+        alignment="left",
+    )
+
+
+def _make_label(name: str, slope: PrecisionSlope | None) -> str:
+    """Label an estimator with its slope, and with that of theory if they disagree."""
+    if slope is None:
+        return name
+    theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
+    return f"{name}  {slope.slope:.2f}{theory}".replace(" -", f" {MINUS}")
+
+
+def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
+    """Draw a dashed line of slope -1/2 under the points, if they span enough time."""
+    start = min(point.seconds for point in points)
+    end = max(point.seconds for point in points)
+    if not end >= 1.5 * start:
+        return
+    smallest = min(point.rms * math.sqrt(point.seconds) for point in points)
+    scale = PERCENT * smallest * 0.8
+    center = math.sqrt(start * end)
+    axes.plot(
+        [start, end],
+        [scale / math.sqrt(start), scale / math.sqrt(end)],
+        color=GREY,
+        linewidth=1.0,
+        linestyle="--",
+    )
+    axes.annotate(
+        f"{MINUS}1/2",
+        (center, scale / math.sqrt(center)),
+        fontsize=8,
+        color=GREY,
+        ha="right",
+        va="top",
+    )
 
 
 def _draw_line(

@@ -164,34 +164,42 @@ def summarize_samples(
     and heavy tails have none.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
-    raw = statistics.fmean(squares)
-    heavy = is_heavy_tailed(samples)
+    mean_square = statistics.fmean(squares)
+    is_heavy = is_heavy_tailed(samples)
+    exceeds_floor = mean_square > (KNOWN * floor) ** 2
+    is_known = exceeds_floor and math.isfinite(mean_square) and mean_square > 0.0
+    error = math.sqrt(mean_square - floor**2) if is_known else math.sqrt(mean_square)
     interval = None
-    known = raw > (KNOWN * floor) ** 2 and math.isfinite(raw) and raw > 0.0
-    error = math.sqrt(raw - floor**2) if known else math.sqrt(raw)
-    if known and not heavy and len(squares) > 1:
-        relative = 0.5 * statistics.stdev(squares) / math.sqrt(len(squares)) / raw
-        factor = math.exp(
-            min(50.0, float(stdtrit(len(squares) - 1, (1.0 + LEVEL) / 2.0)) * relative)
-        )
+    if is_known and not is_heavy and len(squares) > 1:
+        deviation = statistics.stdev(squares) / math.sqrt(len(squares))
+        factor = _interval_factor(deviation, mean_square, len(squares))
         interval = (error / factor, error * factor)
-    time_names = [name for name in ("seconds", "wall_seconds") if name in samples[0]]
-    times = {
-        name: median_time([numbers[name] for numbers in samples]) for name in time_names
-    }
-    cosine = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
-    status = "ok" if known else "reference unusable"
-    more: dict[str, object] = {
+    cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
+    cosine = None
+    if cosines and setting.quantity == "gradient":
+        cosine = statistics.fmean(cosines)
+    fields: dict[str, object] = {
         "repeats": len(samples),
-        "status": status,
+        "status": "ok" if is_known else "reference unusable",
         "error": error,
         "interval": interval,
+        "reference_error": floor,
+        "heavy_tailed": is_heavy,
+        "cosine": cosine,
     }
-    more |= {"reference_error": floor, "heavy_tailed": heavy}
-    more["cosine"] = (
-        statistics.fmean(cosine) if cosine and setting.quantity == "gradient" else None
-    )
-    return PrecisionPoint.of({**vars(setting), **more, **times})
+    for name in ("seconds", "wall_seconds"):
+        if name in samples[0]:
+            fields[name] = median_time([numbers[name] for numbers in samples])
+    return PrecisionPoint.of({**vars(setting), **fields})
+
+
+def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
+    """Return the factor of a root mean square's interval, on a logarithmic scale.
+
+    The deviation is the standard error of the mean square of `count` values.
+    """
+    quantile = float(stdtrit(count - 1, (1.0 + LEVEL) / 2.0))
+    return math.exp(min(50.0, quantile * (0.5 * deviation / mean_square)))
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
@@ -321,60 +329,66 @@ def recommend_count(
     if not points or not goal > 0.0:
         return None
     ordered = sorted(points, key=lambda point: point.spp)
-    known = [point for point in ordered if point.known]
     line = fit_line(ordered)
-    error_slope = max(line.slope, -1.0) if line else MONTE_CARLO
-
-    def fitted(spp: float) -> float:
-        return math.exp(line.offset + line.slope * math.log(spp)) if line else math.nan
-
-    is_explained = (
-        line is not None
-        and line.points > LEAST_POINTS
-        and line.slope <= -0.1
-        and all(
-            point.interval
-            and point.interval[0] <= fitted(point.spp) <= point.interval[1]
-            for point in known
-        )
-    )
-    if line is not None and is_explained:
-        samples = math.exp((math.log(goal) - line.offset) / line.slope)
-        least = float(ordered[0].spp)
-        largest = float(ordered[-1].spp)
-        basis = (
-            "measured"
-            if samples <= least
-            else "fitted"
-            if samples <= largest
-            else "extrapolated"
-        )
-        count = None if samples > FURTHEST * largest else max(samples, least)
+    explaining_line = line if line and _explains_points(line, ordered) else None
+    if explaining_line:
+        count, basis = _solve_line(explaining_line, ordered, goal)
     else:
         count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    error = (
-        fitted(spp)
-        if is_explained
-        else _interpolate_value(
-            ordered, spp, [point.rms for point in ordered], error_slope
+    if explaining_line:
+        error = _error_on_line(explaining_line, spp)
+    else:
+        slope = max(line.slope, -1.0) if line else MONTE_CARLO
+        error = _interpolate_value(
+            ordered, spp, [point.rms for point in ordered], slope
         )
-    )
-    seconds = _interpolate_value(
-        ordered, spp, [point.seconds for point in ordered], 1.0
-    )
+    seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
         control=ordered[0].control,
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
-        seconds=seconds,
+        seconds=_interpolate_value(ordered, spp, seconds, 1.0),
         error=error,
         basis=basis,
     )
+
+
+def _error_on_line(line: PrecisionSlope, spp: float) -> float:
+    return math.exp(line.offset + line.slope * math.log(spp))
+
+
+def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
+    """Return whether a falling line passes through the interval of every known point."""
+    if line.points <= LEAST_POINTS or not line.slope <= -0.1:
+        return False
+    for point in ordered:
+        if not point.known:
+            continue
+        if not point.interval:
+            return False
+        lower, upper = point.interval
+        if not lower <= _error_on_line(line, point.spp) <= upper:
+            return False
+    return True
+
+
+def _solve_line(
+    line: PrecisionSlope, ordered: Sequence[PrecisionPoint], goal: float
+) -> tuple[float | None, str]:
+    """Return the samples at which a line reaches a goal, and the basis."""
+    samples = math.exp((math.log(goal) - line.offset) / line.slope)
+    smallest = float(ordered[0].spp)
+    largest = float(ordered[-1].spp)
+    if samples <= smallest:
+        return smallest, "measured"
+    if samples <= largest:
+        return samples, "fitted"
+    return (None if samples > FURTHEST * largest else samples), "extrapolated"
 
 
 def confirm_recommendation(

@@ -837,31 +837,20 @@ def _make_evidence_run(
     result = read_result(folder)
     claims_of_photographs, photo_rows = _read_photographs(folder)
     claims = [*claims_of(result), *claims_of_photographs]
-    sweep_paths = sweeps_read(result)
-    read_paths = [*sweep_paths, *attacks_read(own_settings(folder))]
+    read_paths = [*sweeps_read(result), *attacks_read(own_settings(folder))]
     recorded = recorded_settings(folder, result, read_paths)
-    versions = made_with(folder, read_paths)
-    if getattr(result, "environment", "") == NO_MAP:
-        from advsearch.extend import workbench  # it brings torch, which takes a second
-
-        versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
+    versions = _collect_versions(folder, result, read_paths)
     run = evidence_of(directory.typed_name(folder), result, claims, recorded, versions)
 
-    # the sweeps whose rows it reads: it is about what varied in them
-    sweeps = list[tuple[results.Result, Mapping[str, Any]]]()
-    for path in sweep_paths:
-        with suppress(errors.AdvsearchError):
-            sweeps.append((read_result(path), own_settings(path)))
+    sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
     domain = domain_of(sweeps[0][0] if sweeps else result, recorded, searched)
     conditions = conditions_of(result)
     weighted = exposure_lines(result, conditions, exposure)
-    chosen = dict[str, None]()
-    for each in (result, *(sweep for sweep, _ in sweeps)):
-        chosen |= dict.fromkeys(chosen_axes(each))
     criterion_text = list[str]()
     if criterion is not None:
-        criterion_text = criterion_lines(claims, conditions, criterion, list(chosen))
+        axes = _list_chosen_axes(result, sweeps)
+        criterion_text = criterion_lines(claims, conditions, criterion, axes)
     return run.model_copy(
         update={
             "searched": searched,
@@ -877,6 +866,43 @@ def _make_evidence_run(
             ),
         }
     )
+
+
+def _collect_versions(
+    folder: Path, result: results.Result, read_paths: Sequence[Path]
+) -> dict[str, str]:
+    """Return versions and digests of files, without an environment that is not used."""
+    versions = made_with(folder, read_paths)
+    if getattr(result, "environment", "") == NO_MAP:
+        from advsearch.extend import workbench  # it brings torch, which takes a second
+
+        versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
+    return versions
+
+
+def _read_sweeps(
+    result: results.Result,
+) -> list[tuple[results.Result, Mapping[str, Any]]]:
+    """Read results and settings of the sweeps whose rows a result was made from.
+
+    The result is about what varied in them.
+    """
+    sweeps = list[tuple[results.Result, Mapping[str, Any]]]()
+    for path in sweeps_read(result):
+        with suppress(errors.AdvsearchError):
+            sweeps.append((read_result(path), own_settings(path)))
+    return sweeps
+
+
+def _list_chosen_axes(
+    result: results.Result,
+    sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
+) -> list[str]:
+    """Return the axes whose values were chosen, of a run and of sweeps, each once."""
+    axes = dict.fromkeys(chosen_axes(result))
+    for sweep, _ in sweeps:
+        axes |= dict.fromkeys(chosen_axes(sweep))
+    return list(axes)
 
 
 def _make_unfinished_run(folder: Path) -> EvidenceRun:

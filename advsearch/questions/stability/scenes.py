@@ -812,48 +812,63 @@ def light_rotation_texel() -> Outcome:
     }
     renderer = make_renderer(controls)
     u = renderer.start.clone()
+    u[0] = 0.5
+    u[1] = 0.1
+    second = _estimate_three_curvatures(renderer, u)
+    # from the unit box to watts, degrees and sRGB
+    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
+    path, _ = _record_path(renderer, u, 1.0)
+    scaled_path, ending = _record_path(renderer, u, RATIO)
+    distances = (path - path[0]).abs().amax(dim=0)
+    path_difference = float((path - scaled_path).abs().max())
+    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
+        check("how far the power moved", float(distances[0]), least=0.05),
+        check("how far the rotation moved", float(distances[1]), least=0.05),
+        check("how far the texels moved", float(distances[2:].max()), least=0.05),
+        check(
+            "distance from the path of the objective x 1e6", path_difference, most=1e-3
+        ),
+        ending=ending,
+        measured={
+            "condition number in u": condition_number(second),
+            "condition number in watts, degrees and sRGB": condition_number(
+                units @ second @ units
+            ),
+        },
+    )
+
+
+def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
+    """Return second derivatives (3, 3) by power, rotation, and all texels at once."""
     loss = gradients.smooth_loss(renderer.formation.resolution)
-    u[0], u[1] = 0.5, 0.1
     directions = torch.zeros(3, len(u))
-    directions[0, 0] = directions[1, 1] = 1.0
+    directions[0, 0] = 1.0
+    directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    second = hessian(
+    return hessian(
         lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))),
         u,
         directions,
         steps,
     )
-    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    paths: list[list[Tensor]] = []
-    for scale in (1.0, RATIO):
-        paths.append([])
-        record_step = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
-        scaled = partial(lambda scale, image: scale * loss(image), scale)
-        result = run_search(renderer, scaled, 18, spp=8, start=u, on_step=record_step)
-    path, scaled_path = map(torch.stack, paths)
-    distances = (path - path[0]).abs().amax(dim=0)
-    names = {
-        "condition number in u": second,
-        "condition number in watts, degrees and sRGB": units @ second @ units,
-    }
-    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
-        *(
-            check(f"how far {what} moved", float(distance), least=0.05)
-            for what, distance in (
-                ("the power", distances[0]),
-                ("the rotation", distances[1]),
-                ("the texels", distances[2:].max()),
-            )
-        ),
-        check(
-            "distance from the path of the objective x 1e6",
-            float((path - scaled_path).abs().max()),
-            most=1e-3,
-        ),
-        ending=result.ending.value,
-        measured={name: condition_number(matrix) for name, matrix in names.items()},
+
+
+def _record_path(
+    renderer: gradients.Renderer, u: Tensor, scale: float
+) -> tuple[Tensor, str]:
+    """Search with a scaled objective; return the path (steps, d) and the status."""
+    loss = gradients.smooth_loss(renderer.formation.resolution)
+    path: list[Tensor] = []
+    result = run_search(
+        renderer,
+        lambda image: scale * loss(image),
+        18,
+        spp=8,
+        start=u,
+        on_step=lambda record, at, evaluation: path.append(at),
     )
+    return torch.stack(path), result.ending.value
 
 
 MIXED = {
