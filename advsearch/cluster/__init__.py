@@ -1,10 +1,9 @@
-"""Work on several processors: batches, done here (`InProcess`) or by worker processes
-(`workers.open_workers`).
+"""Batches of work: in this process (`InProcess`) or by workers (`workers.open_workers`).
 
-Workers stand behind one interface, `concurrent.futures.Executor`: a pure function of a
-module and picklable arguments go in, a future comes out. What a batch comes to depends
-on the batch and the run's settings alone, so that anybody may do it, any number of
-times.
+All kinds of workers have one interface, `concurrent.futures.Executor`: a pure function
+of a module and picklable arguments go in, a future comes out. The result of a batch
+depends on the batch and the run's settings alone, so that any worker may compute it,
+any number of times.
 """
 
 from __future__ import annotations
@@ -19,14 +18,16 @@ from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
 from advsearch.trust.code import allowed_code
 
-Call = Callable[[Sequence[Any]], Any]  # what does one batch; a pure function of it
+# a pure function of a batch that computes its result
+Call = Callable[[Sequence[Any]], Any]
 
-DEATHS = 3  # workers that may die of a call before it is given up
+# workers that may die of a call before it is given up
+DEATHS = 3
 
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """What a worker does with batches, in a form that can be sent to it."""
+    """How workers compute batches, in a form that can be sent to them."""
 
     # "package.module:function", which takes the settings and returns a `Call`
     function: str
@@ -34,9 +35,9 @@ class WorkerTask:
     # settings that may hold paths, separated by commas, whose files are sent along
     files: tuple[str, ...] = ()
     threads: int = 1  # for rendering, of a worker
-    # that a batch may take at least; None: by the median of those before
+    # seconds that a batch may always take; None: by the median of earlier ones
     seconds: float | None = None
-    # that a worker may import by its name, as this process
+    # modules of users that a worker may import, as this process
     code: tuple[str, ...] = field(default_factory=allowed_code)
     # SHA-256 of the files by path, for workers elsewhere
     digests: Mapping[str, str] = field(default_factory=dict)
@@ -44,20 +45,23 @@ class WorkerTask:
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """What came of a batch, or of one item of a batch of which workers died."""
+    """The result of a batch, or of a single item of a batch of which workers died."""
 
     items: Sequence[Any]
     value: Any  # what the call returned
-    worker: str = ""  # who did it; empty in this process
-    # by its name in `WorkerStats.machines`; None where it is like this one
+    worker: str = ""  # empty in this process
+    # name in `WorkerStats.machines`; None if it is like this machine
     machine: str | None = None
-    lost: str = ""  # why nothing came back, only of a single item
+    lost: str = ""  # why there is no value, of a single item only
 
     def require_value(self, title: str) -> Any:
         """Return what the call returned.
 
+        Args:
+            title: what the batch was, for the message.
+
         Raises:
-            ClusterError: nothing came back; `title` says what was given out.
+            ClusterError: if there is no value.
         """
         if self.lost:
             raise ClusterError(f"{title}: {self.lost}")
@@ -66,48 +70,52 @@ class BatchResult:
 
 @dataclass
 class WorkerStats:
-    """How the workers did."""
+    """Counts and times of the workers of a run."""
 
-    workers: int = 0  # that are there
-    most: int = 0  # that had work at once, at most
+    workers: int = 0  # connected now
+    most: int = 0  # maximum that computed at once
     lost: int = 0  # that died
-    refused: int = 0  # that cannot do it
-    retried: int = 0  # batches that were given out again
-    batches: int = 0  # that came back
-    busy: float = 0.0  # seconds that workers were at batches
+    refused: int = 0  # that do not suit the task
+    retried: int = 0  # batches that were submitted again
+    batches: int = 0  # that are finished
+    busy: float = 0.0  # seconds that workers computed batches
     loading: float = 0.0  # seconds that they loaded scenes and models
-    alive: float = 0.0  # seconds that they were there, those of loading left out
-    # that are not like this one, by name
+    alive: float = 0.0  # seconds that they were connected, without loading
+    # machines that differ from this one, by name
     machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def told(self) -> dict[str, float | str]:
-        """The same, beside a progress bar."""
-        counts = {"lost": self.lost, "retried": self.retried}
-        return {
-            "workers": self.workers,
-            **{name: count for name, count in counts.items() if count},
-        }
+        """Counts to show next to a progress bar."""
+        counts: dict[str, float | str] = {"workers": self.workers}
+        if self.lost:
+            counts["lost"] = self.lost
+        if self.retried:
+            counts["retried"] = self.retried
+        return counts
 
 
 class Workers(Protocol):
-    """Does batches."""
+    """Computes batches."""
 
     @property
     def facts(self) -> WorkerStats | None:
-        """How the workers do; None where there are none."""
+        """Counts and times of the workers, None without workers."""
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """Do batches, and yield what comes of them, in any order, each once.
+        """Compute batches, and yield the result of each once, in any order.
 
-        Only as many are taken from `batches` before their results are asked for as
-        there are workers. Raises an AdvsearchError that a batch raises, or ClusterError
-        where there is nobody to do it.
+        No more batches are taken before their results are requested than there are
+        workers.
+
+        Raises:
+            AdvsearchError: if a batch raises it.
+            ClusterError: if there is no worker.
         """
 
 
 class InProcess:
-    """Does one batch after the other in this process."""
+    """Computes batches one after the other in this process."""
 
     facts: WorkerStats | None = None
 
@@ -115,21 +123,21 @@ class InProcess:
         self._call = call
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """See `Workers.results`; they come in order."""
+        """Compute batches in order; see `Workers.results`."""
         for items in batches:
             yield BatchResult(items, self._call(items))
 
 
 class WorkerDiedError(Exception):
-    """What a future ends with where `DEATHS` workers died of its call."""
+    """Raised by a future if `DEATHS` workers died of its call."""
 
 
 class WorkerExecutor(Executor):
-    """An executor that gives a call to another worker where one dies of it.
+    """An executor that submits a call again if a worker dies of it.
 
-    A future ends with a WorkerDiedError where `DEATHS` died; with a BrokenExecutor or
-    cancelled where the way to the workers was lost, so that the call has to be
-    submitted again.
+    A future ends with a WorkerDiedError if `DEATHS` died. It ends with a
+    BrokenExecutor, or is cancelled, if the connection to the workers was lost; then the
+    call has to be submitted again.
     """
 
     where: str  # what it is, in a user's words
@@ -137,6 +145,8 @@ class WorkerExecutor(Executor):
 
     @abstractmethod
     def count_workers(self) -> int:
-        """Return how many calls can be under way now. Raises ClusterError where there
-        has been no worker for long.
+        """Return how many calls can run at once now.
+
+        Raises:
+            ClusterError: if there has been no worker for long.
         """

@@ -80,9 +80,14 @@ NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
 
 @dataclass(frozen=True)
 class Site:
-    """Where workers are, in a user's words: the address of a scheduler that runs, or
-    what starts a cluster and with how many workers (None: as it starts); and keywords
-    of Dask's `Security`.
+    """Where workers run: the address of a scheduler, or what starts a cluster.
+
+    Attributes:
+        where: its name for messages.
+        address: address of a scheduler that runs.
+        start: what starts a cluster.
+        security: keywords of Dask's `Security`.
+        count: number of workers that it starts with; None for its default.
     """
 
     where: str
@@ -115,8 +120,9 @@ def call_there(function: Callable[..., Any], *args: Any) -> tuple[str, Any]:
 
 
 class DaskExecutor(WorkerExecutor):
-    """See `WorkerExecutor`; `contents` are files for workers that lack them. Shut it
-    down.
+    """An executor on a Dask cluster, see `WorkerExecutor`; it has to be shut down.
+
+    `contents` are files for workers that lack them.
     """
 
     def __init__(
@@ -195,7 +201,6 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"Dask shows its workers at {self.link}")
 
     # ---- who is there
-    # -----------------------------------------------------------------------------------------------
 
     def count_workers(self) -> int:
         now = time.monotonic()
@@ -221,17 +226,17 @@ class DaskExecutor(WorkerExecutor):
 
     def _look(self) -> None:
         client = self._client
-        there = frozenset(
+        connected = frozenset(
             client.sync(client.scheduler.ncores, callback_timeout=RESTART)
         )
-        self.stats.lost += len(self._fit - there)
+        self.stats.lost += len(self._fit - connected)
         self._refused = {
             address: reason
             for address, reason in self._refused.items()
-            if address in there
+            if address in connected
         }
-        fit = self._fit & there
-        new = there - fit - set(self._refused)
+        fit = self._fit & connected
+        new = connected - fit - set(self._refused)
         versions = (
             client.sync(self._versions, sorted(new), callback_timeout=RESTART)
             if new
@@ -256,9 +261,7 @@ class DaskExecutor(WorkerExecutor):
         self._fit = fit - set(self._refused)
 
     async def _versions(self, workers: list[str]) -> dict[str, Any]:
-        """Return the version of advsearch that workers have, or the error of those that
-        do not say it.
-        """
+        """Return the version of advsearch of each worker, or the error of those that fail."""
         found: dict[str, Any] = await self._client.run(
             version, workers=workers, on_error="return"
         )
@@ -272,9 +275,7 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError where there has been no worker that can do it for too
-        long.
-        """
+        """Raise ClusterError if there has been no worker that suits the task for too long."""
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refused.values()))
@@ -298,7 +299,6 @@ class DaskExecutor(WorkerExecutor):
         self._alone_since = time.monotonic()
 
     # ---- calls
-    # ------------------------------------------------------------------------------------------------------
 
     def submit(
         self, function: Callable[..., Any], /, *args: Any, **kwargs: Any
@@ -315,14 +315,7 @@ class DaskExecutor(WorkerExecutor):
     async def _call(
         self, client: Any, function: Callable[..., Any], args: tuple[Any, ...]
     ) -> Any:
-        """Have a worker call a function, again where its result was lost on the way, or
-        where the worker is not fit.
-
-        No type of an error tells the work from the way to it, but Dask's state does: a
-        call that ended with an error has the state "error", by word of the scheduler.
-        Whatever else is raised comes from fetching the result, or from a future that
-        was let go when a connection was lost.
-        """
+        """Run a function on a worker; again if its result was lost, or the worker is unfit."""
         # comes with the extra `dask`
         from distributed import KilledWorker
 
@@ -367,9 +360,7 @@ class DaskExecutor(WorkerExecutor):
         raise BrokenExecutor(f"{self.where}: the scheduler has gone")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
-        """Return what a future ends with; None where none of the workers that may do it
-        is left.
-        """
+        """Return what a future ends with, None if none of its allowed workers is left."""
 
         async def fetch() -> tuple[str, Any]:
             result: tuple[str, Any] = await future
@@ -385,9 +376,7 @@ class DaskExecutor(WorkerExecutor):
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether another worker has to do it, or this one after it was sent
-        files.
-        """
+        """Return whether another worker has to run the call, or this one with files sent to it."""
         failure = value.failure if isinstance(value, Reply) else None
         if failure is Failure.MISSING_FILES and (
             self._sending is None or not self._sending.done()
@@ -452,9 +441,7 @@ code that the file runs.
 def open_dask(
     task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
 ) -> tuple[DaskExecutor, WorkerTask]:
-    """Return an executor on a cluster, given by its scheduler's address or a YAML file,
-    and the task with what tells its files from others.
-    """
+    """Return an executor on a cluster, and the task with the digests of its files."""
     site = site_of(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
         raise InputError(
@@ -467,13 +454,11 @@ def open_dask(
 
 
 def site_of(workers: int | None, cluster: str) -> Site:
-    """Return where workers are, of a scheduler's address or a YAML file, and how many
-    of them are wanted.
-    """
+    """Parse the address of a scheduler, or a YAML file, and how many workers it needs."""
     if cluster.startswith(SCHEMES):
         site = Site(cluster, address=cluster)
     elif cluster.endswith((".yaml", ".yml")):
-        site = _from_file(Path(cluster), workers)
+        site = _read_site(Path(cluster), workers)
     else:
         raise InputError(
             "cluster: expected the address of a scheduler such as "
@@ -488,30 +473,16 @@ def site_of(workers: int | None, cluster: str) -> Site:
     return site
 
 
-def _from_file(path: Path, workers: int | None) -> Site:
-    said: dict[str, Any] = read_yaml(path)
-    unknown = sorted(
-        set(said) - {"address", "class", "arguments", "workers", "security"}
-    )
-    if unknown or ("address" in said) == ("class" in said):
-        got = (
-            f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
-        )
-        expected = (
-            "expected either address, or class with arguments and workers; "
-            "beside it security"
-        )
-        raise FileFormatError(f"{path}: {expected}; {got}")
-    for name in ("security", "arguments"):
-        given = said.get(name) or {}
-        if not isinstance(given, dict) or not all(
-            isinstance(key, str) for key in given
-        ):
-            raise FileFormatError(
-                f"{path}: {name}: expected names and values, got {given!r}"
-            )
-    security = {**(said.get("security") or {})}
-    arguments = said.get("arguments") or {}
+def _read_site(path: Path, workers: int | None) -> Site:
+    """Read where workers run from a YAML file.
+
+    Raises:
+        FileFormatError: if it has wrong or contradictory entries.
+        InputError: if a package for the cluster is not installed.
+    """
+    entries: dict[str, Any] = read_yaml(path)
+    _check_entries(path, entries)
+    security = {**(entries.get("security") or {})}
     for name in (
         "tls_ca_file",
         "tls_client_cert",
@@ -521,42 +492,60 @@ def _from_file(path: Path, workers: int | None) -> Site:
     ):
         if isinstance(security.get(name), str):
             security[name] = str(path.parent / security[name])
-    count = said.get("workers") if workers is None else workers
-    if count is not None and (
-        isinstance(count, bool) or not isinstance(count, int) or count < 1
-    ):
+    count = entries.get("workers") if workers is None else workers
+    is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
+    if count is not None and not is_count:
         raise FileFormatError(
             f"{path}: workers: expected a whole number of at least 1, got {count!r}"
         )
-    if "address" in said:
-        if not str(said["address"]).startswith(SCHEMES):
+    if "address" in entries:
+        address = str(entries["address"])
+        if not address.startswith(SCHEMES):
             raise FileFormatError(
                 f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
             )
-        if "workers" in said:
+        if "workers" in entries:
             raise FileFormatError(
                 f"{path}: workers: the scheduler says how many there are; leave it out"
             )
-        return Site(
-            str(said["address"]),
-            address=str(said["address"]),
-            security=security or None,
+        return Site(address, address=address, security=security or None)
+    name = str(entries["class"])
+    start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
+    return Site(name, start=start, security=security or None, count=count or 1)
+
+
+def _check_entries(path: Path, entries: dict[str, Any]) -> None:
+    """Check the names of a cluster file's entries, and the types of its mappings."""
+    known = {"address", "class", "arguments", "workers", "security"}
+    unknown = sorted(set(entries) - known)
+    if unknown or ("address" in entries) == ("class" in entries):
+        got = "got both or neither"
+        if unknown:
+            got = f"got {', '.join(map(str, unknown))}"
+        expected = (
+            "expected either address, or class with arguments and workers; "
+            "beside it security"
         )
-    name = str(said["class"])
+        raise FileFormatError(f"{path}: {expected}; {got}")
+    for name in ("security", "arguments"):
+        mapping = entries.get(name) or {}
+        is_mapping = isinstance(mapping, dict)
+        if not is_mapping or not all(isinstance(key, str) for key in mapping):
+            raise FileFormatError(
+                f"{path}: {name}: expected names and values, got {mapping!r}"
+            )
+
+
+def _import_cluster(path: Path, name: str) -> Any:
+    """Import a class of Dask that starts a cluster."""
     if name not in CLASSES:
         raise FileFormatError(
             f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}"
         )
     try:
-        start = getattr(importlib.import_module(CLASSES[name]), name)
+        return getattr(importlib.import_module(CLASSES[name]), name)
     except ImportError:
         package = CLASSES[name].partition(".")[0].replace("_", "-")
         raise InputError(
             f"cluster: {name} needs {package}; pip install {package}"
         ) from None
-    return Site(
-        name,
-        start=partial(start, **arguments),
-        security=security or None,
-        count=count or 1,
-    )

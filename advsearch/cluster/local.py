@@ -47,8 +47,10 @@ class WorkerProcess:
         )
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Have it call a function of a module, and wait for the answer. Raises
-        WorkerDiedError.
+        """Run a function of a module in the process, and return its result.
+
+        Raises:
+            WorkerDiedError: if the process ends before.
         """
         assert self._popen.stdin is not None and self._popen.stdout is not None
         request = pickle.dumps((function, args))
@@ -76,9 +78,7 @@ class WorkerProcess:
 
 
 class LocalExecutor(WorkerExecutor):
-    """An executor of so many processes, each started when it is needed, and replaced
-    when it died.
-    """
+    """An executor of processes, each started when it is needed, and replaced if it dies."""
 
     def __init__(self, count: int) -> None:
         if SERVING in os.environ:
@@ -138,9 +138,7 @@ class LocalExecutor(WorkerExecutor):
             self.stats.retried += 1
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, also in the middle of a call: what they have under way
-        comes to nothing.
-        """
+        """End the processes, even in the middle of a call, whose result is lost."""
         with self._lock:
             self._closed = True
             for process in self._busy:

@@ -1,7 +1,8 @@
-"""What runs on a worker: it loads a task with its first batch. Errors go back as
-values, as they may not survive being pickled. Files that a task needs are sent to
-workers that lack them; with a mesh goes its folder, files in it and below of the kinds
-that a scene consists of.
+"""What runs on a worker: it loads a task with its first batch, and computes batches.
+
+Errors are returned as values, as they may not survive being pickled. Files that a task
+needs are sent to workers that lack them; with a mesh goes its directory, with the files
+in it and below of the kinds that a scene consists of.
 """
 
 from __future__ import annotations
@@ -59,20 +60,21 @@ def this_machine() -> MachineInfo:
 
 
 def machine_name(machine: MachineInfo) -> str:
+    """Return a short digest that names a machine."""
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:8]
 
 
 @cache
 def version() -> str:
-    """Return the version of advsearch, with a few digits of what its files say, which
-    no version number tells.
+    """Return the version of advsearch, with a digest of its source files.
+
+    Development versions of one number differ in the digest.
     """
     digest = hashlib.sha256()
-    folder = Path(__file__).resolve().parents[1]
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(
-            path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes()
-        )
+    root = Path(__file__).resolve().parents[1]
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode())
+        digest.update(b"\0" + path.read_bytes())
     return f"{_version('advsearch')}+{digest.hexdigest()[:8]}"
 
 
@@ -88,10 +90,10 @@ WITH_OTHERS = {
     ".gltf": (".bin",),
     ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
 }
-"""Files that name others, and what these end in beside pictures."""
+"""Suffixes of files that refer to others, and the suffixes of these besides pictures."""
 
 OF_A_PLACE = (".glb", ".gltf", ".bin", ".exr", ".hdr")
-"""What files end in that the YAML file of a place may name, beside pictures."""
+"""Suffixes of files besides pictures that the YAML file of an environment may name."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
@@ -99,37 +101,23 @@ LARGEST = 1 << 30
 
 
 class MissingFilesError(Exception):
-    """A file is neither where the settings say nor among those that were sent
-    before.
-    """
+    """Raised if a file exists neither at its path nor among those that were sent."""
 
 
 def read_files(task: WorkerTask) -> dict[str, bytes]:
-    """Read the files that a task's settings name, and those beside them, by their
-    paths.
+    """Read the files that a task's settings name, and files next to them, by path.
+
+    Raises:
+        InputError: if they are too large to be sent.
     """
     contents: dict[str, bytes] = {}
     for name in task.files:
         value = task.settings.get(name)
-        for part in _split(value) if isinstance(value, str) else ():
+        parts = _split_paths(value) if isinstance(value, str) else ()
+        for part in parts:
             path = Path(part)
             if path.is_absolute() and path.is_file():
-                is_place = name == "environment" and path.suffix.lower() in (
-                    ".yaml",
-                    ".yml",
-                )
-                kinds = (
-                    OF_A_PLACE if is_place else WITH_OTHERS.get(path.suffix.lower(), ())
-                )
-                others = sorted(path.parent.rglob("*")) if kinds else []
-                beside = [
-                    file
-                    for file in others
-                    if file.suffix.lower() in (*kinds, *PICTURES) and file.is_file()
-                ]
-                # no link leads elsewhere
-                inside = [file for file in beside if is_inside(file, path.parent)]
-                contents |= {str(file): file.read_bytes() for file in (path, *inside)}
+                contents |= _read_with_neighbors(name, path)
     size = sum(map(len, contents.values()))
     if size > LARGEST:
         raise InputError(
@@ -140,13 +128,33 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
     return contents
 
 
+def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
+    """Read a file, and the files in its directory that it may refer to, by path."""
+    suffix = path.suffix.lower()
+    suffixes: tuple[str, ...] = WITH_OTHERS.get(suffix, ())
+    if setting == "environment" and suffix in (".yaml", ".yml"):
+        suffixes = OF_A_PLACE
+    contents = {str(path): path.read_bytes()}
+    if not suffixes:
+        return contents
+    for file in sorted(path.parent.rglob("*")):
+        if file.suffix.lower() not in (*suffixes, *PICTURES) or not file.is_file():
+            continue
+        # no link leads out of the directory
+        if is_inside(file, path.parent):
+            contents[str(file)] = file.read_bytes()
+    return contents
+
+
 def file_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
+    """Return the SHA-256 of each file by path."""
     return {path: hashlib.sha256(data).hexdigest() for path, data in contents.items()}
 
 
 def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
-    """Return where files that are sent stand below a folder, by their paths; each set
-    of files has its own.
+    """Return where files are stored on a worker, by their original paths.
+
+    Each set of files has its own directory below `folder`.
     """
     name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
     return {
@@ -156,60 +164,71 @@ def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
 
 
 def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
-    """Write files that were sent, each whole or not at all."""
+    """Write files that were sent, each atomically."""
     paths = sent_paths(file_digests(contents), folder)
     for name, data in contents.items():
-        paths[name].parent.mkdir(parents=True, exist_ok=True)
-        part = paths[name].with_name(f"{paths[name].name}.part-{os.getpid()}")
-        part.write_bytes(data)
-        part.replace(paths[name])
+        path = paths[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.part-{os.getpid()}")
+        temporary.write_bytes(data)
+        temporary.replace(path)
 
 
 def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
-    """Return the task with paths that hold here: its own where all its files are here,
-    or else those below a folder to which they were sent. Raises MissingFilesError.
+    """Return the task with paths that are valid on this machine.
+
+    They are its own if all of its files exist here, else those below `folder`, to
+    which files are sent.
+
+    Raises:
+        MissingFilesError: if a file is in neither.
     """
-    if all(_is(Path(path), digest) for path, digest in task.digests.items()):
+    if all(_has_digest(Path(path), digest) for path, digest in task.digests.items()):
         return task
-    here = sent_paths(task.digests, folder)
+    local_paths = sent_paths(task.digests, folder)
     for path, digest in task.digests.items():
-        if not _is(here[path], digest):
+        if not _has_digest(local_paths[path], digest):
             raise MissingFilesError(path)
     settings = dict(task.settings)
     for name in task.files:
         value = settings.get(name)
         if isinstance(value, str):
-            settings[name] = "".join(
-                str(here.get(part, part)) for part in _split(value)
-            )
+            parts = [str(local_paths.get(part, part)) for part in _split_paths(value)]
+            settings[name] = "".join(parts)
     return replace(task, settings=settings)
 
 
-def _is(path: Path, digest: str) -> bool:
+def _has_digest(path: Path, digest: str) -> bool:
+    """Return whether a file exists and has a SHA-256."""
     return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
 
-def _split(value: str) -> Iterator[str]:
-    """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and
-    what stands between them.
+def _split_paths(value: str) -> Iterator[str]:
+    """Split ``/a.glb#NODE,/b.obj`` into paths and separators, which join to the value.
+
+    Another example is ``/camera.csv+/object.csv``.
     """
     for part in re.split("(,)", value):
-        path, mark, inner = part.strip().partition("#")
+        path, mark, node = part.strip().partition("#")
         first, *second = split_paths(path)
         yield first
-        yield from ("+", *second) if second else (mark + inner,)
+        if second:
+            yield "+"
+            yield from second
+        else:
+            yield mark + node
 
 
-# tasks that a worker keeps loaded; the one that was not used for longest goes
+# tasks that a worker caches; the least recently used one is dropped
 MAX_LOADED = 2
 # seconds that loading may take, and a batch before there is a median
 LOAD_DEADLINE = 900.0
-# folders below the machine's own: Dr.Jit's kernels, and files that were sent
+# directories of a worker: Dr.Jit's kernels, and files that were sent
 KERNELS = "kernels"
 INPUTS = "inputs"
 
 _loaded: OrderedDict[str, Call] = OrderedDict()
-_one_at_a_time = threading.Lock()
+_batch_lock = threading.Lock()
 
 
 class Failure(Enum):
@@ -223,7 +242,7 @@ class Failure(Enum):
 
 @dataclass(frozen=True)
 class Reply:
-    """What a worker says of a batch."""
+    """The reply of a worker to a batch."""
 
     value: Any = None
     seconds: float = 0.0  # that the batch took, and that loading took before it
@@ -235,14 +254,14 @@ class Reply:
 
 
 def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
-    """Do a batch of a task, which is loaded before unless it is already.
+    """Compute a batch of a task, which is loaded if it is not cached.
 
-    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, whatever
-    native code it hangs in, and writes to its error output where that was.
+    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, even if
+    native code hangs, and writes a traceback to its error output.
     """
     worker = f"{platform.node()}, process {os.getpid()}"
     try:
-        with _one_at_a_time:
+        with _batch_lock:
             start = time.perf_counter()
             with ended_after(LOAD_DEADLINE):
                 call = load_task(task)
@@ -280,7 +299,11 @@ def ended_after(seconds: float) -> Iterator[None]:
 
 
 def load_task(task: WorkerTask) -> Call:
-    """Return what does batches of a task. Raises MissingFilesError."""
+    """Return the function that computes batches of a task, loaded or cached.
+
+    Raises:
+        MissingFilesError: if this machine lacks files of the task.
+    """
     key = task_key(task)
     if key in _loaded:
         _loaded.move_to_end(key)
@@ -301,7 +324,7 @@ def load_task(task: WorkerTask) -> Call:
 
 
 def task_key(task: WorkerTask) -> str:
-    """Return what tells a task from others."""
+    """Return a digest that identifies a task."""
     described = [
         task.function,
         task.settings,
@@ -313,42 +336,46 @@ def task_key(task: WorkerTask) -> str:
 
 
 def own_folder() -> Path:
-    """Return a folder on this machine's disk that only this user can write to; it
-    outlives the worker.
+    """Return a directory on this machine that only this user can write to.
+
+    It outlives the worker.
     """
     folder = Path(tempfile.gettempdir()) / f"advsearch-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    facts = folder.lstat()
-    mine = (
-        stat.S_ISDIR(facts.st_mode)
-        and facts.st_uid == os.getuid()
-        and not facts.st_mode & 0o022
+    status = folder.lstat()
+    is_private = (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid == os.getuid()
+        and not status.st_mode & 0o022
     )
-    return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
+    return folder if is_private else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
-SERVING = "ADVSEARCH_WORKER"  # environment variable of a process that `serve`s
+# environment variable of a process that runs `serve`
+SERVING = "ADVSEARCH_WORKER"
 
 
 def serve() -> None:
-    """Answer the calls that the process writes which has started this one, a pickled
-    pair (function, arguments) each, until it goes.
+    """Run the calls that the parent process sends, until it ends.
+
+    A call is a pickled pair (function, arguments) on standard input; its pickled result
+    goes to standard output.
     """
     calls = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    os.dup2(2, 1)  # what code of others prints is no answer
-    asked: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
+    os.dup2(2, 1)  # what other code prints is no result
+    received: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
 
     def listen() -> None:
         try:
             while True:
-                asked.put(pickle.load(calls))
+                received.put(pickle.load(calls))
         except (EOFError, OSError):
-            os._exit(0)  # also in the middle of a batch: nobody waits for it any more
+            os._exit(0)  # also in the middle of a batch: its result has no reader
 
     threading.Thread(target=listen, name="calls", daemon=True).start()
     while True:
-        function, args = asked.get()
+        function, args = received.get()
         pickle.dump(function(*args), answers)
         answers.flush()

@@ -1,6 +1,7 @@
-"""Batches done by workers: as many calls under way as there are workers, and what is
-lost is asked for again, at last item by item, so that an item that kills its workers is
-known.
+"""Computes batches by workers: as many calls run at once as there are workers.
+
+Lost batches are submitted again, at last item by item, so that an item that kills its
+workers is known.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ MIN_BATCHES = 5  # that a median takes
 
 # batches that may kill all their workers before a first one is done
 MAX_DEAD_STARTS = 5
-POLL = 0.5  # seconds between two looks at who is there
+POLL = 0.5  # seconds between two counts of workers
 
 
 class PoolWorkers:
@@ -64,10 +65,11 @@ class PoolWorkers:
         self._task = task
         self._tell = tell
         self._clock = clock
-        self._here = machine_name(this_machine())
+        self._this_machine = machine_name(this_machine())
         self._dead_starts = 0
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+        """See `Workers.results`."""
         source = iter(batches)
         waiting = deque[Sequence[Any]]()
         running = dict[Future[Reply], Sequence[Any]]()
@@ -97,15 +99,11 @@ class PoolWorkers:
                 if ended_future is None:
                     continue
                 items = running.pop(ended_future)
-                error = (
-                    BrokenExecutor()
-                    if ended_future.cancelled()
-                    else ended_future.exception()
-                )
+                error = _error_of(ended_future)
                 if error is None:
                     reply = ended_future.result()
                     item_seconds.append(reply.seconds / max(1, len(items)))
-                    yield self._result(items, reply)
+                    yield self._read_reply(items, reply)
                 elif isinstance(error, BrokenExecutor):
                     self.facts.retried += 1
                     waiting.appendleft(items)
@@ -113,10 +111,9 @@ class PoolWorkers:
                     raise error
                 elif len(items) > 1:
                     self._count_dead_start()
-                    waiting.extendleft(
-                        items[index : index + 1]
-                        for index in reversed(range(len(items)))
-                    )
+                    # item by item, in the same order
+                    for index in range(len(items) - 1, -1, -1):
+                        waiting.appendleft(items[index : index + 1])
                 else:
                     self._count_dead_start()
                     yield BatchResult(items, None, lost=str(error))
@@ -125,7 +122,7 @@ class PoolWorkers:
                 future.cancel()
 
     def _wait(self, ended: queue.SimpleQueue[Future[Reply]]) -> Future[Reply] | None:
-        """Return a future that has ended; None where none has for a moment."""
+        """Return a future that has ended, None if none ends for a moment."""
         try:
             return ended.get(timeout=POLL)
         except queue.Empty:
@@ -135,15 +132,13 @@ class PoolWorkers:
     def _take_next(
         waiting: deque[Sequence[Any]], source: Iterator[Sequence[Any]]
     ) -> bool:
-        """Have a batch wait, unless one does. Return whether there is one."""
+        """Move a batch to those that wait, if none waits; return whether one waits."""
         if not waiting:
             waiting.extend(islice(source, 1))
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return the seconds after which a worker counts as hanging, and ends
-        itself.
-        """
+        """Return the seconds after which a worker counts as hanging, and ends itself."""
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
         else:
@@ -153,7 +148,13 @@ class PoolWorkers:
             )
         return max(deadline, self._task.seconds or 0.0)
 
-    def _result(self, items: Sequence[Any], reply: Reply) -> BatchResult:
+    def _read_reply(self, items: Sequence[Any], reply: Reply) -> BatchResult:
+        """Return the result in a worker's reply, and count it.
+
+        Raises:
+            RuntimeError: if the worker's code raised an unexpected error.
+            ClusterError: for any other failure.
+        """
         if reply.failure is Failure.BUG:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
         if reply.failure is not None:
@@ -163,22 +164,24 @@ class PoolWorkers:
         self.facts.loading += reply.loading
         self.facts.alive -= reply.loading
         machine: str | None = machine_name(reply.machine)
-        if machine == self._here:
+        if machine == self._this_machine:
             machine = None
         elif machine is not None and machine not in self.facts.machines:
             self.facts.machines = {**self.facts.machines, machine: reply.machine}
-            described = ", ".join(
+            description = ", ".join(
                 f"{key} {text}" for key, text in reply.machine.items()
             )
             self._tell(
-                f"{reply.worker} is another machine than this ({described}): "
+                f"{reply.worker} is another machine than this ({description}): "
                 "last bits of rows may differ"
             )
         return BatchResult(items, reply.value, reply.worker, machine)
 
     def _count_dead_start(self) -> None:
-        """Raise ClusterError where workers die of whatever they are given, for example
-        while they load.
+        """Count a worker that died before any batch was finished.
+
+        Raises:
+            ClusterError: if as many died, for example while loading, that all will.
         """
         self._dead_starts += 1
         if self._dead_starts >= MAX_DEAD_STARTS and not self.facts.batches:
@@ -190,6 +193,13 @@ class PoolWorkers:
             )
 
 
+def _error_of(future: Future[Reply]) -> BaseException | None:
+    """Return the error of a future that has ended; cancelled ones are broken."""
+    if future.cancelled():
+        return BrokenExecutor()
+    return future.exception()
+
+
 @contextmanager
 def open_workers(
     task: WorkerTask,
@@ -198,9 +208,16 @@ def open_workers(
     cluster: str | None,
     tell: Callable[[str], None],
 ) -> Iterator[Workers | None]:
-    """Open workers for a task: processes of this machine, by default one a core, or
-    those of a cluster, given by its scheduler's address or a YAML file. None where
-    everything is done in this process.
+    """Open workers for a task.
+
+    Args:
+        task: what the workers do.
+        workers: number of processes on this machine, by default one a core.
+        cluster: the address of a scheduler, or a YAML file.
+        tell: takes messages for the user.
+
+    Yields:
+        The workers, None if `workers` and `cluster` are None: then this process does all.
     """
     if workers is None and cluster is None:
         yield None

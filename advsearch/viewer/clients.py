@@ -1,8 +1,7 @@
-"""Those who ask the dashboard's server: in what time each has to have asked and taken
-the answer, and HTTPS.
+"""Connections of the dashboard's server: worker threads, time limits, and HTTPS.
 
-A few workers answer. A client that has said nothing yet keeps none of them from others,
-one that is slow does so until its time is up, or for `GRACE` only where others wait.
+A few workers serve the requests. A client that has sent nothing yet occupies none of
+them; a slow client occupies one until its time is up, or for `GRACE` while others wait.
 """
 
 from __future__ import annotations
@@ -21,47 +20,55 @@ from dataclasses import dataclass
 from queue import Empty, LifoQueue
 from typing import Any
 
-WORKERS = 16  # requests that are answered at once; others wait
+# requests that are served at once; others wait
+WORKERS = 16
 WAITING = 128
-"""Connections that may be open beside those that are served. More wait in the operating
-system, without a file open here.
+"""Connections that may be open and wait for a worker or for their client.
+
+More wait in the operating system, without an open file in this process.
 """
-PATIENCE = 10.0  # seconds in which a client has to have said what it asks for
-# bytes a second at which it has to take the answer at least, beyond as long as
-# `PATIENCE`
+# seconds that a client has to send its request
+PATIENCE = 10.0
+# minimum bytes per second at which a client takes the response, after `PATIENCE`
 SLOWEST = 50_000
-GRACE = 1.0  # seconds that a slow client has where others wait
-TICK = 0.05  # seconds between two looks at the clock
-
-
-LARGEST_SENT = 16 << 20  # bytes of what is sent, at most
-NO_QR = "pip install segno"  # what to type where there is nothing to draw a code with
+# seconds that a slow client has while others wait
+GRACE = 1.0
+# seconds between two checks of the time limits
+TICK = 0.05
+# maximum bytes of a request's body
+LARGEST_SENT = 16 << 20
+# what to type if QR codes cannot be drawn
+NO_QR = "pip install segno"
 
 
 def reachable(host: str) -> str:
-    """Return the address under which others reach what listens at `host`: of any
-    address, the one that leads out.
+    """Return the address under which other machines reach what listens at `host`.
+
+    If it listens at all addresses, that is the address of the default route.
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    family, far = (
-        (socket.AF_INET6, "2001:db8::1")
-        if host == "::"
-        else (socket.AF_INET, "192.0.2.1")
-    )
+    # addresses of documentation, RFC 3849 and RFC 5737
+    family, remote = socket.AF_INET, "192.0.2.1"
+    if host == "::":
+        family, remote = socket.AF_INET6, "2001:db8::1"
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((far, 9))  # chooses an address; nothing is sent
+            probe.connect((remote, 9))  # chooses an address; nothing is sent
             return str(probe.getsockname()[0])
     except OSError:
         return "::1" if host == "::" else "127.0.0.1"
 
 
 @dataclass(eq=False)
-class _Served:
-    """One that a worker serves: its connection, since when the worker waits for it, and
-    until when that may last; both are infinite while the worker itself is what takes
-    time.
+class _Connection:
+    """A connection that a worker serves.
+
+    Attributes:
+        connection: the socket of the client.
+        since: when the worker began to wait for the client; infinite while the worker
+            itself computes.
+        due: until when it waits; infinite likewise.
     """
 
     connection: socket.socket
@@ -70,9 +77,13 @@ class _Served:
 
 
 class Clients:
-    """Serves the connections that a socket accepts until `close`, with HTTPS if there
-    is a context. `answer` is called with each, in a worker's thread, and says when it
-    waits for the client (`wait_for`) or works.
+    """Serve the connections that a socket accepts until `close`.
+
+    Args:
+        listening: the socket that listens.
+        answer: serves a connection in a worker's thread; calls `wait_for` when it begins
+            or ends to wait for the client.
+        context: for HTTPS; without it, HTTP.
     """
 
     def __init__(
@@ -82,15 +93,17 @@ class Clients:
         context: ssl.SSLContext | None,
     ) -> None:
         self._listening = listening
-        self._answer = answer
+        self._handle = answer
         self._context = context
-        # Who came last is served first: a crowd may be there to keep others out.
+        # The newest connection is served first: many old ones may be an attack.
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
-        self._served: dict[int, _Served] = {}
-        self._closed, self._ended = threading.Event(), threading.Event()
+        self._connections: dict[int, _Connection] = {}
+        self._closed = threading.Event()
+        self._ended = threading.Event()
         self._ended.set()
 
     def serve(self) -> None:
+        """Serve connections until `close` is called."""
         self._ended.clear()
 
         def work() -> None:
@@ -106,6 +119,7 @@ class Clients:
             self._ended.set()
 
     def close(self) -> None:
+        """End `serve`, and close the connections that wait for a worker."""
         self._closed.set()
         self._ended.wait()
         with suppress(Empty):
@@ -116,28 +130,31 @@ class Clients:
             self._ready.put(None)
 
     def wait_for(self, seconds: float | None) -> None:
-        """Say, in a worker's thread, that it waits for its client from now on, and for
-        how long at most; None that it does not.
+        """Report, in a worker's thread, that it waits for its client from now on.
+
+        It waits for `seconds` at most; None reports that it no longer waits.
         """
-        client = self._served[threading.get_ident()]
+        client = self._connections[threading.get_ident()]
+        if seconds is None:
+            client.since = math.inf
+            client.due = math.inf
+            return
         now = time.monotonic()
-        client.since, client.due = (
-            (math.inf, math.inf) if seconds is None else (now, now + seconds)
-        )
+        client.since = now
+        client.due = now + seconds
 
     def _watch(self, selector: selectors.BaseSelector) -> None:
-        """Hand each connection that has said something to the workers, and end those
-        whose time is up.
-        """
+        """Pass connections that have sent something to workers; enforce time limits."""
+        # address, and since when it is silent, by connection
         silent: dict[Any, tuple[Any, float]] = {}
         listens = False
         while not self._closed.is_set():
-            room = len(silent) + self._ready.qsize() < WAITING
-            if room and not listens:
+            has_room = len(silent) + self._ready.qsize() < WAITING
+            if has_room and not listens:
                 selector.register(self._listening, selectors.EVENT_READ)
-            elif listens and not room:
+            elif listens and not has_room:
                 selector.unregister(self._listening)
-            listens = room
+            listens = has_room
             for key, _ in selector.select(TICK):
                 connection: Any = key.fileobj
                 if connection is self._listening:
@@ -149,54 +166,60 @@ class Clients:
                     selector.unregister(connection)
                     self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
-            most = PATIENCE if room else min(PATIENCE, GRACE)
-            for connection in [
-                one for one, (_, since) in silent.items() if now - since > most
-            ]:
-                del silent[connection]
-                selector.unregister(connection)
-                connection.close()
-            served = sorted(self._served.copy().values(), key=lambda one: one.since)
-            others = self._ready.qsize() if len(served) == WORKERS else 0
-            # where others wait, those end too that have had `GRACE`, the slowest first
-            for one in served:
-                pressed = others > 0 and now - one.since > GRACE
-                if one.due < now or pressed:
-                    others -= 1
-                    one.since = one.due = math.inf
-                    # not the method of an SSL socket, which would forget that it is one
-                    with suppress(OSError):
-                        socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
+            patience = PATIENCE if has_room else min(PATIENCE, GRACE)
+            for connection, (_, since) in list(silent.items()):
+                if now - since > patience:
+                    del silent[connection]
+                    selector.unregister(connection)
+                    connection.close()
+            self._end_slow_clients(now)
         for connection in silent:
             connection.close()
 
+    def _end_slow_clients(self, now: float) -> None:
+        """End clients whose time is up.
+
+        While others wait, those that have had `GRACE` end too, the slowest first.
+        """
+        clients = sorted(
+            self._connections.copy().values(), key=lambda client: client.since
+        )
+        n_waiting = self._ready.qsize() if len(clients) == WORKERS else 0
+        for client in clients:
+            makes_room = n_waiting > 0 and now - client.since > GRACE
+            if client.due < now or makes_room:
+                n_waiting -= 1
+                client.since = math.inf
+                client.due = math.inf
+                # not the method of an SSL socket, which would forget that it is one
+                with suppress(OSError):
+                    socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
+
     def serve_one(self, connection: socket.socket, address: Any) -> None:
-        """Answer one client, in this thread; whatever it does, nothing is raised."""
-        own = threading.get_ident()
+        """Serve one client in this thread; whatever it does, nothing is raised."""
+        thread = threading.get_ident()
         try:
             connection.setblocking(True)
             if self._context is not None:
                 connection = self._context.wrap_socket(
                     connection, server_side=True, do_handshake_on_connect=False
                 )
-            self._served[own] = _Served(connection)
+            self._connections[thread] = _Connection(connection)
             self.wait_for(PATIENCE)
             if isinstance(connection, ssl.SSLSocket):
                 connection.do_handshake()
-            self._answer(connection, address)
+            self._handle(connection, address)
         except Exception:
             return
         finally:
-            self._served.pop(own, None)
+            self._connections.pop(thread, None)
             with suppress(OSError):
                 socket.socket.shutdown(connection, socket.SHUT_WR)
             connection.close()
 
 
 def qr_text(address: str) -> str | None:
-    """Return an address as a QR code for a terminal; None where segno is not
-    installed.
-    """
+    """Return an address as a QR code for a terminal, None if segno is not installed."""
     code = qr_code(address)
     text = io.StringIO()
     if code is not None:
@@ -205,7 +228,7 @@ def qr_text(address: str) -> str | None:
 
 
 def qr_code(address: str) -> Any:
-    """Return a QR code of an address; None where segno is not installed."""
+    """Return the QR code of an address, None if segno is not installed."""
     try:
         return importlib.import_module("segno").make(address, error="m", micro=False)
     except ImportError:

@@ -1,5 +1,4 @@
-"""The rows of a sweep as columns of numbers, which a browser aggregates faster than a
-database could answer.
+"""The rows of a sweep as columns of numbers, for a browser that aggregates them.
 
 A million rows are 30 MB of numbers; going through them takes a browser some ten
 milliseconds, SQLite some seconds.
@@ -8,6 +7,7 @@ milliseconds, SQLite some seconds.
 from __future__ import annotations
 
 import json
+import math
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,24 +24,29 @@ from advsearch.trust.databases import DAMAGED
 if TYPE_CHECKING:
     import pandas as pd
 
-# different names of one axis, or predictions, that are told apart; further ones are
-# one: "others"
+# distinct names of an axis, or predictions; further ones are merged to "others"
 MOST_LEVELS = 65535
-UNKNOWN = 2  # `right` of a row whose prediction was not judged
+# `right` of a row whose prediction was not evaluated
+UNKNOWN = 2
 NO_PROBABILITY = 65535
-BOX_STEPS = 8  # of a pixel, in which the corners of boxes are counted
+# steps of a pixel, in which the corners of boxes are counted
+BOX_STEPS = 8
 NO_BOX = 65535
-OTHERS = "boxes"  # where a frame keeps the boxes of its rows, in its `attrs`
-# numbers of a box among `Boxes`: its corners, the place of its name, its score
+# the key in a frame's `attrs` of the boxes of its rows
+OTHERS = "boxes"
+# values of a box in `Boxes`: its corners, the index of its name, its score
 OF_A_BOX = 6
 
 
 @dataclass
 class Boxes:
-    """All boxes of a detector's predictions, true ones too, as rows have from none to
-    many: `OF_A_BOX` numbers a box, corners in `BOX_STEPS` of a pixel, place of the
-    name, score in 1/10000 (`NO_PROBABILITY` of what is true); how many boxes there are
-    up to and with each row; and names of classes and things.
+    """All boxes of a detector's predictions, and the true ones, of rows with any number.
+
+    Attributes:
+        numbers: `OF_A_BOX` uint16 values a box: x0, y0, x1 and y1 in `BOX_STEPS` of a
+            pixel, index of the name, score in 1/10000 (`NO_PROBABILITY` of true boxes).
+        ends: number of boxes up to and including each row.
+        names: index of each name of a class or a thing.
     """
 
     numbers: array[int] = field(default_factory=lambda: array("H"))
@@ -49,143 +54,124 @@ class Boxes:
     names: dict[str, int] = field(default_factory=dict)
 
     def put(self, payload: Mapping[str, Any]) -> None:
-        things = payload.get("things", {})
-        true = [
-            (one["box"], name, None) for name, one in things.items() if one.get("box")
-        ]
-        found = [
-            (one["box"], one["label"], float(one["score"]))
-            for one in payload.get("found", ())
-        ]
-        for box, name, score in [*true, *found]:
-            x0, y0, x1, y1 = (
-                min(max(round(BOX_STEPS * float(end)), 0), NO_BOX - 1) for end in box
-            )
-            place = self.names.setdefault(str(name), min(len(self.names), MOST_LEVELS))
-            told = (
-                NO_PROBABILITY
-                if score is None
-                else round(10_000 * min(max(score, 0.0), 1.0))
-            )
-            self.numbers.extend((x0, y0, x1, y1, place, told))
+        """Add the true boxes and the detections of a row's payload."""
+        for name, thing in payload.get("things", {}).items():
+            if thing.get("box"):
+                self._put_box(thing["box"], name, NO_PROBABILITY)
+        for detection in payload.get("found", ()):
+            score = min(max(float(detection["score"]), 0.0), 1.0)
+            self._put_box(detection["box"], detection["label"], round(10_000 * score))
+
+    def _put_box(self, box: Any, name: object, score: int) -> None:
+        """Add the values of a box, with corners clipped to what uint16 can hold."""
+        x0, y0, x1, y1 = (
+            min(max(round(BOX_STEPS * float(corner)), 0), NO_BOX - 1) for corner in box
+        )
+        next_index = min(len(self.names), MOST_LEVELS)
+        name_index = self.names.setdefault(str(name), next_index)
+        self.numbers.extend((x0, y0, x1, y1, name_index, score))
 
     def __deepcopy__(self, memo: object) -> Boxes:
-        """Itself: pandas copies the attributes of a frame with every column that is
-        taken out of it.
-        """
+        """Return itself: pandas copies the attributes of a frame with every column it selects."""
         return self
 
 
 CORNERS = tuple(
-    f"{what} {end}"
-    for what in ("true box", "predicted box")
-    for end in ("x0", "y0", "x1", "y1")
+    f"{box} {corner}"
+    for box in ("true box", "predicted box")
+    for corner in ("x0", "y0", "x1", "y1")
 )
-"""Columns of detection: of the true box and of the one that the prediction is about, in
-pixels of the rendering.
-"""
+"""Columns of detection: corners of the true and of the predicted box, pixels."""
 
 
 def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataFrame:
-    """Return the rows of the sweep in `run` that were written after the row with this
-    id, `most` of them at most, as a frame (`runs.tables`), with `CORNERS` where rows
-    have boxes. Raises FileFormatError where the results cannot be read.
+    """Read rows of a sweep as a frame (`runs.tables`), with `CORNERS` if it has boxes.
+
+    Args:
+        run: directory of the run.
+        after: id of the row after which to begin.
+        most: maximum number of rows.
+
+    Raises:
+        FileFormatError: if the results cannot be read.
     """
     from advsearch.runs.tables import read_sweep  # pandas takes half a second
 
     boxes = Boxes()
 
-    def corners(row: Row) -> Mapping[str, float]:
-        """The true box of a detector's prediction, and the best one with the label that
-        the prediction is, or misses.
-        """
-        payload: Any = row.payload
-        if not isinstance(payload, dict) or "box" not in payload:
-            boxes.ends.append(len(boxes.numbers) // OF_A_BOX)
-            return {}
-        sought = payload.get("class", row.label)
+    def read_corners(row: Row) -> Mapping[str, float]:
         try:
-            best = next(
-                (
-                    one["box"]
-                    for one in payload.get("found", ())
-                    if one["label"] == sought
-                ),
-                None,
-            )
-            boxes.put(payload)
-            boxes.ends.append(len(boxes.numbers) // OF_A_BOX)
-            numbers = [
-                float("nan") if x is None else float(x)
-                for b in (payload["box"], best)
-                for x in b or [None] * 4
-            ]
-            return dict(zip(CORNERS, numbers, strict=True))
+            return _read_corners(row, boxes)
         except (LookupError, TypeError, ValueError, OverflowError, AttributeError):
-            file = run / NAME
-            expected = (
-                f"{file}: row {row.id}: expected boxes of a detector, got "
+            raise FileFormatError(
+                f"{run / NAME}: row {row.id}: expected boxes of a detector, got "
                 f"something else; {DAMAGED}"
-            )
-            raise FileFormatError(expected) from None
+            ) from None
 
-    rows = read_sweep(run, after, most, corners)
+    rows = read_sweep(run, after, most, read_corners)
     rows.attrs[OTHERS] = boxes
     return rows
 
 
-def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> bytes:
-    """Return rows for a browser: the length of the head (uint32), the head as JSON
-    filled up to a multiple of 4 bytes, the columns.
+def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
+    """Return the corners of a row's true box and its best detection; fill `boxes`.
 
-    The head has the count, names, and where each column begins behind it; whether there
-    are `more` rows behind these, and whether further ones are still being made. All is
-    little-endian; columns of four bytes a number come first, so that each begins at a
-    multiple of its size. Boxes are (n, 8) uint16 in `BOX_STEPS` of a pixel, `NO_BOX`
-    where there is none. `others` are all `Boxes`, up to each row's `others end`.
+    The detection is the first with the label that the prediction is, or misses. Rows
+    of other tasks have no corners.
     """
-    predictions, labels = _levels(rows["label"])
-    outcomes, outcome_names = _levels(rows["outcome"])
-    share = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
-    columns = {
-        "step": rows["step"].to_numpy(np.uint32),
-        "margin": rows["margin"].to_numpy(np.float32),
-        "answer": predictions,
-        "probability": np.where(np.isnan(share), NO_PROBABILITY, share.round()).astype(
-            np.uint16
-        ),
-        "outcome": outcomes,
-        "right": rows["correct"]
-        .where(rows["label"] != OUT_OF_VIEW)
-        .fillna(UNKNOWN)
-        .to_numpy(np.uint8),
-        "unit": rows["unit"].to_numpy(np.uint32),
-    }
-    units = rows.attrs["units"]
-    edges = rows.attrs["edges"]
-    parameters = []
-    for number, (name, unit) in enumerate(units.items()):
-        column = rows[name]
-        levels = None
-        if column.dtype == "category":
-            unit = ""
-            columns[f"parameter {number}"], levels = _levels(column)
-        else:
-            with np.errstate(over="ignore"):
-                columns[f"parameter {number}"] = column.to_numpy(np.float32)
-        parameters.append(
-            {"name": name, "unit": unit, "levels": levels, "edges": edges.get(name)}
-        )
-    if CORNERS[0] in rows:
-        pixels = rows[list(CORNERS)].to_numpy()
-        steps = (BOX_STEPS * pixels).clip(0, NO_BOX - 1).round()
-        columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
+    payload: Any = row.payload
+    corners: Mapping[str, float] = {}
+    if isinstance(payload, dict) and "box" in payload:
+        label = payload.get("class", row.label)
+        best_box = None
+        for detection in payload.get("found", ()):
+            if detection["label"] == label:
+                best_box = detection["box"]
+                break
+        boxes.put(payload)
+        values = list[float]()
+        for box in (payload["box"], best_box):
+            for corner in box or [None] * 4:
+                values.append(math.nan if corner is None else float(corner))
+        corners = dict(zip(CORNERS, values, strict=True))
+    boxes.ends.append(len(boxes.numbers) // OF_A_BOX)
+    return corners
+
+
+def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> bytes:
+    """Serialize rows for a browser: length of the head, the head, the columns.
+
+    The length is a uint32; the head is JSON, padded to a multiple of 4 bytes. It has
+    the count, names, and the offset of each column behind it. All is little-endian;
+    columns of four bytes a value come first, so that each is aligned. Boxes are (n, 8)
+    uint16 in `BOX_STEPS` of a pixel, or `NO_BOX`. `others` are all `Boxes`, up to each
+    row's `others end`.
+
+    Args:
+        rows: a frame as `read_columns` returns it.
+        more: whether the run has further rows already.
+        running: whether the run is adding rows.
+    """
+    columns, labels, outcome_names = _prediction_columns(rows)
+    parameter_columns, parameters = _parameter_columns(rows)
+    columns |= parameter_columns
+    columns |= _box_columns(rows)
+    arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
+
+    layout = list[dict[str, object]]()
+    offset = 0
+    for name, values in arrays:
+        entry: dict[str, object] = {
+            "name": name,
+            "type": values.dtype.name,
+            "at": offset,
+            "width": values.size // max(len(values), 1),
+        }
+        if name == "others":
+            entry["length"] = values.size
+        layout.append(entry)
+        offset += values.nbytes
     boxes: Boxes | None = rows.attrs.get(OTHERS)
-    if boxes is not None and boxes.numbers and len(boxes.ends) == len(rows):
-        columns["others"] = np.asarray(boxes.numbers, np.uint16)
-        columns["others end"] = np.asarray(boxes.ends, np.uint32)
-    arrays = sorted(columns.items(), key=lambda one: -one[1].itemsize)
-    starts = np.cumsum([0, *(one.nbytes for _, one in arrays)]).tolist()
     head = {
         "count": len(rows),
         "last": int(rows["id"].iloc[-1]) if len(rows) else 0,
@@ -195,29 +181,80 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
         "outcomes": outcome_names,
         "parameters": parameters,
         "things": list(boxes.names) if boxes is not None else [],
-        "columns": [
-            {
-                "name": name,
-                "type": one.dtype.name,
-                "at": start,
-                "width": one.size // max(len(one), 1),
-            }
-            | ({"length": one.size} if name == "others" else {})
-            for (name, one), start in zip(arrays, starts, strict=False)
-        ],
+        "columns": layout,
     }
-    text = json.dumps(head).encode()
-    text += b" " * (-len(text) % 4)
-    data = (one.astype(one.dtype.newbyteorder("<")).tobytes() for _, one in arrays)
-    return b"".join([len(text).to_bytes(4, "little"), text, *data])
+    head_data = json.dumps(head).encode()
+    head_data += b" " * (-len(head_data) % 4)
+    data = [
+        values.astype(values.dtype.newbyteorder("<")).tobytes() for _, values in arrays
+    ]
+    return b"".join([len(head_data).to_bytes(4, "little"), head_data, *data])
 
 
-def _levels(column: pd.Series) -> tuple[Any, list[str]]:
-    """The place (n,) uint16 of each name of a column among the names that are told
-    apart, and these.
-    """
+def _prediction_columns(
+    rows: pd.DataFrame,
+) -> tuple[dict[str, Any], list[str], list[str]]:
+    """Return the columns of predictions, and the names of labels and outcomes."""
+    labels, label_names = _encode_levels(rows["label"])
+    outcomes, outcome_names = _encode_levels(rows["outcome"])
+    probability = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
+    probability = np.where(
+        np.isnan(probability), NO_PROBABILITY, probability.round()
+    ).astype(np.uint16)
+    is_right = rows["correct"].where(rows["label"] != OUT_OF_VIEW).fillna(UNKNOWN)
+    columns = {
+        "step": rows["step"].to_numpy(np.uint32),
+        "margin": rows["margin"].to_numpy(np.float32),
+        "answer": labels,
+        "probability": probability,
+        "outcome": outcomes,
+        "right": is_right.to_numpy(np.uint8),
+        "unit": rows["unit"].to_numpy(np.uint32),
+    }
+    return columns, label_names, outcome_names
+
+
+def _parameter_columns(
+    rows: pd.DataFrame,
+) -> tuple[dict[str, Any], list[dict[str, object]]]:
+    """Return the columns of parameters, and their names, units, levels and edges."""
+    edges = rows.attrs["edges"]
+    columns = dict[str, Any]()
+    parameters = list[dict[str, object]]()
+    for index, (name, unit) in enumerate(rows.attrs["units"].items()):
+        column = rows[name]
+        levels = None
+        if column.dtype == "category":
+            unit = ""
+            values, levels = _encode_levels(column)
+        else:
+            with np.errstate(over="ignore"):
+                values = column.to_numpy(np.float32)
+        columns[f"parameter {index}"] = values
+        parameters.append(
+            {"name": name, "unit": unit, "levels": levels, "edges": edges.get(name)}
+        )
+    return columns, parameters
+
+
+def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the columns of boxes, empty if the rows have none."""
+    columns = dict[str, Any]()
+    if CORNERS[0] in rows:
+        pixels = rows[list(CORNERS)].to_numpy()
+        steps = (BOX_STEPS * pixels).clip(0, NO_BOX - 1).round()
+        columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
+    boxes: Boxes | None = rows.attrs.get(OTHERS)
+    if boxes is not None and boxes.numbers and len(boxes.ends) == len(rows):
+        columns["others"] = np.asarray(boxes.numbers, np.uint16)
+        columns["others end"] = np.asarray(boxes.ends, np.uint32)
+    return columns
+
+
+def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
+    """Encode a column of names: return the index (n,) uint16 of each, and the names."""
     names = column.cat.categories.tolist() if column.dtype == "category" else []
     if len(names) >= MOST_LEVELS:
         names = [*names[: MOST_LEVELS - 1], "others"]
-    places = column.cat.codes.to_numpy() if names else np.zeros(len(column))
-    return np.minimum(places, max(len(names) - 1, 0)).astype(np.uint16), names
+    indices = column.cat.codes.to_numpy() if names else np.zeros(len(column))
+    return np.minimum(indices, max(len(names) - 1, 0)).astype(np.uint16), names

@@ -1,5 +1,4 @@
-"""The frame of every page, such that it needs nothing from elsewhere, and what pages
-have in common.
+"""The frame of every page, which needs no other file, and elements that pages share.
 
 Its style sheet is light and dark, from a phone to a wide screen, and on paper.
 """
@@ -23,16 +22,16 @@ from advsearch.runs.directory import PARTS, REPORT
 from advsearch.trust import pages
 from advsearch.version import __version__
 
-MOST_NOTES = 3  # notes on files that are not folded
+# notes on files that are not folded
+MOST_NOTES = 3
 
-_OF_A_FILE = re.compile(
-    rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has ",
-    re.IGNORECASE,
+_SUFFIXES = "|".join(suffix[1:] for suffix in (*MESHES, ".hdr", ".exr", ".xml"))
+_FILE_REMARK = re.compile(
+    rf"[^:]{{1,200}}\.({_SUFFIXES})[: ]|The clean scene has ", re.IGNORECASE
 )
-"""How what is said of the reading of a file begins, and of a value that a control
-leaves out.
-"""
-LONG = 32  # letters of a cell above which its text is broken into lines
+"""The beginning of remarks on how a file was read, or on a value without a control."""
+# characters of a cell above which its text is broken into lines
+LONG = 32
 
 SCRIPTS = (
     ("sweep.js",),
@@ -41,8 +40,9 @@ SCRIPTS = (
     ("make.js", "attack.js"),
     ("make.js", "attack.js", "object.js"),
 )
-"""Files of the viewer that run together in a page. There are no other scripts, and the
-server allows none.
+"""Files of the viewer that run together in a page.
+
+There are no other scripts, and the server allows none.
 """
 
 
@@ -54,15 +54,20 @@ def document(
     connects: bool = False,
     footer: str = "",
 ) -> str:
-    """Return a page as HTML, with a title of the window, what stands in it, before the
-    footer, a sentence, scripts that hold `data`, and files of the viewer that run in
-    it, one after the other: one of `SCRIPTS`. It `connects` if it asks its server for
-    rows and pictures; else it cannot ask anybody.
+    """Return a page as HTML.
+
+    Args:
+        title: title of the window.
+        *body: content of the page.
+        data: scripts that hold data (`data_script`).
+        scripts: names of files that run in the page, in order: one of `SCRIPTS`.
+        connects: whether the page may request rows and images from its server;
+            otherwise it cannot connect to anything.
+        footer: a sentence at the end, by default the title.
     """
-    code = _code(scripts)
-    policy = pages.page_policy(
-        [pages.script_digest(code.encode())] if code else [], connects=connects
-    )
+    code = _join_scripts(scripts)
+    digests = [pages.script_digest(code.encode())] if code else []
+    policy = pages.page_policy(digests, connects=connects)
     head = element(
         "head",
         element("meta", charset="utf-8"),
@@ -77,20 +82,17 @@ def document(
         element("link", rel="icon", href="data:,"),
         element("style", Html(f"\n{asset('document.css')}{asset('viewer.css')}")),
     )
-    end = element("footer", f"advsearch {__version__}, {footer or title}")
-    shown = Html(
-        re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, end)) + join_html(*data)
-    )
-    page = element(
-        "html",
-        head,
-        element("body", shown, element("script", Html(code)) if code else None),
-        lang="en",
-    )
+    footer_html = element("footer", f"advsearch {__version__}, {footer or title}")
+    # no line break between a number and its percent sign
+    text = re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, footer_html))
+    content = Html(text + join_html(*data))
+    script = element("script", Html(code)) if code else None
+    page = element("html", head, element("body", content, script), lang="en")
     return f"<!doctype html>\n{page}\n"
 
 
-def _code(scripts: Sequence[str]) -> str:
+def _join_scripts(scripts: Sequence[str]) -> str:
+    """Join files of the viewer to one script."""
     if scripts and tuple(scripts) not in SCRIPTS:
         raise ValueError(
             f"scripts: expected one of SCRIPTS, got {tuple(scripts)}; name it there"
@@ -99,34 +101,34 @@ def _code(scripts: Sequence[str]) -> str:
 
 
 @cache
-def _own_digests() -> frozenset[str]:
+def _script_digests() -> frozenset[str]:
+    """Return the digests of all scripts that pages of this version have."""
     return frozenset(
-        pages.script_digest(_code(scripts).encode()) for scripts in SCRIPTS
+        pages.script_digest(_join_scripts(scripts).encode()) for scripts in SCRIPTS
     )
 
 
 def has_other_scripts(page: bytes) -> bool:
-    """Whether a page has a script that is none of `SCRIPTS`, such as that of another
-    version, and so will not run where `served_policy` holds. Scripts that are data do
-    not count.
+    """Return whether a page has a script that is none of `SCRIPTS`.
+
+    Such a script, as of another version, does not run under `served_policy`. Scripts
+    that are data do not count.
     """
-    return pages.has_other_scripts(page, _own_digests())
+    return pages.has_other_scripts(page, _script_digests())
 
 
 def served_policy(*, own: bool) -> str:
-    """Return the `Content-Security-Policy` that a server sends, under which no script
-    runs but those of `SCRIPTS`.
-    """
-    return pages.served_policy(_own_digests(), own=own)
+    """Return the `Content-Security-Policy` that a server sends: only `SCRIPTS` run."""
+    return pages.served_policy(_script_digests(), own=own)
 
 
 def in_address(name: str) -> str:
-    """Return a name of a file, which may be no text, as a part of an address."""
+    """Quote the name of a file, which may be no valid text, as a part of a URL."""
     return quote(os.fsencode(name), safe="")
 
 
 def data_script(value: object, name: str) -> Html:
-    """Return JSON that a script finds by its `id`, whatever its texts are."""
+    """Return a value as JSON in a script element, which code finds by its `id`."""
     text = (
         json.dumps(value)
         .replace("<", "\\u003c")
@@ -137,26 +139,25 @@ def data_script(value: object, name: str) -> Html:
 
 
 def data_url(data: bytes, kind: str) -> str:
-    """Return bytes as an address that needs no file; `kind` is a media type."""
+    """Return bytes as a data URL; `kind` is a media type."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def scrolled(inside: Html | None, css: str = "") -> Html:
-    """Return what scrolls sideways where it is too wide, by keys too."""
+    """Wrap an element so that it scrolls sideways if it is too wide, also by keys."""
     return element("div", inside, class_=f"scroll {css}".strip(), tabindex="0")
 
 
 @cache
 def asset(name: str) -> str:
+    """Read a static file of the viewer."""
     return (resources.files("advsearch.viewer") / "static" / name).read_text(
         encoding="utf-8"
     )
 
 
 def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
-    """Return the header of a page: what was asked, the result, and what has to be known
-    beside it.
-    """
+    """Return the header of a page: a line about its subject, the result, and remarks."""
     return element(
         "header",
         element("p", eyebrow, class_="eyebrow"),
@@ -166,51 +167,43 @@ def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
 
 
 def remarks_html(remarks: Sequence[str]) -> Html:
-    """Return what has to be known beside a result, and below it, folded where it is
-    much, how files were read.
+    """Return a list of remarks on a result, and one of notes on how files were read.
+
+    Many notes are folded.
     """
-    notes = [one for one in remarks if _OF_A_FILE.match(one)]
-    listed, noted = (
-        element("ul", *(element("li", one) for one in lines), class_=css)
-        if lines
-        else None
-        for lines, css in (
-            ([one for one in remarks if one not in notes], "remarks"),
-            (notes, "notes"),
-        )
-    )
+    notes = [remark for remark in remarks if _FILE_REMARK.match(remark)]
+    others = [remark for remark in remarks if remark not in notes]
+    notes_html = _list_html(notes, "notes")
     if len(notes) > MOST_NOTES:
-        noted = element(
-            "details",
-            element("summary", f"{len(notes)} notes on how files were read"),
-            noted,
-        )
-    return join_html(listed, noted)
+        summary = element("summary", f"{len(notes)} notes on how files were read")
+        notes_html = element("details", summary, notes_html)
+    return join_html(_list_html(others, "remarks"), notes_html)
+
+
+def _list_html(lines: Sequence[str], css: str) -> Html | None:
+    """Return a list, None without lines."""
+    if not lines:
+        return None
+    return element("ul", *(element("li", line) for line in lines), class_=css)
 
 
 def subject_html(*parts: tuple[str, str]) -> Html:
-    """Return what a run is about: kinds with their names, the paths among which are
-    short, and whole on hover.
-    """
-    shown = (
-        join_html(
-            f"{kind} " if kind else "",
-            element("span", wording.short_names(text), title=text),
-        )
-        for kind, text in parts
-    )
-    return join_html(
-        *(join_html(", " if number else "", one) for number, one in enumerate(shown))
-    )
+    """Return what a run is about: kinds with names; paths are short, and full on hover."""
+    content = list[Html | str]()
+    for index, (kind, text) in enumerate(parts):
+        separator = ", " if index else ""
+        name = element("span", wording.short_names(text), title=text)
+        content += [separator, f"{kind} " if kind else "", name]
+    return join_html(*content)
 
 
 def facts_table(facts: Mapping[str, str]) -> Html:
-    """Return names with their values; those that are empty are left out."""
-    known = ((name, value) for name, value in facts.items() if value)
-    lines = (
+    """Return a table of names and values, without those that are empty."""
+    lines = [
         element("tr", element("th", name, scope="row"), element("td", value))
-        for name, value in known
-    )
+        for name, value in facts.items()
+        if value
+    ]
     return element("table", element("tbody", *lines), class_="facts")
 
 
@@ -221,46 +214,59 @@ def study_table(
     shares: Mapping[tuple[int, int], float] | None = None,
     bars: Sequence[tuple[float, float, float] | None] = (),
 ) -> Html:
-    """Return a table whose rows begin with their name. Links, of the names, lead
-    nowhere where they are empty or missing. Shares and bars as those of `ResultPart`.
+    """Return a table whose rows begin with their name.
+
+    Args:
+        heads: heads of the columns.
+        rows: the cells of each row.
+        links: addresses of the names; rows with an empty or no link have none.
+        shares: fractions that color cells, as in `ResultPart`.
+        bars: intervals with marks in an extra column, as in `ResultPart`.
     """
     lines = []
-    for number, (first, *cells) in enumerate(rows):
-        link = links[number] if number < len(links) else ""
+    for index, (first, *texts) in enumerate(rows):
+        link = links[index] if index < len(links) else ""
         name = element("a", first, href=link) if link else first
-        shown = []
-        for at, text in enumerate(cells, 1):
-            share = (shares or {}).get((number, at))
-            css = "number" if len(text) <= LONG else "long"
-            css = css if share is None else f"number share share-{round(10 * share)}"
-            shown.append(element("td", text, class_=css))
+        cells = [element("th", name, scope="row")]
+        for column, text in enumerate(texts, 1):
+            share = (shares or {}).get((index, column))
+            cells.append(element("td", text, class_=_cell_class(text, share)))
         if bars:
-            drawn = None
-            if (bar := bars[number]) is not None:
-                low, high, mark = bar
-                reach = element(
-                    "span",
-                    style=f"left: {low:.1%}; width: {high - low:.1%}",
-                    class_="range",
-                )
-                marked = element("span", style=f"left: {mark:.1%}", class_="mark")
-                drawn = element(
-                    "div", reach, marked, class_="interval", aria_hidden="true"
-                )
-            shown.append(element("td", drawn, class_="hide-small"))
-        lines.append(element("tr", element("th", name, scope="row"), *shown))
-    beside = element("td", class_="hide-small") if bars else None
-    head = element("tr", *(element("th", text, scope="col") for text in heads), beside)
+            cells.append(element("td", _interval_bar(bars[index]), class_="hide-small"))
+        lines.append(element("tr", *cells))
+    bar_head = element("td", class_="hide-small") if bars else None
+    column_heads = (element("th", text, scope="col") for text in heads)
+    head = element("tr", *column_heads, bar_head)
     return scrolled(element("table", element("thead", head), element("tbody", *lines)))
 
 
+def _cell_class(text: str, share: float | None) -> str:
+    """Return the CSS classes of a cell, which may have the color of a fraction."""
+    if share is not None:
+        return f"number share share-{round(10 * share)}"
+    return "number" if len(text) <= LONG else "long"
+
+
+def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
+    """Return a bar from a lower to an upper fraction of the width, with a mark on it."""
+    if bar is None:
+        return None
+    lower, upper, mark = bar
+    range_html = element(
+        "span", style=f"left: {lower:.1%}; width: {upper - lower:.1%}", class_="range"
+    )
+    mark_html = element("span", style=f"left: {mark:.1%}", class_="mark")
+    return element("div", range_html, mark_html, class_="interval", aria_hidden="true")
+
+
 def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
-    """Return where the pages of a run's parts are, seen from its own; empty of those
-    that have none.
+    """Return the addresses of the pages of a run's parts, relative to its own page.
+
+    They are empty of parts that have no page.
     """
-    names = ["" if part is None else Path(part).name for part in parts]
-    there = [name and (run / PARTS / name / REPORT).is_file() for name in names]
-    return [
-        f"{PARTS}/{in_address(name)}/{REPORT}" if has else ""
-        for name, has in zip(names, there, strict=True)
-    ]
+    links = []
+    for part in parts:
+        name = "" if part is None else Path(part).name
+        has_page = bool(name) and (run / PARTS / name / REPORT).is_file()
+        links.append(f"{PARTS}/{in_address(name)}/{REPORT}" if has_page else "")
+    return links

@@ -1,5 +1,4 @@
-"""HTML of pages that experiments make: elements, tables, whole documents, and what the
-server refuses.
+"""HTML of pages that experiments make: elements, tables, documents, and `Refused`.
 
 `advsearch.extend` offers this module to added experiments. Text becomes markup only
 through `element`, which escapes it.

@@ -1,7 +1,6 @@
-"""`report.html` of any run: the page that its question has, or what it shows of its
-result as a page.
+"""`report.html` of any run: the page of its experiment, or its result laid out as a page.
 
-The object of an attack may be turned there: `object.js` draws the run's binary glTF.
+The object of an attack can be rotated there: `object.js` draws the run's binary glTF.
 """
 
 from __future__ import annotations
@@ -35,227 +34,227 @@ from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import write_text
 from advsearch.viewer import document
 
-LARGEST_FIGURE = 2_000_000  # bytes of a figure or a picture that the page takes along
-LARGEST_PNG = 50_000_000  # bytes of a picture that is read to be made smaller
+# maximum bytes of an image that is embedded
+LARGEST_FIGURE = 2_000_000
+# maximum bytes of a PNG that is read to be scaled down
+LARGEST_PNG = 50_000_000
 LARGE_PICTURE = 1_000_000
-"""Bytes above which a PNG is put into the page at a smaller size; the file itself stays
-as it is.
-"""
-SMALLER_SIDE = 640  # longest side in pixels of such a smaller picture
-# media types of pictures
+"""Bytes above which a PNG is scaled down in the page; its file stays as it is."""
+# longest side of a PNG that is scaled down, pixels
+SMALLER_SIDE = 640
+# media types of images
 KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 
 
 def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
-    """Return the file of a picture in the folder of a run; None where it is missing,
-    elsewhere or too large.
+    """Return an image file of a run, None if it is missing, outside of it or too large.
+
+    Names come from a summary, which may name any file.
     """
     file = run / name
-    inside = is_inside(file, run) and file.is_file()  # a summary may name any
-    return file if inside and file.stat().st_size <= largest else None
+    if not is_inside(file, run) or not file.is_file():
+        return None
+    return file if file.stat().st_size <= largest else None
 
 
 def part_html(run: Path, one: ResultPart, said: str) -> Html:
-    """A part of a result, which says `said`; a folded one has its title as the
-    handle.
+    """Return a part of a result as HTML; a folded one opens at its title.
+
+    `said` describes the chart of a part without text of its own.
     """
-    chart = None
-    if one.draw is not None:
-        words = " ".join([f"{one.title}.", *(one.text or [said])])
-        chart = element(
-            "div",
-            *(
-                views.study_chart(one.draw, words, width, one.height)
-                for width in (views.WIDE, views.NARROW)
-            ),
-        )
-    table = None
-    if one.heads:
-        table = document.study_table(
-            one.heads,
-            one.rows,
-            document.part_links(run, one.parts),
-            one.shares,
-            one.bars,
-        )
-    inside = join_html(
-        *(element("p", text) for text in one.text if text and one.draw is None),
-        chart or _figure(run, one.figure, " ".join(one.text) or one.title),
-        (table or document.facts_table({row[0]: row[1] for row in one.rows}))
-        if one.rows
-        else None,
-        *(_pictures(run, group, one.layout) for group in one.pictures),
-        element("p", one.note, class_="soft") if one.note else None,
-    )
+    content = _part_content(run, one, said)
+    title = element("h2", one.title) if one.title else None
     if one.live:
-        title = element("h2", one.title) if one.title else None
         return element(
             "div",
             title,
             element("div", id=one.live),
-            inside,
+            content,
             hidden="hidden",
             class_="screen",
         )
     if one.folded:
-        return element("details", element("summary", one.title), inside)
-    return join_html(element("h2", one.title) if one.title else None, inside)
+        return element("details", element("summary", one.title), content)
+    return join_html(title, content)
 
 
-def _pictures(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
+def _part_content(run: Path, part: ResultPart, description: str) -> Html:
+    """Return text, chart or figure, table, images and note of a part."""
+    content = list[Html | None]()
+    if part.draw is not None:
+        alt = " ".join([f"{part.title}.", *(part.text or [description])])
+        charts = [
+            views.study_chart(part.draw, alt, width, part.height)
+            for width in (views.WIDE, views.NARROW)
+        ]
+        content.append(element("div", *charts))
+    else:
+        content += [element("p", text) for text in part.text if text]
+        alt = " ".join(part.text) or part.title
+        content.append(_embed_figure(run, part.figure, alt))
+    if part.rows and part.heads:
+        links = document.part_links(run, part.parts)
+        content.append(
+            document.study_table(part.heads, part.rows, links, part.shares, part.bars)
+        )
+    elif part.rows:
+        content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
+    for group in part.pictures:
+        content.append(_embed_images(run, group, part.layout))
+    if part.note:
+        content.append(element("p", part.note, class_="soft"))
+    return join_html(*content)
+
+
+def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
+    """Return images side by side with captions, None if no file can be embedded."""
     figures = []
-    for one in group:
-        png = one.file.lower().endswith(".png")
-        if (
-            file := kept(run, one.file, LARGEST_PNG if png else LARGEST_FIGURE)
-        ) is None:
+    for picture in group:
+        is_png = picture.file.lower().endswith(".png")
+        file = kept(run, picture.file, LARGEST_PNG if is_png else LARGEST_FIGURE)
+        if file is None:
             continue
         data = file.read_bytes()
-        kind = KINDS[file.suffix.lower()]
-        data = (
-            smaller_png(data, SMALLER_SIDE)
-            if png and len(data) > LARGE_PICTURE
-            else data
+        if is_png and len(data) > LARGE_PICTURE:
+            data = smaller_png(data, SMALLER_SIDE)
+        image = element(
+            "img",
+            src=document.data_url(data, KINDS[file.suffix.lower()]),
+            alt=": ".join(filter(None, (picture.name, picture.caption))),
+            data_picture=file.stem,
         )
-        alt = ": ".join(filter(None, (one.name, one.caption)))
-        picture = element(
-            "img", src=document.data_url(data, kind), alt=alt, data_picture=file.stem
-        )
-        name = [element("strong", one.name), ": "] if one.name else []
-        figures.append(
-            element("figure", picture, element("figcaption", *name, one.caption))
-        )
-    layout = layout or ("pair" if len(figures) < 3 else "")
-    return (
-        element("div", *figures, class_=f"pictures {layout}".strip())
-        if figures
-        else None
-    )
+        name = [element("strong", picture.name), ": "] if picture.name else []
+        caption = element("figcaption", *name, picture.caption)
+        figures.append(element("figure", image, caption))
+    if not figures:
+        return None
+    if not layout and len(figures) < 3:
+        layout = "pair"
+    return element("div", *figures, class_=f"pictures {layout}".strip())
 
 
-def _figure(run: Path, name: str, alt: str) -> Html | None:
+def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
+    """Return a wide figure, None without a file that can be embedded."""
     file = kept(run, name) if name else None
     if file is None:
         return None
-    picture = element(
+    image = element(
         "img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt
     )
-    return element("figure", document.scrolled(picture, "wide"), class_="wide")
+    return element("figure", document.scrolled(image, "wide"), class_="wide")
 
 
 def end_html(run: Path, result: Result, given: ShownResult) -> Html:
-    """Return what stands at the end of a page: how the result came about, the commands
-    that go on with what was stopped and that ask the same again, and all settings.
+    """Return the end of a page: cost and conditions, commands, and all settings.
+
+    The commands resume a run that was stopped, and repeat it.
     """
     facts = {
         name[:1].upper() + name[1:]: text
         for name, text in views.facts_of(result, given).items()
     }
-    recipe = run / CONFIG
-    parts = [element("h2", "Cost and conditions"), document.facts_table(facts)]
+    content = [element("h2", "Cost and conditions"), document.facts_table(facts)]
     if result.goes_on:
         resume = shlex.join(["advsearch", "resume", str(run)])
-        parts += [element("h2", "Go on"), element("pre", resume, class_="wrap")]
-    again = ""
-    if python_only := getattr(result, "python_only", []):
-        again = f"No command repeats this: {python_only_text(python_only)}"
-    elif recipe.is_file():
-        again = shlex.join(["advsearch", "run", str(recipe)])
-    parts += (
-        [element("h2", "Do it again"), element("pre", again, class_="wrap")]
-        if again
-        else []
-    )
-    settings = (
-        recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
-    )
-    if settings:
-        whole = element("pre", settings, class_="wrap")
-        parts.append(element("details", element("summary", "All settings"), whole))
-    return join_html(*parts)
+        content += [element("h2", "Go on"), element("pre", resume, class_="wrap")]
+    config_file = run / CONFIG
+    python_only = getattr(result, "python_only", [])
+    repeat = ""
+    if python_only:
+        repeat = f"No command repeats this: {python_only_text(python_only)}"
+    elif config_file.is_file():
+        repeat = shlex.join(["advsearch", "run", str(config_file)])
+    if repeat:
+        content += [element("h2", "Do it again"), element("pre", repeat, class_="wrap")]
+    if config_file.is_file():
+        settings = config_file.read_text(encoding="utf-8", errors="replace")
+        if settings:
+            settings_html = element("pre", settings, class_="wrap")
+            summary = element("summary", "All settings")
+            content.append(element("details", summary, settings_html))
+    return join_html(*content)
 
 
 AnyResult = TypeVar("AnyResult", bound=Result)
-LARGEST = 2_700_000  # bytes of an object that a page takes along
-_WORDS = (
+# maximum bytes of an object that is embedded
+LARGEST = 2_700_000
+_HINT = (
     "Drag it, or choose it and press the arrow keys. It is lit evenly here, not "
     "by the scene's light."
 )
 
 
 def read_object(run: Path) -> bytes:
-    """Return the object that a run has to turn; nothing where it has none, or one that
-    is damaged or too large.
-    """
+    """Read a run's object as binary glTF; empty if there is none that can be embedded."""
     try:
         data = read_bytes(run / OBJECT_FILE, "an object to turn", LARGEST)
     except (OSError, FileFormatError):
         return b""
-    return data if _header(data) else b""
+    return data if _read_header(data) else b""
 
 
 def object_part(data: bytes) -> ResultPart:
-    """Return where the script puts the object; empty where there is none."""
+    """Return the part in which a script draws the object; empty without an object."""
     if not data:
         return ResultPart()
-    extras = _header(data).get("asset", {}).get("extras", {})
+    extras = _read_header(data).get("asset", {}).get("extras", {})
     note = str(extras.get("note", "")) if isinstance(extras, dict) else ""
     return ResultPart(
         "The object, to turn",
-        note=" ".join(filter(None, (_WORDS, note))),
+        note=" ".join(filter(None, (_HINT, note))),
         live="object",
     )
 
 
 def object_data(data: bytes) -> list[Html]:
-    return (
-        [document.data_script(base64.b64encode(data).decode("ascii"), "object-file")]
-        if data
-        else []
-    )
+    """Return the object as data of a page, empty without an object."""
+    if not data:
+        return []
+    text = base64.b64encode(data).decode("ascii")
+    return [document.data_script(text, "object-file")]
 
 
-def _header(data: bytes) -> dict[str, dict[str, object]]:
-    """The header of a binary glTF file; empty where it is damaged."""
+def _read_header(data: bytes) -> dict[str, dict[str, object]]:
+    """Read the JSON header of a binary glTF file; empty if the file is corrupt."""
     try:
         magic, _, _, length, kind = struct.unpack_from("<4sII I4s", data)
-        head = (
-            json.loads(data[20 : 20 + length])
-            if (magic, kind) == (b"glTF", b"JSON")
-            else None
-        )
+        if (magic, kind) != (b"glTF", b"JSON"):
+            return {}
+        header = json.loads(data[20 : 20 + length])
     except (struct.error, ValueError, RecursionError):
         return {}
-    return (
-        head if isinstance(head, dict) and isinstance(head.get("asset"), dict) else {}
-    )
+    if not isinstance(header, dict) or not isinstance(header.get("asset"), dict):
+        return {}
+    return header
 
 
 def write_page(run: Path, result: Result | None = None) -> Path:
-    """Write `report.html` of a result, by default the one that is there, into the
-    folder of a run and return its path. Raises FileFormatError where results of the run
-    are damaged, StorageError where the page cannot be written.
+    """Write `report.html` of a result, by default of the run's, and return its path.
+
+    Raises:
+        FileFormatError: if results of the run are corrupt.
+        StorageError: if the page cannot be written.
     """
-    return write_text(
-        run / REPORT, page_of(run, result or read_result(run)), durable=False
-    )
+    page = page_of(run, result or read_result(run))
+    return write_text(run / REPORT, page, durable=False)
 
 
 def page_of(run: Path, result: Result) -> str:
-    """Return the page of a run, which needs no other file but those of its parts.
-    Raises FileFormatError where other results of the run are damaged.
+    """Return the page of a run, which needs no other files but those of its parts.
+
+    Raises:
+        FileFormatError: if other results of the run are corrupt.
     """
     make_page = registry.get_experiment(result.command).page
-    made: str | None = make_page(run, result) if make_page else None
-    return made or shown_page(run, result, views.shown(result))
+    page: str | None = make_page(run, result) if make_page else None
+    return page or shown_page(run, result, views.shown(result))
 
 
 def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
-    """Write the page and the summary of a result into the open directory of its run,
-    and return it.
+    """Write the page and the summary of a result into the directory of its run.
 
-    The summary is the last file: a run whose disk was full before is not done, and goes
-    on.
+    The summary is the last file: a run whose disk was full before counts as unfinished,
+    and can be resumed.
     """
     write_page(run.path, result)
     run.write_summary(result)
@@ -270,46 +269,49 @@ def shown_page(
     data: Sequence[Html] = (),
     scripts: Sequence[str] = (),
 ) -> str:
-    """Return what is shown of a result as the page of the run in the folder `run`; data
-    and scripts fill the parts that are `live`.
+    """Return the view of a result as the page of its run.
+
+    Args:
+        run: directory of the run.
+        result: its result.
+        given: the view of the result.
+        data: scripts that hold data.
+        scripts: files that fill the parts that are `live`.
     """
-    inside = list[Html | None]()
-    # its question names none
+    content = list[Html | None]()
+    # an experiment that names no figures shows all of its images
     if not any(part.draw or part.figure or part.pictures for part in given.sections):
         for file in sorted((run / IMAGES).glob("*.png")):
             name = file.stem.replace("-", " ").replace("_", " ").capitalize()
-            inside.append(
-                _figure(run, f"{IMAGES}/{file.name}", f"{name}: {given.said}")
-            )
-    inside += [
-        part_html(run, part, given.said)
-        for part in given.sections
-        if part.only in ("", "page") and not part.empty
-    ]
-    parts = list(getattr(result, "parts", ()))
-    if parts and all(isinstance(part, str) for part in parts):
-        linked = zip(parts, document.part_links(run, parts), strict=True)
-        lines = [
-            element("li", element("a", name, href=link) if link else name)
-            for name, link in linked
-        ]
-        inside.append(
-            element(
-                "details",
-                element("summary", f"The runs ({len(parts)})"),
-                element("ul", *lines),
-            )
-        )
-    main = element("main", *inside, end_html(run, result, given))
+            alt = f"{name}: {given.said}"
+            content.append(_embed_figure(run, f"{IMAGES}/{file.name}", alt))
+    for part in given.sections:
+        if part.only in ("", "page") and not part.empty:
+            content.append(part_html(run, part, given.said))
+    content.append(_list_parts(run, list(getattr(result, "parts", ()))))
     subject = views.subject_of(result, given)
-    what = join_html(
+    eyebrow = join_html(
         result.command,
         "; " if subject else None,
-        document.subject_html(*(("", one) for one in subject)),
+        document.subject_html(*(("", name) for name in subject)),
     )
-    header = document.heading(what, given.said, views.remarks_of(result, given))
-    footer = f"run {run.name}. This page needs no other file."
-    title = f"{run.name}, {result.command}"
     return document.document(
-        title, header, main, data=data, scripts=scripts, footer=footer
+        f"{run.name}, {result.command}",
+        document.heading(eyebrow, given.said, views.remarks_of(result, given)),
+        element("main", *content, end_html(run, result, given)),
+        data=data,
+        scripts=scripts,
+        footer=f"run {run.name}. This page needs no other file.",
     )
+
+
+def _list_parts(run: Path, parts: list[object]) -> Html | None:
+    """Return a folded list of the runs of a run, linked to their pages if they exist."""
+    names = [part for part in parts if isinstance(part, str)]
+    if not parts or len(names) < len(parts):
+        return None
+    items = []
+    for name, link in zip(names, document.part_links(run, names), strict=True):
+        items.append(element("li", element("a", name, href=link) if link else name))
+    summary = element("summary", f"The runs ({len(names)})")
+    return element("details", summary, element("ul", *items))

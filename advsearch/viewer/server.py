@@ -1,16 +1,15 @@
-"""`advsearch dashboard`: the pages of runs from a small server, on this machine unless
-asked otherwise.
+"""`advsearch dashboard`: a small server of the pages of runs, by default for this machine.
 
-It answers GET and HEAD of the list, of a run's page, rows and pictures, POST of a
-photograph, and nothing else. No part of an address becomes a path but a name in
+It responds to GET and HEAD of the list, of a run's page, rows and images, to POST of a
+photograph, and to nothing else. No part of an address becomes a path except a name in
 `runs/`. A request whose `Host` is not this server's is refused (DNS rebinding); so is
-one that another origin's page sends. Beyond this machine every request needs the token,
-and goes over HTTPS, with a certificate that `openssl` makes and that is good for as
-long as the server runs.
+one that another origin's page sends. Other machines need the token in every request,
+and HTTPS, with a certificate that `openssl` makes and that is valid for as long as the
+server runs.
 
-What lies in a run's folder is taken for somebody else's: it is served with a policy
-that gives it an origin of its own and lets no script run but those of this package. A
-photograph needs the key that only the run's own page for it has.
+The files of a run count as untrusted: they are served with a policy that gives them an
+origin of their own and lets no script run but those of this package. A photograph needs
+the key that only the run's page for photographs has.
 """
 
 from __future__ import annotations
@@ -57,175 +56,174 @@ from advsearch.viewer.document import (
 )
 from advsearch.viewer.thumbnails import cover, kept_pictures, read_thumbnail, thumbnail
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Pages that only the dashboard has: the list of its runs, and a run that goes on or was
-# stopped.
-#
-# Of such a run: how far it is, its search as a curve and step by step.
+# ---- Pages of the dashboard alone: the list of runs, and a run in progress or stopped
 
 
 def list_page(runs: Mapping[str, Path]) -> str:
-    """Return the page that lists runs, by the name under which each is shown; the
-    newest first.
-    """
+    """Return the page that lists runs (directories by name), the newest first."""
     listed = [
         (name, listing.listed_run(path, counts=False)) for name, path in runs.items()
     ]
-    listed.sort(key=lambda named: named[1].when or 0.0, reverse=True)
-    several = sum(run.command == "sweep" for _, run in listed) > 1
-    heads = [
-        *(["side by side"] if several else []),
-        "picture",
-        "run",
-        "what came out",
-        "begun",
-    ]
-    lines = list[Html]()
-    for name, run in listed:
-        place = f"runs/{in_address(name)}/"
-        sweep = run.command == "sweep"
-        box = (
-            element(
+    listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
+    # a single sweep has nothing to be compared with
+    can_compare = sum(run.command == "sweep" for _, run in listed) > 1
+    heads = ["picture", "run", "what came out", "begun"]
+    if can_compare:
+        heads.insert(0, "side by side")
+    rows = [_run_row(name, run, can_compare) for name, run in listed]
+    head = element("tr", *(element("th", text, scope="col") for text in heads))
+    table = element(
+        "table", element("thead", head), element("tbody", *rows), class_="runs"
+    )
+    button = element(
+        "p", element("button", "Show the chosen sweeps side by side", type="submit")
+    )
+    content = element(
+        "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
+    )
+    if listed:
+        content = element(
+            "form",
+            scrolled(table),
+            button if can_compare else None,
+            action="compare/",
+        )
+    title = element("header", element("h1", "Runs"))
+    return document("Runs", title, element("main", content), connects=True)
+
+
+def _run_row(name: str, run: listing.Listed, can_compare: bool) -> Html:
+    """Return the row of a run in the list."""
+    address = f"runs/{in_address(name)}/"
+    cells = []
+    if can_compare:
+        checkbox = None
+        if run.command == "sweep":
+            checkbox = element(
                 "input",
                 type="checkbox",
                 name="run",
                 value=name,
                 aria_label=f"compare {name}",
             )
-            if sweep
-            else None
+        cells.append(element("td", checkbox))
+    cover_image = element(
+        "img", src=f"{address}cover", alt="", loading="lazy", width="72", height="72"
+    )
+    cover_link = element(
+        "a",
+        None if run.fault else cover_image,
+        href=address,
+        tabindex="-1",
+        aria_hidden="true",
+    )
+    cells.append(element("td", cover_link))
+    cells.append(
+        element(
+            "th",
+            element("a", name, href=address),
+            _run_subject(name, run, address),
+            scope="row",
         )
-        picture = element(
-            "img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72"
-        )
-        linked = element(
-            "a",
-            None if run.fault else picture,
-            href=place,
-            tabindex="-1",
-            aria_hidden="true",
-        )
-        about = ", ".join(
-            filter(
-                None,
-                (
-                    run.command,
-                    wording.short_names(run.object),
-                    " and ".join(run.controls),
-                ),
-            )
-        )
-        aligning = element(
+    )
+    outcome = join_html(run.state, f": {run.answer}" if run.answer else None)
+    fault = element("div", run.fault, class_="remarks") if run.fault else None
+    cells.append(element("td", outcome, fault))
+    start = ""
+    if run.when is not None:
+        start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
+    cells.append(element("td", start, class_="number"))
+    return element("tr", *cells)
+
+
+def _run_subject(name: str, run: listing.Listed, address: str) -> Html:
+    """Return what a run is about, with a link to its page for photographs."""
+    facts = (run.command, wording.short_names(run.object), " and ".join(run.controls))
+    photographs = None
+    if run.command in ("attack", "sweep"):
+        link = element(
             "a",
             "photographs",
-            href=f"{place}align/",
+            href=f"{address}align/",
             aria_label=f"photographs of {name}",
         )
-        beside = (
-            join_html(" ", aligning) if run.command in ("attack", "sweep") else None
-        )
-        came_out = join_html(run.state, f": {run.answer}" if run.answer else None)
-        fault = element("div", run.fault, class_="remarks") if run.fault else None
-        begun = (
-            ""
-            if run.when is None
-            else time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
-        )
-        cells = [element("td", box)] if several else []
-        cells += [
-            element("td", linked),
-            element(
-                "th",
-                element("a", name, href=place),
-                element("div", about, beside, class_="soft"),
-                scope="row",
-            ),
-            element("td", came_out, fault),
-            element("td", begun, class_="number"),
-        ]
-        lines.append(element("tr", *cells))
-    head = element("tr", *(element("th", text, scope="col") for text in heads))
-    made = element(
-        "table", element("thead", head), element("tbody", *lines), class_="runs"
-    )
-    button = element(
-        "p", element("button", "Show the chosen sweeps side by side", type="submit")
-    )
-    form = element(
-        "form", scrolled(made), button if several else None, action="compare/"
-    )
-    none = element(
-        "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
-    )
-    title = element("header", element("h1", "Runs"))
-    return document(
-        "Runs", title, element("main", form if listed else none), connects=True
-    )
+        photographs = join_html(" ", link)
+    subject = ", ".join(filter(None, facts))
+    return element("div", subject, photographs, class_="soft")
 
 
-MOST_ROWS = 2000  # evaluations that are sent at once; the page asks for the rest
-START = 0  # where a page begins: the last row that it has
+# maximum evaluations in one response; the page requests the rest
+MOST_ROWS = 2000
+# the last row that a new page has
+START = 0
 
 
 def is_under_way(run: Path) -> bool:
-    """Whether a run has no page that says what came out: none at all, or one of an
-    attack that is being resumed.
+    """Return whether a run has no page of its result.
+
+    It has none at all, or one of an attack that is being resumed.
     """
     return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
 
 
 def following_page(name: str, run: Path) -> str:
-    """Return the page that follows a run, by its name in the dashboard. Without its
-    script it says how far it is.
+    """Return the page that follows a run's progress, by its name in the dashboard.
+
+    Without its script it shows the progress at the time of the request.
     """
-    one = listing.listed_run(run)
-    what = ", ".join(
-        filter(None, (one.command, one.object, " and ".join(one.controls)))
-    )
-    state = (
-        "A process is working on it."
-        if one.state == "running"
-        else f"It was stopped: advsearch resume {name} goes on."
-    )
-    kept = (
-        ", ".join(f"{count} of {kind}" for kind, count in one.kinds.items()) or "none"
-    )
-    parts = []
-    # attacks of a study
-    for path in (path for path in sorted((run / PARTS).glob("*")) if path.is_dir()):
-        page = element("a", path.name, href=f"{PARTS}/{in_address(path.name)}/{REPORT}")
-        parts.append(element("li", page if (path / REPORT).is_file() else path.name))
+    listed = listing.listed_run(run)
+    facts = (listed.command, listed.object, " and ".join(listed.controls))
+    state = f"It was stopped: advsearch resume {name} goes on."
+    if listed.state == "running":
+        state = "A process is working on it."
+    counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
+    attacks = []
+    for path in sorted((run / PARTS).glob("*")):  # attacks of a study
+        if path.is_dir():
+            address = f"{PARTS}/{in_address(path.name)}/{REPORT}"
+            link = element("a", path.name, href=address)
+            has_page = (path / REPORT).is_file()
+            attacks.append(element("li", link if has_page else path.name))
     header = element(
         "header",
-        element("p", what, class_="eyebrow"),
+        element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
         element("h1", f"{name} has not ended"),
     )
+    attack_list = None
+    if attacks:
+        attack_list = element(
+            "div", element("h2", "Its attacks"), element("ul", *attacks)
+        )
+    state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = element(
         "main",
-        element("p", f"{state} Evaluations so far: {kept}.", id="state"),
+        element("p", state_text, id="state"),
         element("div", id="follow"),
-        element("div", element("h2", "Its attacks"), element("ul", *parts))
-        if parts
-        else None,
+        attack_list,
     )
-    data = [data_script({"progress": "progress", "start": START}, "run")]
-    scripts = ["make.js", "follow.js"]
     return document(
         name,
         header,
         main,
-        data=data,
-        scripts=scripts,
+        data=[data_script({"progress": "progress", "start": START}, "run")],
+        scripts=["make.js", "follow.js"],
         connects=True,
         footer=f"run {name}",
     )
 
 
 def progress_json(run: Path, after: int) -> bytes:
-    """Return what is new in a run as JSON, after what `next` was in the answer before,
-    or `START`. Raises FileFormatError where what it keeps is damaged.
+    """Return what is new in a run as JSON.
+
+    Args:
+        run: directory of the run.
+        after: `next` of the previous response, or `START`.
+
+    Raises:
+        FileFormatError: if the stored results are corrupt.
     """
-    running = is_held(run)  # before what it has: what comes later is asked for
+    # before the rows are read: later ones are requested next time
+    running = is_held(run)
     ended = not is_under_way(run)
     last = after
     rows = list[dict[str, object]]()
@@ -233,57 +231,63 @@ def progress_json(run: Path, after: int) -> bytes:
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
             for row in islice(results.rows(after=after), MOST_ROWS):
-                values = {
-                    name: [value["value"], value["unit"]]
-                    for name, value in row.values.items()
-                }
-                told = {
-                    name: getattr(row, name)
-                    for name in ("kind", "step", "objective", "success", "label")
-                }
-                rows.append({**told, "values": values})
+                rows.append(_row_json(row))
                 last = row.id or after
             for number, picture in results.pictures("search", after, last):
-                small = data_url(
-                    thumbnail(picture.astype("float32") / 255.0), "image/jpeg"
-                )
-                pictures.append({"step": number, "picture": small})
-    news = {
+                jpeg = thumbnail(picture.astype("float32") / 255.0)
+                url = data_url(jpeg, "image/jpeg")
+                pictures.append({"step": number, "picture": url})
+    progress = {
         "rows": rows,
         "pictures": pictures,
         "next": last,
         "running": running,
         "ended": ended,
     }
-    return json.dumps(plain(news), allow_nan=False).encode()
+    return json.dumps(plain(progress), allow_nan=False).encode()
+
+
+def _row_json(row: store.Row) -> dict[str, object]:
+    """Return the fields of a stored row that the page of a run in progress needs."""
+    values = {
+        name: [value["value"], value["unit"]] for name, value in row.values.items()
+    }
+    fields = {
+        name: getattr(row, name)
+        for name in ("kind", "step", "objective", "success", "label")
+    }
+    return {**fields, "values": values}
 
 
 FIRST_PART = 4_000
 PART = 50_000
-"""Rows of a sweep that goes on that are sent at once; reading more takes longer than
-somebody waits for the first.
-"""
-LARGEST = 1 << 30  # most bytes of a sweep's columns, and of a page that lies in a run
+"""Rows of a sweep in one response: of the first, which people wait for, and of others."""
+# maximum bytes of a sweep's columns, and of a run's page
+LARGEST = 1 << 30
 LARGEST_PAGE = 1 << 28
-SENDING = 60.0  # seconds in which a photograph has to have come
+# seconds in which a photograph has to arrive
+SENDING = 60.0
 FAULT = "this page could not be made, which is a fault of advsearch"
-BACKLOG = 4096  # connections that may wait in the operating system
-NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")  # a thousand pictures have a folder
+# connections that may wait in the operating system
+BACKLOG = 4096
+# directory and file of a thumbnail
+NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")
 
 
 class PhotographServer(Protocol):
-    """What answers for the page of a run on which photographs are aligned with its
-    renderings.
-    """
+    """What responds for the page on which photographs are aligned with a run's renderings."""
 
     def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
-        """Return the page as HTML; `elsewhere` is its address for another device, if
-        one can open it.
+        """Return the page as HTML.
+
+        `elsewhere` is its address for another device, if one can open it.
         """
 
     def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
-        """Return the type and the data of a "rendering" or of a "photo" of a run.
-        Raises Refused: there is none.
+        """Return media type and data of a "rendering" or a "photo" of a run.
+
+        Raises:
+            Refused: if there is none.
         """
 
     def take(
@@ -294,19 +298,28 @@ class PhotographServer(Protocol):
         key: str,
         read_data: Callable[[], bytes],
     ) -> tuple[str, bytes]:
-        """Take a photograph in, and return the type and the data of the answer. Raises
-        Refused: it is none, or it doesn't come from the page, which alone has the key.
+        """Store a photograph, and return media type and data of the response.
+
+        Raises:
+            Refused: if it is no photograph, or the request lacks the page's key.
         """
 
 
 class Dashboard(HTTPServer):
-    """The server, of folders of runs, or of those in ``runs/``, looked up anew for each
-    request; `serve_forever` answers until `shutdown`. A `port` of 0 takes a free one;
-    beyond this machine it always speaks HTTPS; without what takes `photographs` in,
-    these are refused. Every request has to bring the `token`; None on this machine
-    only. The `fingerprint` is SHA-256 of the certificate; None without HTTPS. Raises
-    InputError where the address can't be listened at, or there is nothing to make a
-    certificate.
+    """The server of runs, by default of those in ``runs/``, looked up at each request.
+
+    `serve_forever` responds until `shutdown`. `token` is what every request needs, None
+    on this machine. `fingerprint` is SHA-256 of the certificate, None without HTTPS.
+
+    Args:
+        runs: directories of runs; without, those in ``runs/``.
+        host: address to listen at; one beyond this machine always has HTTPS.
+        port: port to listen at, 0 for a free one.
+        https: whether to use HTTPS on this machine too.
+        photographs: what handles photographs; without it they are refused.
+
+    Raises:
+        InputError: if it cannot listen at the address, or not make a certificate.
     """
 
     request_queue_size = BACKLOG
@@ -321,14 +334,14 @@ class Dashboard(HTTPServer):
         https: bool = False,
         photographs: PhotographServer | None = None,
     ) -> None:
-        self._given: dict[str, Path] = {}
+        self._explicit_runs: dict[str, Path] = {}
         for path in runs:
             name = path.resolve().name
             number = 2
-            while name in self._given:
+            while name in self._explicit_runs:
                 name = f"{path.resolve().name} ({number})"
                 number = number + 1
-            self._given[name] = path
+            self._explicit_runs[name] = path
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)
         self.photographs = photographs
@@ -360,30 +373,32 @@ class Dashboard(HTTPServer):
         return self.address_of("/")
 
     def address_of(self, path: str) -> str:
-        """What to open in a browser, here or elsewhere, to see a page."""
+        """Return the URL of a page for a browser on this or another machine."""
         host = reachable(self.named)
-        host = f"[{host}]" if ":" in host else host
-        return f"{self.scheme}://{host}:{self.server_port}{path}" + (
-            f"?token={self.token}" if self.token else ""
-        )
+        if ":" in host:  # IPv6
+            host = f"[{host}]"
+        url = f"{self.scheme}://{host}:{self.server_port}{path}"
+        return f"{url}?token={self.token}" if self.token else url
 
     def runs(self) -> Mapping[str, Path]:
-        found = (
+        """Return the directories of the runs by name."""
+        if self._explicit_runs:
+            return self._explicit_runs
+        paths = (
             path for path in sorted(HOME.glob("*")) if path.is_dir() and is_run(path)
         )
-        return self._given or {path.name: path for path in found}
+        return {path.name: path for path in paths}
 
     def run(self, name: str) -> Path:
-        """Return the folder of one of them. Raises Refused where there is none,
-        FileFormatError where it has links.
+        """Return the directory of a run.
+
+        Raises:
+            Refused: if there is no such run.
+            FileFormatError: if it has links.
         """
-        path = self._given.get(name)
-        if (
-            not self._given
-            and name not in ("", ".", "..")
-            and not set("/\0") & set(name)
-            and is_run(HOME / name)
-        ):
+        path = self._explicit_runs.get(name)
+        is_name = name not in ("", ".", "..") and not set("/\0") & set(name)
+        if not self._explicit_runs and is_name and is_run(HOME / name):
             path = HOME / name
         if path is None:
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
@@ -392,7 +407,11 @@ class Dashboard(HTTPServer):
 
     @property
     def photograph_pages(self) -> PhotographServer:
-        """What answers about photographs. Raises Refused: this server takes none."""
+        """What handles photographs.
+
+        Raises:
+            Refused: if this server takes none.
+        """
         if self.photographs is None:
             raise Refused(
                 HTTPStatus.NOT_FOUND,
@@ -401,18 +420,20 @@ class Dashboard(HTTPServer):
         return self.photographs
 
     def key(self, name: str) -> str:
-        """What a photograph of a run has to bring: its page has it, and no other."""
+        """Return the key that a photograph of a run needs, and only its page has."""
         return hmac.new(self._secret, os.fsencode(name), "sha256").hexdigest()
 
     def list_page(self) -> str:
-        with self._listing:  # one reads, the others find what it has read
+        """Return the page that lists the runs."""
+        with self._listing:  # one thread reads, the others find what it has cached
             return list_page(self.runs())
 
     def serve_forever(self, poll_interval: float = TICK) -> None:
+        """Respond to requests until `shutdown`."""
         self.clients.serve()
 
     def shutdown(self) -> None:
-        """Let `serve_forever` and its workers end."""
+        """Stop `serve_forever` and its workers."""
         self.clients.close()
 
     def server_close(self) -> None:
@@ -425,8 +446,9 @@ OTHERS = served_policy(own=False)
 
 
 class Served(NamedTuple):
-    """What is answered: its media type and bytes, and under which policy. Whatever
-    comes out of a run's folder may be somebody else's, so that policy is the usual one.
+    """A response: media type, data and policy.
+
+    By default the policy is that of untrusted content, such as files of a run.
     """
 
     kind: str
@@ -435,53 +457,47 @@ class Served(NamedTuple):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    """Responds to a request in a worker's thread."""
+
     server: Dashboard
     protocol_version = "HTTP/1.0"
     server_version = "advsearch"
     sys_version = ""
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
     def do_GET(self) -> None:
+        """Respond to a request; any error becomes a response."""
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
         self.server.clients.wait_for(None)
         try:
-            self._check()
-            served, headers = self._served()
-        except Exception as error:  # one page must not take others along
-            status = HTTPStatus.INTERNAL_SERVER_ERROR
-            text = f"{FAULT}: {type(error).__name__}"
-            if isinstance(error, Refused):
-                status = error.status
-                text = str(error)
-            elif isinstance(error, AdvsearchError):
-                text = str(error)
-            elif isinstance(error, OSError):
-                status = HTTPStatus.NOT_FOUND
-                text = "it is not there any more"
-            served = Served(
-                "text/plain; charset=utf-8", f"{text}\n".encode("utf-8", "replace")
-            )
+            self._check_request()
+            response, headers = self._respond()
+        except Exception as error:  # an error of one page must not end the server
+            status, text = _describe_error(error)
+            data = f"{text}\n".encode("utf-8", "replace")
+            response = Served("text/plain; charset=utf-8", data)
         self.send_response(status)
         for name, value in {
-            "Content-Type": served.kind,
-            "Content-Length": str(len(served.data)),
-            "Content-Security-Policy": served.policy,
+            "Content-Type": response.kind,
+            "Content-Length": str(len(response.data)),
+            "Content-Security-Policy": response.policy,
             "Cache-Control": "no-store",
             **CLOSED,
             **headers,
         }.items():
             self.send_header(name, value)
-        self.server.clients.wait_for(PATIENCE + len(served.data) / SLOWEST)
+        self.server.clients.wait_for(PATIENCE + len(response.data) / SLOWEST)
         self.end_headers()
         if self.command != "HEAD":
-            self.wfile.write(served.data)
+            self.wfile.write(response.data)
 
     do_HEAD = do_POST = do_GET
 
-    def _check(self) -> None:
+    def _check_request(self) -> None:
+        """Refuse a request without the token, or from another origin."""
         server = self.server
         check_request(
             self.command,
@@ -493,7 +509,8 @@ class _Handler(BaseHTTPRequestHandler):
             server.token,
         )
 
-    def _served(self) -> tuple[Served, dict[str, str]]:
+    def _respond(self) -> tuple[Served, dict[str, str]]:
+        """Return the response to a request, and headers to send with it."""
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
@@ -508,132 +525,129 @@ class _Handler(BaseHTTPRequestHandler):
             unquote(part, errors="surrogateescape")
             for part in address.path.split("/")[1:]
         ]
-        return self._answer(query, parts), headers
-
-    def _answer(self, query: Query, parts: list[str]) -> Served:
-        """Return what is at an address, by its parts; nothing but a photograph is sent
-        to any.
-        """
-        server = self.server
         if self.command == "POST":
-            match parts:
-                case ["runs", name, "align", "renderings", file]:
-                    run = server.run(name)
-                    key = server.key(name)
-                    return Served(
-                        *server.photograph_pages.take(
-                            run, file, self.headers, key, self._body
-                        )
-                    )
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+            return self._take_photograph(parts), headers
+        return self._route(query, parts), headers
+
+    def _take_photograph(self, parts: list[str]) -> Served:
+        """Respond to a POST request; only photographs are accepted."""
+        match parts:
+            case ["runs", name, "align", "renderings", file]:
+                run = self.server.run(name)
+                kind, data = self.server.photograph_pages.take(
+                    run, file, self.headers, self.server.key(name), self._read_body
+                )
+                return Served(kind, data)
+        raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _route(self, query: Query, parts: list[str]) -> Served:
+        """Respond to a GET request by the parts of its path."""
+        server = self.server
         match parts:
             case [""]:
-                return _own(server.list_page())
+                return _serve_page(server.list_page())
             case ["compare", ""]:
-                return self._compare(query)
+                return self._serve_comparison(query)
             case ["runs", name, ""]:
-                run = server.run(name)
-                if listing.listed_run(run, counts=False).command == "sweep":
-                    return _own(
-                        sweep_page_html(
-                            [(run, result_of(run))], [_source(name, run, "")]
-                        ),
-                        "../../",
-                    )
-                return (
-                    _own(following_page(name, run), "../../")
-                    if is_under_way(run)
-                    else _kept(run, "../../")
-                )
+                return self._serve_run(name)
             case ["runs", name, "cover"]:
                 return Served("image/jpeg", cover(server.run(name)))
             case ["runs", name, "rows"]:
-                return self._rows(query, server.run(name))
+                return self._serve_rows(query, server.run(name))
             case ["runs", name, "progress"]:
-                return Served(
-                    "application/json", progress_json(server.run(name), _after(query))
-                )
-            # of a study, whose page links to it
+                progress = progress_json(server.run(name), _parse_after(query))
+                return Served("application/json", progress)
+            # a part of a study, whose page links to it
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
-                attack = next(
-                    (
-                        path
-                        for path in (server.run(name) / PARTS).iterdir()
-                        if path.name == part
-                    ),
-                    None,
-                )
-                if attack is None or not (attack / REPORT).is_file():
-                    raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
-                return _kept(attack, "../../../../", ("../../", name))
+                return self._serve_part(name, part)
             case ["runs", name, "pictures", folder, file] if NUMBERED.fullmatch(
                 f"{folder}/{file}"
             ):
-                return Served(
-                    "image/jpeg",
-                    read_thumbnail(server.run(name), int(file.removesuffix(".jpg"))),
-                )
+                number = int(file.removesuffix(".jpg"))
+                return Served("image/jpeg", read_thumbnail(server.run(name), number))
             case ["runs", name, "align", ""]:
-                run = server.run(name)
-                key = server.key(name)
-                elsewhere = (
-                    server.address_of(f"/runs/{in_address(name)}/align/")
-                    if server.token
-                    else None
+                return self._serve_photograph_page(name)
+            case ["runs", name, "align", ("renderings" | "photos") as kinds, file]:
+                kind, data = server.photograph_pages.read_picture(
+                    kinds.removesuffix("s"), server.run(name), file
                 )
-                page = server.photograph_pages.make_page(run, name, key, elsewhere)
-                return _own(page, "../../../", ("../", name))
-            case ["runs", name, "align", ("renderings" | "photos") as kind, file]:
-                return Served(
-                    *server.photograph_pages.read_picture(
-                        kind.removesuffix("s"), server.run(name), file
-                    )
-                )
+                return Served(kind, data)
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def _compare(self, query: Query) -> Served:
-        runs = [
-            (name, self.server.run(name))
-            for name in dict.fromkeys(query.get("run", []))
-        ]
+    def _serve_run(self, name: str) -> Served:
+        """Return the page of a run: of a sweep, a run in progress, or a finished one."""
+        run = self.server.run(name)
+        if listing.listed_run(run, counts=False).command == "sweep":
+            page = sweep_page_html(
+                [(run, result_of(run))], [_make_source(name, run, "")]
+            )
+            return _serve_page(page, "../../")
+        if is_under_way(run):
+            return _serve_page(following_page(name, run), "../../")
+        return _serve_stored_page(run, "../../")
+
+    def _serve_part(self, name: str, part: str) -> Served:
+        """Return the stored page of a part of a run, such as an attack of a study."""
+        for path in (self.server.run(name) / PARTS).iterdir():
+            if path.name == part:
+                if (path / REPORT).is_file():
+                    return _serve_stored_page(path, "../../../../", ("../../", name))
+                break
+        raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
+
+    def _serve_photograph_page(self, name: str) -> Served:
+        """Return the page on which photographs are aligned with a run's renderings."""
+        run = self.server.run(name)
+        elsewhere = None
+        if self.server.token:
+            elsewhere = self.server.address_of(f"/runs/{in_address(name)}/align/")
+        page = self.server.photograph_pages.make_page(
+            run, name, self.server.key(name), elsewhere
+        )
+        return _serve_page(page, "../../../", ("../", name))
+
+    def _serve_comparison(self, query: Query) -> Served:
+        """Return a page of several sweeps side by side."""
+        names = dict.fromkeys(query.get("run", []))
+        runs = [(name, self.server.run(name)) for name in names]
         if not runs:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        other = [
+        others = [
             name
             for name, run in runs
             if listing.listed_run(run, counts=False).command != "sweep"
         ]
-        if other:
+        if others:
             raise Refused(
                 HTTPStatus.BAD_REQUEST,
-                f"only sweeps can be shown side by side; {', '.join(other)} is none",
+                f"only sweeps can be shown side by side; {', '.join(others)} is none",
             )
         sources = [
-            _source(name, run, f"../runs/{in_address(name)}/") for name, run in runs
+            _make_source(name, run, f"../runs/{in_address(name)}/")
+            for name, run in runs
         ]
-        return _own(
-            sweep_page_html([(run, result_of(run)) for _, run in runs], sources), "../"
-        )
+        page = sweep_page_html([(run, result_of(run)) for _, run in runs], sources)
+        return _serve_page(page, "../")
 
-    def _rows(self, query: Query, run: Path) -> Served:
-        after = _after(query)
+    def _serve_rows(self, query: Query, run: Path) -> Served:
+        """Return rows of a sweep as columns; those of a finished one may be stored."""
+        media_type = "application/octet-stream"
+        after = _parse_after(query)
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
-            return Served(
-                "application/octet-stream",
-                read_bytes(run / COLUMNS, "columns of a sweep", LARGEST),
-            )
-        part = PART if after else FIRST_PART
-        # before the rows are read: what comes later is asked for again
+            stored = read_bytes(run / COLUMNS, "columns of a sweep", LARGEST)
+            return Served(media_type, stored)
+        max_rows = PART if after else FIRST_PART
+        # before the rows are read: later ones are requested next time
         running = is_held(run)
-        columns = read_columns(run, after, part)
-        return Served(
-            "application/octet-stream",
-            packed(columns, more=len(columns) == part, running=running),
-        )
+        rows = read_columns(run, after, max_rows)
+        has_more = len(rows) == max_rows
+        return Served(media_type, packed(rows, more=has_more, running=running))
 
-    def _body(self) -> bytes:
-        """What was sent along; nothing is read of what says that it is larger than
-        `clients.LARGEST_SENT`.
+    def _read_body(self) -> bytes:
+        """Read the body of a request.
+
+        Raises:
+            Refused: if its length is missing, wrong or more than `clients.LARGEST_SENT`.
         """
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):
@@ -651,16 +665,30 @@ class _Handler(BaseHTTPRequestHandler):
         return data
 
 
-def _after(query: Query) -> int:
+def _parse_after(query: Query) -> int:
+    """Return the id of the row after which rows are requested."""
     after = query.get("after", [str(START)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
     return int(after)
 
 
-def _source(name: str, run: Path, base: str) -> SweepSource:
-    """Where a page gets a sweep's rows and pictures; `base` leads from the page to the
-    run's own address.
+def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
+    """Return the status and the text of the response to an error."""
+    if isinstance(error, Refused):
+        return error.status, str(error)
+    if isinstance(error, AdvsearchError):
+        return HTTPStatus.INTERNAL_SERVER_ERROR, str(error)
+    if isinstance(error, OSError):
+        return HTTPStatus.NOT_FOUND, "it is not there any more"
+    text = f"{FAULT}: {type(error).__name__}"
+    return HTTPStatus.INTERNAL_SERVER_ERROR, text
+
+
+def _make_source(name: str, run: Path, base: str) -> SweepSource:
+    """Return where a page requests a sweep's rows and images.
+
+    `base` is the address of the run relative to the page.
     """
     return SweepSource(
         name,
@@ -674,44 +702,48 @@ def _source(name: str, run: Path, base: str) -> SweepSource:
 HTML = "text/html; charset=utf-8"
 
 
-def _own(
+def _serve_page(
     page: str, home: str | None = None, above: tuple[str, str] | None = None
 ) -> Served:
-    """Return a page that the server has made, with the way back; arguments as for
-    `_with_way`.
-    """
+    """Return a page that the server has made; for arguments see `_add_navigation`."""
     data = page.encode("utf-8", "replace")  # names of files may be no text
-    return Served(
-        HTML, _with_way(data, home, above) if home else data, served_policy(own=True)
-    )
+    if home:
+        data = _add_navigation(data, home, above)
+    return Served(HTML, data, served_policy(own=True))
 
 
-def _kept(run: Path, home: str, above: tuple[str, str] | None = None) -> Served:
-    """Return the page that lies in the folder of a run, with the way back; arguments as
-    for `_with_way`.
-    """
+def _serve_stored_page(
+    run: Path, home: str, above: tuple[str, str] | None = None
+) -> Served:
+    """Return the stored page of a run; for arguments see `_add_navigation`."""
     page = read_bytes(run / REPORT, "a page", LARGEST_PAGE)
-    said = (
-        "Its scripts are of another advsearch and do not run here; advsearch view "
-        f"{run.name} makes the page anew."
-    )
-    return Served(
-        HTML, _with_way(page, home, above, said if has_other_scripts(page) else None)
-    )
+    remark = None
+    if has_other_scripts(page):
+        remark = (
+            "Its scripts are of another advsearch and do not run here; advsearch view "
+            f"{run.name} makes the page anew."
+        )
+    return Served(HTML, _add_navigation(page, home, above, remark))
 
 
-def _with_way(
-    page: bytes, home: str, above: tuple[str, str] | None, said: str | None = None
+def _add_navigation(
+    page: bytes, home: str, above: tuple[str, str] | None, remark: str | None = None
 ) -> bytes:
-    """Return a page with the way back: to the list, and to what it is a part of (an
-    address and its name).
+    """Insert links into a page: to the list of runs, and to the run it is a part of.
+
+    Args:
+        page: the page as HTML.
+        home: address of the list of runs.
+        above: address and name of the run that the page is a part of.
+        remark: a sentence below the links.
     """
-    links = [("All runs", home), *([(above[1], above[0])] if above else [])]
-    way = element(
-        "nav",
-        *(element("a", text, href=address) for text, address in links),
-        aria_label="back",
+    links = [("All runs", home)]
+    if above:
+        links.append((above[1], above[0]))
+    anchors = (element("a", text, href=address) for text, address in links)
+    navigation = join_html(
+        element("nav", *anchors, aria_label="back"),
+        element("p", remark, class_="remarks") if remark else None,
     )
-    way = join_html(way, element("p", said, class_="remarks") if said else None)
-    at = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
-    return page[:at] + way.encode("utf-8", "replace") + page[at:]
+    start = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
+    return page[:start] + navigation.encode("utf-8", "replace") + page[start:]

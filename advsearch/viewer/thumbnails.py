@@ -1,6 +1,4 @@
-"""Small pictures of a sweep's configurations: ``images/rows/0001/1234.jpg``, a thousand
-to a folder.
-"""
+"""Thumbnails of a sweep's images: ``images/rows/0001/1234.jpg``, 1000 a directory."""
 
 from __future__ import annotations
 
@@ -28,38 +26,45 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-A_FOLDER = 1000  # pictures in each folder
-SIDE = 128  # longest side of a thumbnail, pixels
-QUALITY = 85  # of the JPEG files, from 1 to 95
-LARGEST_COVER = 50_000_000  # pixels of a picture that a list shows small
-LARGEST = 1 << 24  # most bytes of the file of a thumbnail
-# what a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects
+# images in each directory
+A_FOLDER = 1000
+# longest side of a thumbnail, pixels
+SIDE = 128
+# of JPEG files, from 1 to 95
+QUALITY = 85
+# maximum pixels of an image that is scaled down for the list of runs
+LARGEST_COVER = 50_000_000
+# maximum bytes of the file of a thumbnail
+LARGEST = 1 << 24
+# about the bytes of a thumbnail, measured on images of the bundled objects
 BYTES = 5000
 
 
 def thumbnail(picture: object) -> bytes:
-    """Return a display-referred picture (H, W, 3) in [0, 1] as a JPEG of at most `SIDE`
-    pixels a side.
-    """
+    """Encode a display-referred image (H, W, 3) in [0, 1] as a JPEG of at most `SIDE` pixels."""
     values: Bytes = to_8bit(picture)
-    return _jpeg(Image.fromarray(values))
+    return _encode_jpeg(Image.fromarray(values))
 
 
 def cover(run: Path) -> bytes:
-    """Return a small picture of a run as a JPEG: its worst prediction, or else its
-    first figure; grey where it has none.
+    """Return a small image of a run as a JPEG; gray if it has none.
+
+    That is its worst prediction, or else its first figure.
     """
-    first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
-    for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
+    preferred = ("adversarial", "clean", "worst")
+    files = [run / IMAGES / f"{name}.png" for name in preferred]
+    files += sorted((run / IMAGES).glob("*.png"))
+    for file in files:
         if not file.is_file():
             continue
         with suppress(*BAD_PICTURE), Image.open(file, formats=("PNG",)) as image:
             if image.width * image.height <= LARGEST_COVER:
-                return _jpeg(image.convert("RGB"))
-    return _jpeg(Image.new("RGB", (1, 1), (128, 128, 128)))
+                return _encode_jpeg(image.convert("RGB"))
+    return _encode_jpeg(Image.new("RGB", (1, 1), (128, 128, 128)))
 
 
-def _jpeg(image: Image.Image) -> bytes:
+def _encode_jpeg(image: Image.Image) -> bytes:
+    """Scale an image down to a thumbnail, and encode it as a JPEG."""
     buffer = io.BytesIO()
     image.thumbnail((SIDE, SIDE))
     image.save(buffer, "JPEG", quality=QUALITY)
@@ -67,24 +72,27 @@ def _jpeg(image: Image.Image) -> bytes:
 
 
 def path_of(run: Path, number: int) -> Path:
+    """Return where the thumbnail of an image is stored."""
     return run / SMALL_PICTURES / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
 
 
 def kept_file(run: Path, number: int) -> Path | None:
-    """Return the file of the thumbnail of a picture; None where there is none. A link
-    is none (`check_links` leaves these to this function).
+    """Return the file of a thumbnail, None if there is none.
+
+    A link counts as none (`check_links` leaves these to this function).
     """
     file = path_of(run, number)
-    return (
-        file
-        if file.is_file() and not (file.is_symlink() or file.parent.is_symlink())
-        else None
-    )
+    if not file.is_file() or file.is_symlink() or file.parent.is_symlink():
+        return None
+    return file
 
 
 def read_thumbnail(run: Path, number: int) -> bytes:
-    """Return the thumbnail of a picture. Raises FileNotFoundError where there is none,
-    or a link in its place, and FileFormatError where it is too large.
+    """Return the thumbnail of an image as a JPEG.
+
+    Raises:
+        FileNotFoundError: if there is none, or a link instead.
+        FileFormatError: if it is too large.
     """
     file = kept_file(run, number)
     if file is None:
@@ -93,16 +101,22 @@ def read_thumbnail(run: Path, number: int) -> bytes:
 
 
 def keep(run: Path, number: int, data: bytes) -> None:
-    """Keep the thumbnail of a picture. Raises StorageError where it cannot be
-    written.
+    """Store the thumbnail of an image.
+
+    Raises:
+        StorageError: if it cannot be written.
     """
     write_bytes(path_of(run, number), data, durable=False)
 
 
 @dataclass(frozen=True)
 class Kept:
-    """The thumbnails that a run has, each of `models` configurations in a row; only of
-    some of the pictures, if it says so.
+    """The thumbnails of a run.
+
+    Attributes:
+        run: directory of the run.
+        models: number of consecutive configurations that share an image.
+        some: whether only a subset of the images has thumbnails.
     """
 
     run: Path
@@ -111,14 +125,17 @@ class Kept:
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
-        """Of the pictures, sorted. Listing the files of a million takes seconds, so
-        only who needs them asks.
+        """The numbers of the images that have thumbnails, sorted.
+
+        Listing a million files takes seconds; it is done at first use.
         """
-        return tuple(sorted(_numbers(self.run)))
+        return tuple(sorted(_list_numbers(self.run)))
 
     def png_of(self, step: int) -> bytes | None:
-        """Return the picture of a configuration as a PNG; None where it was not
-        kept.
+        """Return the image of a configuration as a PNG, None if it was not stored.
+
+        Raises:
+            FileFormatError: if the file is no JPEG.
         """
         try:
             data = read_thumbnail(self.run, step // self.models)
@@ -136,53 +153,49 @@ class Kept:
         return stream.getvalue()
 
     def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
-        """Yield number and data address of thumbnails, of the worst margins first, up
-        to `most` bytes.
+        """Yield number and data URL of thumbnails, those of the worst margins first.
+
+        The URLs take at most `most` bytes in all.
         """
         steps = rows["step"].to_numpy()
         margins = rows["margin"].to_numpy()
         order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
-        there = set(self.numbers)
-        spent = 0
+        remaining = set(self.numbers)
+        n_bytes = 0
         for step in steps[order]:
             number = int(step) // self.models
-            if number not in there:
+            if number not in remaining:
                 continue
-            there.discard(number)
+            remaining.discard(number)
             data = read_thumbnail(self.run, number)
-            spent += len(data) * 4 // 3
-            if spent > most:
+            n_bytes += len(data) * 4 // 3
+            if n_bytes > most:
                 return
-            yield (
-                str(number),
-                "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii"),
-            )
+            text = base64.b64encode(data).decode("ascii")
+            yield str(number), f"data:image/jpeg;base64,{text}"
 
 
 def kept_pictures(run: Path) -> Kept | None:
-    """Return which thumbnails a sweep has; None where it has none."""
-    if next(_numbers(run), None) is None:
+    """Return the thumbnails of a sweep, None if it has none."""
+    if next(_list_numbers(run), None) is None:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
     models = len(split_names(str(settings.get("model", "one"))))
     return Kept(run, models, settings.get("keep_pictures") != "all")
 
 
-def _numbers(run: Path) -> Iterator[int]:
-    """Yield the numbers of the pictures that are there; links are none."""
-    top = run / SMALL_PICTURES
-    if not top.is_dir():
+def _list_numbers(run: Path) -> Iterator[int]:
+    """Yield the numbers of the images that have thumbnails; links are ignored."""
+    root = run / SMALL_PICTURES
+    if not root.is_dir():
         return
-    with os.scandir(top) as folders:
-        for folder in folders:
-            if not folder.is_dir(follow_symlinks=False):
+    with os.scandir(root) as directories:
+        for directory in directories:
+            if not directory.is_dir(follow_symlinks=False):
                 continue
-            with os.scandir(folder) as files:
+            with os.scandir(directory) as files:
                 for file in files:
                     stem, _, suffix = file.name.rpartition(".")
-                    if (
-                        suffix == "jpg"
-                        and stem.isdecimal()
-                        and file.is_file(follow_symlinks=False)
-                    ):
+                    is_image = suffix == "jpg" and stem.isdecimal()
+                    if is_image and file.is_file(follow_symlinks=False):
                         yield int(stem)

@@ -1,6 +1,7 @@
-"""Takes pictures and gradients in every way that is compared, beside references, in
-interleaved rounds inside a time budget: every setting once, then every setting again,
-so that a machine that slows down does so for all of them.
+"""Measures pictures and gradients of several settings against references, in rounds.
+
+Within a time budget every setting is measured once, then every setting again, so that a
+machine that slows down does so for all of them.
 """
 
 from __future__ import annotations
@@ -26,103 +27,110 @@ from advsearch.questions.precision.rule import (
     estimate_reference,
 )
 
-# calls of a setting that have to fit into the budget for it to be begun; the first ones
-# take longer
+# calls of a setting that have to fit into the budget before it is started
 LEAST = 5
+# first calls of a setting, which take longer
 COLD = 2
-CLAIM = 0.25  # share of the time left that one setting may lay claim to
-MOST_PARTS = 64  # independent parts of a reference, at most
+# fraction of the remaining time that one setting may need
+CLAIM = 0.25
+# maximum number of independent parts of a reference
+MOST_PARTS = 64
 Part = TypeVar("Part")
 
 
 class TimeBudget:
-    """Seconds from now on that may be spent, by a clock."""
+    """A number of seconds from now on, by a clock."""
 
     def __init__(
         self, seconds: float, clock: Callable[[], float] = time.perf_counter
     ) -> None:
-        self.clock, self._end = clock, clock() + seconds
+        self.clock = clock
+        self._end = clock() + seconds
 
     @property
     def left(self) -> float:
+        """The remaining seconds, at least 0."""
         return max(0.0, self._end - self.clock())
 
     def share(self, part: float) -> TimeBudget:
+        """Return a budget of a fraction of the remaining seconds."""
         return TimeBudget(part * self.left, self.clock)
 
 
 @dataclass
 class MeasuredRounds:
-    """What came out for each setting, the seconds of each call by the clock, and what
-    did not fit at all.
-    """
+    """Measurements by setting, the seconds of each call, and settings that did not fit."""
 
     results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
     walls: dict[SampleSetting, list[float]] = field(default_factory=dict)
     left_out: list[SampleSetting] = field(default_factory=list)
 
     def estimate_call_seconds(self, setting: SampleSetting) -> float:
-        """Seconds of a call but the first ones: as the setting's own, else in
-        proportion to its line's dearest setting, else at the highest rate of any line;
-        0 where nothing is known.
+        """Estimate the seconds of a call other than the first ones.
+
+        The estimate is the setting's own; else in proportion to the most expensive
+        setting of its line; else at the highest rate of any line; 0 without any.
         """
         if setting in self.walls:
-            return statistics.median(
-                (self.walls[setting][COLD:] or self.walls[setting][-1:])[-3:]
-            )
-        dearest = {
-            known.line: known
-            for known in sorted(self.walls, key=lambda each: each.cost)
-        }
+            walls = self.walls[setting]
+            warm = walls[COLD:] or walls[-1:]
+            return statistics.median(warm[-3:])
+        by_cost = sorted(self.walls, key=lambda each: each.cost)
+        most_expensive = {known.line: known for known in by_cost}
         rates = {
             line: self.estimate_call_seconds(known) / known.cost
-            for line, known in dearest.items()
+            for line, known in most_expensive.items()
         }
         return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
 
     def estimate_needed_seconds(self, setting: SampleSetting, left: float) -> float:
-        """Seconds that a new setting needs for its calls, with what those begun still
-        need for as many. One of these that needs more than a share `CLAIM` of what is
-        left turned out too dear, and waits until the end.
+        """Estimate the seconds for `LEAST` calls of a new setting and of earlier ones.
+
+        An earlier setting that needs more than a fraction `CLAIM` of the remaining time
+        turned out too expensive, and waits until the end.
         """
-        cold = [
-            sum(taken[:COLD]) - COLD * self.estimate_call_seconds(at)
-            for at, taken in self.walls.items()
-            if len(taken) > COLD
-        ]
-        owed = [
-            max(0, LEAST - len(taken)) * self.estimate_call_seconds(at)
-            for at, taken in self.walls.items()
-        ]
-        first = max(0.0, statistics.median(cold)) if cold else 0.0
-        return (
-            first
-            + LEAST * self.estimate_call_seconds(setting)
-            + sum(need for need in owed if need <= CLAIM * left)
-        )
+        cold_seconds = list[float]()
+        earlier_seconds = 0.0
+        for known, walls in self.walls.items():
+            call_seconds = self.estimate_call_seconds(known)
+            if len(walls) > COLD:
+                cold_seconds.append(sum(walls[:COLD]) - COLD * call_seconds)
+            needed = max(0, LEAST - len(walls)) * call_seconds
+            if needed <= CLAIM * left:
+                earlier_seconds += needed
+        first = max(0.0, statistics.median(cold_seconds)) if cold_seconds else 0.0
+        new_seconds = LEAST * self.estimate_call_seconds(setting)
+        return first + new_seconds + earlier_seconds
 
 
 def measure_in_rounds(
-    settings: Iterable[SampleSetting], measure: Callable[[SampleSetting, int], Any], budget: TimeBudget, *,
-    rounds: int, seed: int, on_done: Callable[[SampleSetting], None] = lambda setting: None,
-) -> MeasuredRounds:  # fmt: skip
-    """Measure settings, cheapest first, in rounds until these are done or the budget is
-    used up; the first is always measured.
+    settings: Iterable[SampleSetting],
+    measure: Callable[[SampleSetting, int], Any],
+    budget: TimeBudget,
+    *,
+    rounds: int,
+    seed: int,
+    on_done: Callable[[SampleSetting], None] = lambda setting: None,
+) -> MeasuredRounds:
+    """Measure settings in rounds, cheapest first, until the budget is used up.
 
-    In the first round a setting is begun only if `LEAST` calls of it, and those that
-    the settings before it still need for as many, fit into what is left. The first call
-    compiles and records kernels, so that every setting has two at once: without the
-    second, nothing would be known of its time. A call that should not fit is not begun:
-    a budget is kept to within a setting's first calls. Each call has a seed of its own.
+    In the first round a setting is started only if `LEAST` calls of it, and those that
+    the settings before it still need for as many, fit into the remaining time; the
+    first is always measured. The first call compiles and records kernels, so that every
+    setting has two at once: without the second, nothing would be known of its time. A
+    call that should not fit is not started: a budget is kept to within a setting's
+    first calls. Each call has a seed of its own.
     """
     measured = MeasuredRounds()
 
     def call(setting: SampleSetting) -> None:
-        taken = measured.results.setdefault(setting, [])
-        begun = budget.clock()
+        measurements = measured.results.setdefault(setting, [])
+        start = budget.clock()
         stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
-        taken.append(measure(setting, seeds.stream(seed, stream, len(taken))))
-        measured.walls.setdefault(setting, []).append(budget.clock() - begun)
+        measurements.append(
+            measure(setting, seeds.stream(seed, stream, len(measurements)))
+        )
+        measured.walls.setdefault(setting, []).append(budget.clock() - start)
         on_done(setting)
 
     for setting in sorted(settings, key=lambda each: each.cost):
@@ -147,16 +155,17 @@ def take_reference_parts(
     on_done: Callable[[], None],
     seed: int,
 ) -> list[Part]:
-    """Return independent parts of a reference, each from a seed of its own, as many as
-    fit into a budget; at least two, whatever they take: without these, nothing is known
-    about the error.
+    """Return as many independent parts of a reference as fit into a budget.
+
+    Each has its own seed. There are at least two, whatever they take: without these,
+    nothing is known about the error.
     """
     parts: list[Part] = []
     slowest = 0.0
     while len(parts) < 2 or (len(parts) < MOST_PARTS and slowest < budget.left):
-        begun = budget.clock()
+        start = budget.clock()
         parts.append(part(seeds.stream(seed, "reference", len(parts))))
-        slowest = max(budget.clock() - begun, 0.5 * slowest)
+        slowest = max(budget.clock() - start, 0.5 * slowest)
         on_done()
     return parts
 
@@ -168,53 +177,57 @@ def choose_part_samples(
     parts: int = 4,
     counts: Sequence[int] = (16, 64, 256, 1024),
 ) -> int:
-    """Return the largest of some rising sample counts of which `parts` calls fit into
-    some seconds; the least if none does. Three calls tell how long one takes, and the
-    first ones compile.
+    """Return the largest sample count of which several calls fit into some seconds.
+
+    The last of three calls tells how long one takes, since the first ones compile.
+
+    Args:
+        call: takes a part with a number of samples.
+        seconds: time of all parts.
+        parts: number of parts.
+        counts: sample counts, ascending; the first is returned if none fits.
     """
     for _ in range(3):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         call(counts[0])
-    rate = (time.perf_counter() - begun) / counts[0]
-    return max(
-        (count for count in counts if parts * count * rate <= seconds),
-        default=counts[0],
-    )
+    seconds_per_sample = (time.perf_counter() - start) / counts[0]
+    fitting = [
+        count for count in counts if parts * count * seconds_per_sample <= seconds
+    ]
+    return max(fitting, default=counts[0])
 
 
 def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
-    processor = time.process_time()
-    wall = time.perf_counter()
-    taken = take()
-    return taken, {
-        "seconds": time.process_time() - processor,
-        "wall_seconds": time.perf_counter() - wall,
+    """Call a function; return its result, and seconds of processor and wall clock time."""
+    process_start = time.process_time()
+    wall_start = time.perf_counter()
+    result = take()
+    return result, {
+        "seconds": time.process_time() - process_start,
+        "wall_seconds": time.perf_counter() - wall_start,
     }
 
 
 # ---- pictures
-# -------------------------------------------------------------------------------------------------------
 
 REFERENCE_SAMPLER = "multijitter"
-"""Unbiased as all of them, and a reference of a given error is reached in less than
-half of the time.
-"""
+"""Sampler of references: unbiased as all, and twice as fast to an error as others."""
 OIDN = " + oidn"
 COUNTS = {"independent": (4, 8, 16, 32, 64, 128, 256), "orthogonal": (4, 25, 121, 289)}
-"""Sample counts of a line, which its sampler takes as they are; (4, 16, 64, 256) of the
-others. All but the independent sampler compile a kernel for each count.
+"""Sample counts by sampler, which accepts them exactly; others have (4, 16, 64, 256).
+
+All but the independent sampler compile a kernel for each count.
 """
 FIRST = ("independent", "multijitter", "independent" + OIDN)
 LATER = 6.0
-"""Lines that are measured first where time is short; the others count as so many times
-as dear.
-"""
+"""Lines that are measured first if time is short, and the extra cost of others."""
 
 
 class PictureBench:
-    """Renders one configuration (d,) with every sampler, with some of them denoised
-    too, and compares the pictures and the model's margin on them with references.
-    Pictures with and without denoiser have the same, margins their own.
+    """Measures the error of pictures of one configuration (d,), and of the model's margin.
+
+    Every sampler is measured, some with a denoiser too. Pictures with and without
+    denoiser have the same reference, margins their own.
     """
 
     def __init__(
@@ -228,14 +241,10 @@ class PictureBench:
         self._margin = margin
         self._space = renderer.space
         self._formation = renderer.formation
-        self._lines = [
-            *samplers,
-            *(
-                name + OIDN
-                for name in ("independent", REFERENCE_SAMPLER)
-                if name in samplers
-            ),
-        ]
+        self._lines = list(samplers)
+        for name in ("independent", REFERENCE_SAMPLER):
+            if name in samplers:
+                self._lines.append(name + OIDN)
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
             name: renderer.scene.like(sampler=name)
@@ -247,59 +256,61 @@ class PictureBench:
             )
             for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
-        self.settings = [
-            SampleSetting(
-                "picture",
-                line,
-                count,
-                count * (1.0 if line in FIRST else LATER),
-                family=get_denoiser(line),
-            )
-            for line in self._lines
-            for count in COUNTS.get(line, (4, 16, 64, 256))
-        ]
+        self.settings = list[SampleSetting]()
+        for line in self._lines:
+            cost_factor = 1.0 if line in FIRST else LATER
+            for count in COUNTS.get(line, (4, 16, 64, 256)):
+                self.settings.append(
+                    SampleSetting(
+                        "picture",
+                        line,
+                        count,
+                        count * cost_factor,
+                        family=get_denoiser(line),
+                    )
+                )
 
     def refer(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
-        """Render the references, one for each family, in shares of a budget."""
-
-        def shown(mean: Array) -> Tensor:
-            size = (*self._formation.resolution, 3)
-            return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
-
+        """Render the references, one for each denoiser, within a budget."""
         families = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
-        for number, family in enumerate(families):
-            share = budget.share(1.0 / (len(families) - number))
+        for index, family in enumerate(families):
+            share = budget.share(1.0 / (len(families) - index))
             name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
             take = partial(self._radiance, name)
             spp = choose_part_samples(partial(take, 0), share.left)
-            parts = [
-                flatten(radiance)
-                for radiance in take_reference_parts(
-                    partial(take, spp=spp), share, on_done, seed
-                )
-            ]
-            picture = estimate_reference(parts, lambda mean: flatten(shown(mean)))
+            radiances = take_reference_parts(
+                partial(take, spp=spp), share, on_done, seed
+            )
+            parts = [flatten(radiance) for radiance in radiances]
+            picture = estimate_reference(
+                parts, lambda mean: flatten(self._display_mean(mean))
+            )
             margin = estimate_reference(
-                parts, lambda mean: np.array([self._margin(shown(mean))])
+                parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
             )
             self._references["margin", family] = margin
-            self._references["picture", family] = self._references.get(
-                ("picture", "none"), picture
-            )
-            rows += [_row("picture", name, picture, spp)] if family == "none" else []
-            rows.append(_row("margin", name, margin, spp))
+            # that without denoiser, which comes first, is the reference of all pictures
+            undenoised = self._references.get(("picture", "none"), picture)
+            self._references["picture", family] = undenoised
+            if family == "none":
+                rows.append(_make_row("picture", name, picture, spp))
+            rows.append(_make_row("margin", name, margin, spp))
         return rows
 
+    def _display_mean(self, mean: Array) -> Tensor:
+        """Return the picture of a mean radiance (n,)."""
+        size = (*self._formation.resolution, 3)
+        return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
+
     def floor(self, setting: SampleSetting, quantity: str) -> float:
+        """Return the error of the reference of a quantity."""
         return self._references[quantity, setting.family].error
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
-        """Make one picture; return how it and the margin compare, and the times of
-        rendering and denoising.
-        """
+        """Render a picture; return its errors, those of the margin, and the times."""
         radiance, times = measure_time(
             partial(self._radiance, setting.estimator, seed, setting.spp)
         )
@@ -308,11 +319,11 @@ class PictureBench:
             "picture": flatten(picture),
             "margin": np.array([self._margin(picture)]),
         }
-        beside = {
-            name: self._references[name, setting.family].compare(value)
-            for name, value in values.items()
-        }
-        return {name: {**numbers, **times} for name, numbers in beside.items()}
+        numbers = dict[str, Numbers]()
+        for name, value in values.items():
+            reference = self._references[name, setting.family]
+            numbers[name] = {**reference.compare(value), **times}
+        return numbers
 
     def _radiance(self, line: str, seed: int, spp: int) -> Tensor:
         with torch.no_grad():
@@ -324,22 +335,21 @@ class PictureBench:
 
 
 def get_denoiser(line: str) -> str:
+    """Return the denoiser of a line."""
     return "oidn" if line.endswith(OIDN) else "none"
 
 
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
-"""An adjoint takes about as long as so many renders, the kernels that the material form
-compiles included.
-"""
-# sets of at most so many coordinates have a reference by differences, coordinate by
-# coordinate
+"""Cost of adjoint gradients in renders, with the kernels that `material` compiles."""
+# maximum number of coordinates for a reference by differences
 BY_COORDINATE = 32
 
 
 @dataclass(frozen=True)
 class GradientPart:
-    """Coordinates of one control whose gradient one call gives; named with parameters
-    where a control has several.
+    """Coordinates of a control whose gradient one call computes.
+
+    It is named with parameters if a control has several parts.
     """
 
     name: str
@@ -355,22 +365,23 @@ class GradientPart:
         return {group.name for group in self.groups}
 
     def of(self, gradient: Tensor) -> Array:
+        """Return the part (n,) of a gradient (d,)."""
         return flatten(
             torch.cat([gradient[group.coordinates] for group in self.groups])
         )
 
     def count_renders(self, estimator: str) -> int:
-        """Return the primal renders that one gradient by an estimator takes, beside the
-        image itself.
-        """
+        """Return the primal renders of a gradient by an estimator, without the image itself."""
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 
 def list_gradient_parts(
     groups: Sequence[gradients.Group], *, linear: bool
 ) -> list[GradientPart]:
-    """Return the parts of a space with the estimators that are valid for them. Of a
-    linear loss, differences of the loss are those of the picture, and left out.
+    """Return the parts of a space with the estimators that are valid for them.
+
+    For a linear loss, differences of the loss equal those of the picture, and are left
+    out.
     """
     sets = gradients.planning.comparable_sets(group for group in groups if group.valid)
     controls = [members[0].control for members, _ in sets]
@@ -392,9 +403,10 @@ def list_gradient_parts(
 
 
 class GradientBench:
-    """Takes gradients (d,) of one part of a space at u by every estimator and compares
-    them with a reference, which is taken with a better sampler: differences at two
-    steps where the coordinates are few, else the mean of an adjoint.
+    """Measures the error of the gradient (n,) of one part of a space at u, by every estimator.
+
+    The reference has a better sampler: differences at two steps for few coordinates,
+    else the mean of an adjoint.
     """
 
     def __init__(
@@ -426,36 +438,27 @@ class GradientBench:
     def refer(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
-        """Take the reference within a budget."""
+        """Compute the reference within a budget."""
         if self._by_differences:
             take = partial(self._take_derivatives, self._list_probes())
             spp = choose_part_samples(
                 partial(take, 0), budget.left, parts=3, counts=(16, 64, 256)
             )
             parts = take_reference_parts(partial(take, spp=spp), budget, on_done, seed)
-            bias = (
-                float(
-                    np.linalg.norm(
-                        np.mean([disagreement for _, disagreement in parts], axis=0)
-                    )
-                )
-                / 4.0
-            )
-            self.reference = estimate_reference(
-                [derivatives for derivatives, _ in parts], bias=bias
-            )
+            disagreements = [disagreement for _, disagreement in parts]
+            bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
+            derivatives = [derivative for derivative, _ in parts]
+            self.reference = estimate_reference(derivatives, bias=bias)
         else:
             take_gradient = partial(
                 self._take_gradient, self._exact, self._reference_estimator
             )
             spp = choose_part_samples(partial(take_gradient, 0), budget.left)
-            self.reference = estimate_reference(
-                take_reference_parts(
-                    partial(take_gradient, spp=spp), budget, on_done, seed
-                )
-            )
+            take_part = partial(take_gradient, spp=spp)
+            gradient_parts = take_reference_parts(take_part, budget, on_done, seed)
+            self.reference = estimate_reference(gradient_parts)
         return [
-            _row(
+            _make_row(
                 "gradient",
                 self._reference_estimator,
                 self.reference,
@@ -483,8 +486,10 @@ class GradientBench:
     def _take_derivatives(
         self, probes: Sequence[gradients.Probe], noise: int, spp: int
     ) -> Array:
-        """Return, (2, n), the derivative along each probe, extrapolated to a step of
-        zero, and how far two steps differ.
+        """Return derivatives and step errors, (2, n), along each probe.
+
+        A derivative is extrapolated to a step of zero; its step error is the difference
+        between two steps.
         """
         bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
         references = [
@@ -499,12 +504,11 @@ class GradientBench:
         return table
 
     def floor(self, setting: SampleSetting, quantity: str) -> float:
+        """Return the error of the reference."""
         return self.reference.error if self.reference else 0.0
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
-        """Take one gradient; return how it compares, and its times, the picture itself
-        included.
-        """
+        """Compute a gradient; return its errors, and times including the picture itself."""
         assert self.reference is not None
         gradient, times = measure_time(
             partial(
@@ -518,8 +522,9 @@ class GradientBench:
         return {"gradient": {**self.reference.compare(gradient), **times}}
 
     def bias(self, seed: int) -> str | None:
-        """Check a reference by an adjoint against differences along one direction; a
-        sentence if it is biased.
+        """Check the reference by an adjoint against differences along one direction.
+
+        Return a sentence if it is biased, else None.
         """
         if self._reference_estimator == "differences" or self.reference is None:
             return None
@@ -556,14 +561,21 @@ class GradientBench:
         )
 
 
-def _row(
+def _make_row(
     quantity: str, name: str, value: ReferenceValue, spp: int, control: str = ""
 ) -> PrecisionReference:
+    """Make the row of a reference in the result."""
     return PrecisionReference(
-        quantity=quantity, control=control, reference=name, error=value.error, parts=value.parts, spp=spp * value.parts
-    )  # fmt: skip
+        quantity=quantity,
+        control=control,
+        reference=name,
+        error=value.error,
+        parts=value.parts,
+        spp=spp * value.parts,
+    )
 
 
 def flatten(values: Tensor) -> Array:
+    """Return values as a flat float64 array."""
     numbers: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
     return numbers

@@ -1,4 +1,4 @@
-"""Error against run time of a scene as it is: what `advsearch precision` does."""
+"""`precision`: measure error against run time of a scene."""
 
 from __future__ import annotations
 
@@ -50,23 +50,25 @@ from advsearch.questions.precision.rule import (
     summarize_samples,
 )
 
-# of the time, by quantity; what one doesn't use is the others'
+# fractions of the time by quantity; unused time is that of later ones
 SHARES = {"image": 0.6, "gradient": 0.4}
-REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference
+# fraction of a quantity's time for its reference
+REFERENCE_SHARE = 0.35
 CONFIRM_SHARE = 0.4
 CONFIRM_LEAST = 4
 CONFIRM_MOST = 64
-"""Of the time of a gradient's measurements, for measuring the recommended setting
-again; how often at least for that to count, and at most.
+"""Fraction of a gradient's time to measure the recommended setting again, and how often.
+
+It counts from `CONFIRM_LEAST` measurements on.
 """
 
 
 def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
-    """Measure error against run time and write figures and numbers.
+    """Measure error against run time, and write figures and numbers.
 
-    The image and the gradient of each control are measured one after the other, each in
-    one sitting, so that their times are comparable; what is done is stored at once, and
-    a run that was stopped goes on with the next, in the seconds that are left.
+    The image and the gradient of each control are measured one after the other, each
+    without a break, so that their times are comparable. A finished one is stored at
+    once; a resumed run continues with the next, in the remaining seconds.
     """
     config = context.config
     start_time = time.perf_counter()
@@ -102,14 +104,26 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
                 slopes.append(slope)
                 warnings += filter(None, [describe_disagreement(slope, line)])
         return context.result(
-            PrecisionResult, model=problem.model.name, environment=problem.environment,
-            depth=problem.renderer.scene.max_depth, loss=config.loss, spp=problem.spp, goal=config.error,
+            PrecisionResult,
+            model=problem.model.name,
+            environment=problem.environment,
+            depth=problem.renderer.scene.max_depth,
+            loss=config.loss,
+            spp=problem.spp,
+            goal=config.error,
             image_formation=results.Formation.of(problem.renderer.formation),
-            machine=Machine(**context.machine, threads=count_threads()), points=points, slopes=slopes,
-            references=join("references"), left_out=join("left_out"), warnings=[*warnings, *list_cautions(points)],
-            recommendations=recommend_settings(points, join("again"), config.error, job.round_up, job.or_steeper),
-            figures=[], seconds={"budget": config.seconds, "setup": setup_seconds},
-        )  # fmt: skip
+            machine=Machine(**context.machine, threads=count_threads()),
+            points=points,
+            slopes=slopes,
+            references=join("references"),
+            left_out=join("left_out"),
+            warnings=[*warnings, *list_cautions(points)],
+            recommendations=recommend_settings(
+                points, join("again"), config.error, job.round_up, job.or_steeper
+            ),
+            figures=[],
+            seconds={"budget": config.seconds, "setup": setup_seconds},
+        )
 
     result = measurements.collect(measure_sittings(), make_result)
     written = [
@@ -120,8 +134,10 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
 
 
 class Measurement:
-    """What can be measured, sitting by sitting: of each its name, its share of the
-    time, and what measures it.
+    """The quantities that can be measured.
+
+    `sittings` has the name of each, its fraction of the time, and the function that
+    measures it.
     """
 
     def __init__(
@@ -165,8 +181,10 @@ class Measurement:
                 )
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
-        """Return the next number of samples that a setting takes. A line of the image
-        is named after its sampler; one of a gradient has that of the run.
+        """Return the next number of samples that a setting accepts.
+
+        A line of the image is named after its sampler; one of a gradient has that of
+        the run.
         """
         is_gradient = point.quantity == "gradient"
         sampler = (
@@ -177,11 +195,11 @@ class Measurement:
         return self._renderer.scene.next_count(samples, sampler)
 
     def or_steeper(self, point: PrecisionPoint) -> bool | None:
-        """Return whether the error of a line may fall faster than that of independent
-        samples; None where theory says nothing: differences have the bias of their
-        step, the material form its limits, and the denoiser its own.
+        """Return whether the error may fall faster than that of independent samples.
 
-        Stratification never makes the slope shallower, and often steeper (Owen 1997).
+        None if theory says nothing: differences have the bias of their step, the
+        material form its limits, and the denoiser its own. Stratification never makes
+        the slope shallower, and often steeper (Owen 1997).
         """
         if point.quantity == "gradient":
             is_unbiased = self._is_linear and point.estimator == "adjoint"
@@ -189,6 +207,7 @@ class Measurement:
         return point.estimator != "independent" if point.family == "none" else None
 
     def _measure_image(self, budget: TimeBudget) -> Sitting:
+        """Measure pictures and the model's margin on them."""
         problem = self._problem
         u = problem.whole(problem.domain.start)
 
@@ -201,6 +220,7 @@ class Measurement:
         return self._measure_settings("the picture", bench, budget)
 
     def _measure_gradient(self, part: GradientPart, budget: TimeBudget) -> Sitting:
+        """Measure the gradient of a part, then its recommended setting again."""
         renderer = self._renderer
         title = f"gradient of {part.name}"
         start_time = time.perf_counter()
@@ -225,8 +245,9 @@ class Measurement:
     def _confirm(
         self, title: str, bench: GradientBench, chosen: Recommended, budget: TimeBudget
     ) -> list[PrecisionPoint]:
-        """Measure the recommended setting of a gradient again; return its point, if it
-        was measured often enough.
+        """Measure the recommended setting of a gradient again.
+
+        Return its point, or nothing if it was not measured often enough.
         """
         if chosen.estimator is None or chosen.spp is None:
             return []
@@ -258,7 +279,7 @@ class Measurement:
     def _measure_settings(
         self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget
     ) -> Sitting:
-        """Take a bench's references, and measure all of its settings in rounds."""
+        """Compute a bench's references, and measure all of its settings in rounds."""
         start_time = time.perf_counter()
         share = budget.share(REFERENCE_SHARE)
         references = bench.refer(
@@ -266,9 +287,13 @@ class Measurement:
         )
         tick = self._begin_stage(f"{title}: measuring every setting in rounds", budget)
         measured = measure_in_rounds(
-            bench.settings, bench.measure, budget, rounds=self._config.rounds, seed=self._seed,
+            bench.settings,
+            bench.measure,
+            budget,
+            rounds=self._config.rounds,
+            seed=self._seed,
             on_done=lambda setting: tick(now=setting.estimator, samples=setting.spp),
-        )  # fmt: skip
+        )
         points = []
         for setting, samples in measured.results.items():
             for quantity in samples[0]:
@@ -297,6 +322,7 @@ class Measurement:
         )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
+        """Start a stage of the progress bar in seconds, and return what advances it."""
         total = max(1, math.ceil(budget.left))
         done = 0
         self._progress.stage(
@@ -315,6 +341,7 @@ class Measurement:
 def group_by_line(
     points: Sequence[PrecisionPoint],
 ) -> dict[tuple[str, ...], list[PrecisionPoint]]:
+    """Group points by quantity, control, family and estimator, in ascending order of samples."""
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
         lines.setdefault(
@@ -326,31 +353,35 @@ def group_by_line(
 
 
 def recommend_settings(
-    points: Sequence[PrecisionPoint], again: Sequence[PrecisionPoint], goal: float, round_up: RoundUp,
+    points: Sequence[PrecisionPoint],
+    again: Sequence[PrecisionPoint],
+    goal: float,
+    round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
-) -> list[Recommended]:  # fmt: skip
-    """Return, for each thing that can be asked for, the setting that reaches a goal
-    soonest, if any is known to; one that was measured `again` by what that said.
+) -> list[Recommended]:
+    """Return the fastest setting that reaches a goal for each quantity, if any does.
+
+    A setting that was measured `again` is recommended by these measurements.
     """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
     for key, line in group_by_line(points).items():
+        of_quantity = candidates.setdefault(key[:3], [])
         candidate = recommend_count(line, goal, round_up, or_steeper(line[0]))
-        candidates.setdefault(key[:3], []).extend([candidate] if candidate else [])
-    best = []
-    for (quantity, control, family), reached in candidates.items():
-        chosen = min(
-            reached,
+        if candidate:
+            of_quantity.append(candidate)
+    recommended = []
+    for (quantity, control, family), of_quantity in candidates.items():
+        best = min(
+            of_quantity,
             key=lambda row: row.seconds or 0.0,
             default=Recommended(quantity=quantity, control=control),
         )
         for point in again:
-            if (point.control, point.estimator) == (
-                chosen.control,
-                chosen.estimator,
-            ) and quantity == "gradient":
-                chosen = confirm_recommendation(chosen, point, round_up)
-        best.append(chosen.model_copy(update={"family": family}))
-    return best
+            is_same = (point.control, point.estimator) == (best.control, best.estimator)
+            if is_same and quantity == "gradient":
+                best = confirm_recommendation(best, point, round_up)
+        recommended.append(best.model_copy(update={"family": family}))
+    return recommended
 
 
 def count_threads() -> dict[str, int]:

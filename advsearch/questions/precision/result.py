@@ -1,4 +1,4 @@
-"""What `precision` needs to know, and its result."""
+"""Settings and result of `precision`, with its tables and figures."""
 
 from __future__ import annotations
 
@@ -28,37 +28,62 @@ SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler
 
 
 class PrecisionConfig(DerivativeConfig):
-    """Everything that decides what `precision` does: error against run time, for a
-    scene, its controls and a model.
-    """
+    """Settings of `precision`: error against run time, of a scene, its controls and a model."""
 
-    # fmt: off
     command: ClassVar[str] = "precision"
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,
-        settings.Clash("samplers", lambda config: "image" not in config.measured_quantities,
-              "is of the image, which `quantities` leaves out; leave it out too"),
-        settings.Clash("loss", lambda config: "gradient" not in config.measured_quantities,
-              "is of the gradient, which `quantities` leaves out; leave it out too"),
+        settings.Clash(
+            "samplers",
+            lambda config: "image" not in config.measured_quantities,
+            "is of the image, which `quantities` leaves out; leave it out too",
+        ),
+        settings.Clash(
+            "loss",
+            lambda config: "gradient" not in config.measured_quantities,
+            "is of the gradient, which `quantities` leaves out; leave it out too",
+        ),
     )
 
     quantities: str = setting(
-        "image,gradient", "search", "what is measured, separated by commas", ", ".join(QUANTITIES)
+        "image,gradient",
+        "search",
+        "what is measured, separated by commas",
+        ", ".join(QUANTITIES),
     )
-    seconds: float = setting(120.0, "search", "time that all measurements may take", unit="seconds", gt=0.0, le=1e9)
-    error: float = setting(0.05, "search", "relative error that the recommended "
-                                           "settings should have", gt=0.0, le=1.0)
-    rounds: int = setting(8, "search", "measurements of every setting, at most", ge=3, le=1000)
+    seconds: float = setting(
+        120.0,
+        "search",
+        "time that all measurements may take",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )
+    error: float = setting(
+        0.05,
+        "search",
+        "relative error that the recommended settings should have",
+        gt=0.0,
+        le=1.0,
+    )
+    rounds: int = setting(
+        8, "search", "measurements of every setting, at most", ge=3, le=1000
+    )
     samplers: str = setting(
-        ",".join(SAMPLERS), "search", "samplers that are compared, separated by commas", ", ".join(SAMPLERS)
+        ",".join(SAMPLERS),
+        "search",
+        "samplers that are compared, separated by commas",
+        ", ".join(SAMPLERS),
     )
     loss: Literal["linear", "model"] = setting(
-        "linear", "search",
+        "linear",
+        "search",
         "whose gradient is measured: a smooth linear loss of the raw picture, or the "
         "model's in its image formation",
     )
-    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
-    # fmt: on
+    run: str | None = setting_as_in(
+        SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN"
+    )
 
     @field_validator("quantities", "samplers", mode="before")
     @classmethod
@@ -96,7 +121,7 @@ class PrecisionConfig(DerivativeConfig):
 
 
 class PrecisionPoint(results.Measured):
-    """What repeated measurements of one setting say."""
+    """Estimates from repeated measurements of one setting."""
 
     family: str = Field(
         default="",
@@ -113,9 +138,7 @@ class PrecisionPoint(results.Measured):
 
     @property
     def known(self) -> bool:
-        """Whether the error is well above the reference's own; else it is an upper
-        limit.
-        """
+        """Whether the error is well above the reference's own; else it is an upper limit."""
         return self.status == "ok"
 
     @property
@@ -125,9 +148,7 @@ class PrecisionPoint(results.Measured):
 
 
 class PrecisionSlope(results.Fields):
-    """A line through the points of one estimator: logarithm of the error against that
-    of the samples.
-    """
+    """A line through the points of an estimator: log of the error against log of the samples."""
 
     quantity: str
     control: str
@@ -142,7 +163,7 @@ class PrecisionSlope(results.Fields):
 
 
 class PrecisionReference(results.Fields):
-    """What stands for the truth, and how far off it may be."""
+    """A reference that stands for the truth, and its error."""
 
     quantity: str
     control: str = ""
@@ -172,9 +193,7 @@ class Recommended(results.Fields):
 
 
 class Sitting(results.Fields):
-    """What was measured in one sitting: of the picture and the margin, or of the
-    gradient of a control.
-    """
+    """What was measured without a break: the picture and the margin, or a control's gradient."""
 
     points: list[PrecisionPoint] = Field(default=[])
     references: list[PrecisionReference] = Field(default=[])
@@ -187,7 +206,7 @@ class Sitting(results.Fields):
 
 
 class Machine(results.Fields):
-    """What a time has to be read with."""
+    """The machine that times were measured on."""
 
     cpu: str
     cores: int
@@ -195,7 +214,7 @@ class Machine(results.Fields):
 
 
 class PrecisionResult(RunResult):
-    """Error against run time, and what follows from it, as far as that is measured."""
+    """Error against run time, and recommended settings."""
 
     command: ClassVar[str] = "precision"
 
@@ -233,6 +252,7 @@ READING = (
 
 
 def describe_quantity(quantity: str, control: str = "") -> str:
+    """Name a quantity in a sentence."""
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
@@ -263,6 +283,7 @@ REFERENCES: Mapping[str, views.Column] = {
 
 
 def shown(result: PrecisionResult) -> ShownResult:
+    """Lay out a result: recommendations, errors, slopes and references."""
     machine = result.machine
     threads = " and ".join(
         f"{count} of {name}" for name, count in machine.threads.items()
@@ -306,6 +327,7 @@ def shown(result: PrecisionResult) -> ShownResult:
 
 
 def make_headline(result: PrecisionResult) -> str:
+    """Summarize a result in a sentence: the first setting that reaches the goal."""
     found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
         return (
@@ -320,6 +342,7 @@ def make_headline(result: PrecisionResult) -> str:
 
 
 def describe_recommendation(found: Recommended, goal: float) -> str:
+    """Describe a recommended setting, or that none reaches the goal."""
     quantity = describe_quantity(found.quantity, found.control)
     goal_text = (
         f"{100 * goal:.3g} % error of {quantity}{FAMILIES.get(found.family, '')}"
@@ -337,8 +360,10 @@ def describe_recommendation(found: Recommended, goal: float) -> str:
 
 
 def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
-    """Return what has to be known of points: errors of few pixels, and a machine that
-    most of the time, by the clock, took over twice the processor time.
+    """Return warnings about points: errors of few pixels, and a busy machine.
+
+    A machine is busy if most measurements took over twice their processor time by the
+    clock.
     """
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
     waited = [
@@ -363,6 +388,7 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 
 
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
+    """Make the table of errors of a quantity."""
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, views.Column] = (
         {"control": "{0.control}"} if quantity == "gradient" else {}
@@ -394,8 +420,19 @@ def _format_interval(interval: results.Interval | None) -> str:
 
 
 GREY = figures.GREY
-COLORS = (figures.BLUE, "#b4540a", "#1f7a45", "#7a3fa8", figures.RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0",
-          "#a06a50")  # fmt: skip
+COLORS = (
+    figures.BLUE,
+    "#b4540a",
+    "#1f7a45",
+    "#7a3fa8",
+    figures.RED,
+    "#4a7d8c",
+    "#8a6d00",
+    GREY,
+    "#c2488f",
+    "#3f5fd0",
+    "#a06a50",
+)
 MARKERS = "osD^vP*X<>d"
 PANEL = (5.6, 3.9)  # width and height of one diagram in inches
 PERCENT = 100.0
@@ -403,11 +440,11 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def precision_figures(result: PrecisionResult) -> figures.Figures:
-    """Return work-precision diagrams as files: error against seconds, both logarithmic;
-    none where nothing is known.
+    """Return work-precision diagrams as files: error against seconds, both logarithmic.
 
     Filled markers are known errors; open ones with an arrow are limits: the reference
-    is no better than that. The dashed line falls as independent samples do.
+    is no better. The dashed line falls as independent samples do. Empty if nothing is
+    known.
     """
     panels: dict[str, list[PrecisionPoint]] = {}
     for point in result.points:
@@ -416,47 +453,53 @@ def precision_figures(result: PrecisionResult) -> figures.Figures:
             panels.setdefault(title, []).append(point)
     if not panels:
         return {}
-    wide = min(2, len(panels))
-    tall = math.ceil(len(panels) / wide)
-    machine = result.machine
-    points = result.points
+    n_columns = min(2, len(panels))
+    n_rows = math.ceil(len(panels) / n_columns)
     (height, width) = result.image_formation.resolution
-    threads = ", ".join(
-        f"{count} {name} thread" + "s" * (count != 1)
-        for name, count in machine.threads.items()
-    )
-    most = max(point.repeats for point in points)
-    seconds = f"of the last of {most} repeats at most"
-    if most > WARM_UP + 1:
-        seconds = f"medians of at most {most - WARM_UP} interleaved repeats"
-    key = "Filled: known" + (
-        ", with its 95 % interval." if any(point.interval for point in points) else "."
-    )
-    if not all(point.known for point in points):
-        key += " Open, with an arrow: at most this, the reference is no better."
-    below = (
-        f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
-        f"{seconds}.\n{key}"
-    )
-    what = (
+    headline = (
         f"{result.object} in {result.environment}, {result.model}, {width} x "
         f"{height} pixels"
     )
 
     def draw(figure: Any) -> None:
-        for number, (title, shown) in enumerate(panels.items(), start=1):
-            axes = figure.add_subplot(tall, wide, number)
+        for number, (title, panel_points) in enumerate(panels.items(), start=1):
+            axes = figure.add_subplot(n_rows, n_columns, number)
             axes.set_title(title)
-            _draw_errors(axes, shown, result)
-        figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
-        figure.supxlabel(below, fontsize=8, color=GREY, x=0.01, ha="left")
+            _draw_errors(axes, panel_points, result)
+        figure.suptitle(headline, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        caption = _make_caption(result)
+        figure.supxlabel(caption, fontsize=8, color=GREY, x=0.01, ha="left")
 
-    return figures.drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
+    return figures.drawn(draw, (PANEL[0] * n_columns, PANEL[1] * n_rows + 0.8))
+
+
+def _make_caption(result: PrecisionResult) -> str:
+    """Describe the machine, the repeats and the markers of the diagrams."""
+    machine = result.machine
+    threads = ", ".join(
+        f"{count} {name} thread" + "s" * (count != 1)
+        for name, count in machine.threads.items()
+    )
+    max_repeats = max(point.repeats for point in result.points)
+    seconds = f"of the last of {max_repeats} repeats at most"
+    if max_repeats > WARM_UP + 1:
+        seconds = f"medians of at most {max_repeats - WARM_UP} interleaved repeats"
+    legend = "Filled: known"
+    if any(point.interval for point in result.points):
+        legend += ", with its 95 % interval"
+    legend += "."
+    if not all(point.known for point in result.points):
+        legend += " Open, with an arrow: at most this, the reference is no better."
+    return (
+        f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
+        f"{seconds}.\n{legend}"
+    )
 
 
 def _draw_errors(
     axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult
 ) -> None:
+    """Draw the error of each estimator against seconds, with theory and the goal."""
     slopes = {
         (slope.quantity, slope.control, slope.estimator): slope
         for slope in result.slopes
@@ -466,74 +509,79 @@ def _draw_errors(
             (point for point in points if point.estimator == name),
             key=lambda point: point.spp,
         )
-        label = name
         slope = slopes.get((line[0].quantity, line[0].control, name))
-        if slope is not None:  # and theory where that disagrees
-            doubt = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
-            label = f"{name}  {slope.slope:.2f}{doubt}".replace(" -", f" {MINUS}")
-        _draw_line(axes, line, number, label)
+        _draw_line(axes, line, number, _make_label(name, slope))
     axes.set(
         xscale="log",
         yscale="log",
         xlabel="seconds of processor time",
         ylabel="relative error, %",
     )
-    low = min(point.seconds for point in points)
-    high = max(point.seconds for point in points)
-    if high >= 1.5 * low:  # theory: a dashed line of slope -1/2 under the points
-        at = (
-            PERCENT
-            * min(point.rms * math.sqrt(point.seconds) for point in points)
-            * 0.8
-        )
-        middle = math.sqrt(low * high)
-        axes.plot(
-            [low, high],
-            [at / math.sqrt(low), at / math.sqrt(high)],
-            color=GREY,
-            linewidth=1.0,
-            linestyle="--",
-        )
-        axes.annotate(
-            f"{MINUS}1/2",
-            (middle, at / math.sqrt(middle)),
-            fontsize=8,
-            color=GREY,
-            ha="right",
-            va="top",
-        )
+    _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
     goal = result.goal * PERCENT
-    (low, high) = axes.get_ylim()
-    if low < goal < high:
+    (lower, upper) = axes.get_ylim()
+    if lower < goal < upper:
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
-        where = ("axes fraction", "data")
         axes.annotate(
             f"{goal:g} %",
             (1.0, goal),
-            xycoords=where,
+            xycoords=("axes fraction", "data"),
             ha="right",
             va="bottom",
             fontsize=8,
         )
     axes.grid(True, which="major")
-    place: dict[str, Any] = {
-        "bbox_to_anchor": (1.0, 1.0),
-        "borderaxespad": 0.2,
-        "handlelength": 1.6,
-    }
-    place |= {
-        "title": "slope against samples",
-        "title_fontsize": 8,
-        "alignment": "left",
-    }
-    axes.legend(loc="upper left", **place)
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        handlelength=1.6,
+        title="slope against samples",
+        title_fontsize=8,
+        alignment="left",
+    )
+
+
+def _make_label(name: str, slope: PrecisionSlope | None) -> str:
+    """Label an estimator with its slope, and with that of theory if they disagree."""
+    if slope is None:
+        return name
+    theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
+    return f"{name}  {slope.slope:.2f}{theory}".replace(" -", f" {MINUS}")
+
+
+def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
+    """Draw a dashed line of slope -1/2 under the points, if they span enough time."""
+    start = min(point.seconds for point in points)
+    end = max(point.seconds for point in points)
+    if not end >= 1.5 * start:
+        return
+    smallest = min(point.rms * math.sqrt(point.seconds) for point in points)
+    scale = PERCENT * smallest * 0.8
+    center = math.sqrt(start * end)
+    axes.plot(
+        [start, end],
+        [scale / math.sqrt(start), scale / math.sqrt(end)],
+        color=GREY,
+        linewidth=1.0,
+        linestyle="--",
+    )
+    axes.annotate(
+        f"{MINUS}1/2",
+        (center, scale / math.sqrt(center)),
+        fontsize=8,
+        color=GREY,
+        ha="right",
+        va="top",
+    )
 
 
 def _draw_line(
     axes: Any, line: Sequence[PrecisionPoint], number: int, label: str
 ) -> None:
+    """Draw the points of an estimator with their intervals."""
     color = COLORS[number % len(COLORS)]
     marker = MARKERS[number % len(MARKERS)]
     axes.plot(
@@ -546,9 +594,9 @@ def _draw_line(
     for point in line:
         x = point.seconds
         y = PERCENT * point.rms
-        low, high = (PERCENT * end for end in point.interval or (math.nan, math.nan))
-        if high < 4.0 * y:
-            axes.plot([x, x], [low, high], color=color, linewidth=0.8, alpha=0.6)
+        lower, upper = (PERCENT * end for end in point.interval or (math.nan, math.nan))
+        if upper < 4.0 * y:
+            axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
         axes.plot(
             [x],
             [y],
@@ -571,8 +619,9 @@ def _draw_line(
 
 
 def _plain_axis(axis: Any) -> None:
-    """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as
-    plain numbers.
+    """Set ticks at 1, 2 and 5 times powers of ten, labelled as plain numbers.
+
+    Over a wide range they are at powers only, over a narrow one denser.
     """
     # takes long to import
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter

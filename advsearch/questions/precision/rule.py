@@ -1,6 +1,6 @@
-"""What repeated measurements say: the error of a setting beside a reference that has
-one of its own, how it falls with the samples, and which setting reaches a goal soonest.
-Nothing here knows how to render.
+"""Statistics of repeated measurements: errors, slopes, and the fastest setting.
+
+An error is relative to a reference that has an error of its own. Nothing here renders.
 """
 
 from __future__ import annotations
@@ -32,26 +32,34 @@ is the sum of the fourth powers of all relative errors in a picture, whose squar
 RoundUp = Callable[[PrecisionPoint, float], int]
 """From a point and a number of samples to the next number that its setting takes."""
 
-KNOWN = 2.0  # times the reference's own error that a measured one must have to be known
-LEVEL = 0.95  # of every interval
+# multiple of the reference's own error above which a measured error is known
+KNOWN = 2.0
+# confidence of every interval
+LEVEL = 0.95
 WIDE = 1000
 LEAST_VALUES = 100
-"""From so many numbers on in a picture or gradient it is looked at how many of them
-hold its error. Below so many, in all measurements together, a few noisy pixels decide
-it, and an interval would cover the truth too seldom (`benchmarks/precision.py
+"""Limits of heavy tails.
+
+For values of at least `WIDE` numbers it is checked how many of them hold the error. If
+these are fewer than `LEAST_VALUES`, in all measurements together, a few noisy pixels
+decide it, and an interval would cover the truth too rarely (`benchmarks/precision.py
 --intervals`).
 """
-AGREES = 0.1  # how far a slope may be from theory, whatever its interval
+# difference from theory that a slope may have, whatever its interval
+AGREES = 0.1
 # slope of the error of a mean of independent samples against their number
 MONTE_CARLO = -0.5
-FURTHEST = 16.0  # times the largest measured sample count beyond which nothing is said
-LEAST_POINTS = 3  # of a fit
+# multiple of the largest measured sample count up to which an error is extrapolated
+FURTHEST = 16.0
+# minimum number of points of a fit
+LEAST_POINTS = 3
 
 
 @dataclass(frozen=True)
 class SampleSetting:
-    """One way to compute a quantity: an estimator at a sample count. `cost` is what it
-    should take, in any one unit, and `family` what it is recommended among.
+    """A way to compute a quantity: an estimator with a sample count.
+
+    `cost` is the expected time in any unit; settings are recommended within a `family`.
     """
 
     quantity: str
@@ -68,8 +76,9 @@ class SampleSetting:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceValue:
-    """A value (n,) that stands for the truth: its `error`, over its `size`, the norm,
-    from independent `parts`.
+    """A value (n,) that stands for the truth, with its relative error.
+
+    `size` is its norm, `parts` the number of independent parts that it is the mean of.
     """
 
     value: Array
@@ -78,18 +87,24 @@ class ReferenceValue:
     parts: int
 
     def compare(self, value: Array) -> dict[str, float]:
-        """Return how a value (n,) compares: the norm of the difference over that of the
-        reference, the cosine of the angle between them, and the sum of the fourth
-        powers of the relative errors of the single numbers; NaN where one is zero, or
-        where the numbers are too few to say anything about tails.
+        """Compare a value (n,) with the reference.
+
+        Returns:
+            `error`, the norm of the difference divided by that of the reference; `cosine`
+            of the angle between them; `fourth`, the sum of fourth powers of the relative
+            errors of the single numbers. NaN if a norm is zero, and `fourth` also if there
+            are too few numbers to tell tails.
         """
-        away = value - self.value
+        difference = value - self.value
         norm = float(np.linalg.norm(value)) * self.size
-        wide = len(value) >= WIDE and self.size > 0.0
+        has_tails = len(value) >= WIDE and self.size > 0.0
+        fourth = math.nan
+        if has_tails:
+            fourth = float(np.sum((difference / self.size) ** 4))
         return {
-            "error": relative_error(float(np.linalg.norm(away)), self.size),
+            "error": relative_error(float(np.linalg.norm(difference)), self.size),
             "cosine": float(value @ self.value) / norm if norm > 0.0 else math.nan,
-            "fourth": float(np.sum((away / self.size) ** 4)) if wide else math.nan,
+            "fourth": fourth,
         }
 
 
@@ -98,14 +113,16 @@ def estimate_reference(
     function: Callable[[Array], Array] = lambda mean: mean,
     bias: float = 0.0,
 ) -> ReferenceValue:
-    """Return a function, (n,) to (m,), of the mean of at least two independent parts,
-    with its error by the jackknife (Efron 1982, chapter 3); of the mean itself that is
-    its standard error.
+    """Return a function of the mean of independent parts, with its jackknife error.
 
-    A function is for what is no mean itself, such as a picture after its tone curve or
-    a model's margin on it. The error holds the jackknife's estimate of bias (noise
-    through a bend) as well as of scatter, and a `bias` that is known to be there, in
-    squares.
+    The jackknife (Efron 1982, chapter 3) of the mean itself is its standard error. A
+    function, (n,) to (m,), is for what is no mean, such as a picture after its tone
+    curve or a model's margin on it. The error combines, as squares, the jackknife's
+    estimates of scatter and of bias (noise through a nonlinear function), and a known
+    `bias`.
+
+    Raises:
+        ValueError: if there are fewer than two parts.
     """
     count = len(parts)
     if count < 2:
@@ -114,72 +131,83 @@ def estimate_reference(
         )
     total = np.sum(parts, axis=0)
     value = function(total / count)
-    without = [function((total - part) / (count - 1)) for part in parts]
-    middle = np.mean(without, axis=0)
+    leave_one_out = [function((total - part) / (count - 1)) for part in parts]
+    center = np.mean(leave_one_out, axis=0)
     scatter = math.sqrt(
         (count - 1)
         / count
-        * sum(float(np.sum((each - middle) ** 2)) for each in without)
+        * sum(float(np.sum((each - center) ** 2)) for each in leave_one_out)
     )
-    bend = (count - 1) * float(np.linalg.norm(middle - value)) if count > 2 else 0.0
+    bias_estimate = (
+        (count - 1) * float(np.linalg.norm(center - value)) if count > 2 else 0.0
+    )
     # the estimate of the bias scatters as much as the value does
-    bend = max(0.0, bend - scatter)
+    bias_estimate = max(0.0, bias_estimate - scatter)
     size = float(np.linalg.norm(value))
     return ReferenceValue(
-        value, relative_error(math.hypot(scatter, bend, bias), size), size, count
+        value,
+        relative_error(math.hypot(scatter, bias_estimate, bias), size),
+        size,
+        count,
     )
 
 
 def summarize_samples(
     setting: SampleSetting, samples: Sequence[Numbers], floor: float = 0.0
 ) -> PrecisionPoint:
-    """Return what measurements of a setting say about its error, given the reference's
-    own (`floor`).
+    """Estimate the error of a setting from its measurements.
 
-    The samples' noise and the reference's are independent, so their squares add:
-    error^2 = mean of squares - floor^2. A root mean square below `KNOWN` times the
-    floor is not known; what is given then is a limit. The interval comes from the
-    scatter of the squares on a logarithmic scale; there is none of a single one and of
-    heavy tails.
+    The noise of the samples and that of the reference (`floor`) are independent, so
+    that their squares add: error^2 = mean of squares - floor^2. A root mean square
+    below `KNOWN` times the floor is not known; the result is then a limit. The interval
+    comes from the scatter of the squares on a logarithmic scale; a single measurement
+    and heavy tails have none.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
-    raw = statistics.fmean(squares)
-    heavy = is_heavy_tailed(samples)
+    mean_square = statistics.fmean(squares)
+    is_heavy = is_heavy_tailed(samples)
+    exceeds_floor = mean_square > (KNOWN * floor) ** 2
+    is_known = exceeds_floor and math.isfinite(mean_square) and mean_square > 0.0
+    error = math.sqrt(mean_square - floor**2) if is_known else math.sqrt(mean_square)
     interval = None
-    known = raw > (KNOWN * floor) ** 2 and math.isfinite(raw) and raw > 0.0
-    error = math.sqrt(raw - floor**2) if known else math.sqrt(raw)
-    if known and not heavy and len(squares) > 1:
-        relative = 0.5 * statistics.stdev(squares) / math.sqrt(len(squares)) / raw
-        factor = math.exp(
-            min(50.0, float(stdtrit(len(squares) - 1, (1.0 + LEVEL) / 2.0)) * relative)
-        )
+    if is_known and not is_heavy and len(squares) > 1:
+        deviation = statistics.stdev(squares) / math.sqrt(len(squares))
+        factor = _interval_factor(deviation, mean_square, len(squares))
         interval = (error / factor, error * factor)
-    time_names = [name for name in ("seconds", "wall_seconds") if name in samples[0]]
-    times = {
-        name: median_time([numbers[name] for numbers in samples]) for name in time_names
-    }
-    cosine = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
-    status = "ok" if known else "reference unusable"
-    more: dict[str, object] = {
+    cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
+    cosine = None
+    if cosines and setting.quantity == "gradient":
+        cosine = statistics.fmean(cosines)
+    fields: dict[str, object] = {
         "repeats": len(samples),
-        "status": status,
+        "status": "ok" if is_known else "reference unusable",
         "error": error,
         "interval": interval,
+        "reference_error": floor,
+        "heavy_tailed": is_heavy,
+        "cosine": cosine,
     }
-    more |= {"reference_error": floor, "heavy_tailed": heavy}
-    more["cosine"] = (
-        statistics.fmean(cosine) if cosine and setting.quantity == "gradient" else None
-    )
-    return PrecisionPoint.of({**vars(setting), **more, **times})
+    for name in ("seconds", "wall_seconds"):
+        if name in samples[0]:
+            fields[name] = median_time([numbers[name] for numbers in samples])
+    return PrecisionPoint.of({**vars(setting), **fields})
+
+
+def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
+    """Return the factor of a root mean square's interval, on a logarithmic scale.
+
+    The deviation is the standard error of the mean square of `count` values.
+    """
+    quantile = float(stdtrit(count - 1, (1.0 + LEVEL) / 2.0))
+    return math.exp(min(50.0, quantile * (0.5 * deviation / mean_square)))
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
-    """Whether fewer than `LEAST_VALUES` pixels hold the error of some pictures: (sum of
-    squares)^2 / (sum of fourth powers) counts how many, if all of them were equal.
-    False where the pictures are too small to tell.
+    """Return whether fewer than `LEAST_VALUES` pixels hold the error of some pictures.
 
-    What happens in none of the pictures, such as a firefly in every hundredth one,
-    can't be seen.
+    (sum of squares)^2 / (sum of fourth powers) is their number if all of them were
+    equal. False if the pictures are too small to tell. What happens in none of the
+    pictures, such as a firefly in every hundredth one, cannot be seen.
     """
     squares = sum(numbers["error"] ** 2 for numbers in samples)
     fourth = sum(numbers.get("fourth", math.nan) for numbers in samples)
@@ -187,25 +215,26 @@ def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
 
 
 def median_time(seconds: Sequence[float]) -> float:
-    """Return the median of times without those of calls that warm up; the last one
-    where there are no others.
-    """
+    """Return the median of times without warm-up calls, or the last one if all are."""
     return statistics.median(seconds[WARM_UP:] or seconds[-1:])
 
 
 def relative_error(error: float, size: float) -> float:
-    return error / size if size > 0.0 else (0.0 if error == 0.0 else math.inf)
+    """Divide an error by a norm; an error of nothing is infinite unless it is 0."""
+    if size > 0.0:
+        return error / size
+    return 0.0 if error == 0.0 else math.inf
 
 
 def fit_line(
     points: Sequence[PrecisionPoint], or_steeper: bool | None = None
 ) -> PrecisionSlope | None:
-    """Return the least-squares line of log error against log samples.
+    """Fit the line of log error against log samples by least squares.
 
-    Only points whose error is known count: one below the reference's own error says
-    nothing. None where fewer than `LEAST_POINTS` are left. Theory says `MONTE_CARLO`,
-    `or_steeper`, or nothing (None). A slope disagrees where its interval leaves theory
-    out *and* it is further than `AGREES` from it.
+    Only points with a known error count: one below the reference's own error says
+    nothing. None if fewer than `LEAST_POINTS` are left. Theory says `MONTE_CARLO`,
+    `or_steeper`, or nothing (None). A slope disagrees if its interval excludes theory
+    *and* it differs by more than `AGREES`.
     """
     known = [point for point in points if point.known]
     if len({point.spp for point in known}) < LEAST_POINTS:
@@ -215,23 +244,35 @@ def fit_line(
         np.log([point.rms for point in known]),
     )
     slope = float(line.slope)
-    half = float(stdtrit(len(known) - 2, (1.0 + LEVEL) / 2.0)) * float(line.stderr)
-    off = slope - MONTE_CARLO if or_steeper else abs(slope - MONTE_CARLO)
-    agrees = True if off <= AGREES else None if off <= half else False
+    half_width = float(stdtrit(len(known) - 2, (1.0 + LEVEL) / 2.0)) * float(
+        line.stderr
+    )
+    difference = slope - MONTE_CARLO if or_steeper else abs(slope - MONTE_CARLO)
+    agrees: bool | None = False
+    if difference <= AGREES:
+        agrees = True
+    elif difference <= half_width:
+        agrees = None
+    if or_steeper is None:
+        agrees = None
     return PrecisionSlope(
-        quantity=known[0].quantity, control=known[0].control, estimator=known[0].estimator, slope=slope,
-        interval=(slope - half, slope + half), offset=float(line.intercept), points=len(known),
-        theory=None if or_steeper is None else MONTE_CARLO, or_steeper=bool(or_steeper),
-        agrees=None if or_steeper is None else agrees,
-    )  # fmt: skip
+        quantity=known[0].quantity,
+        control=known[0].control,
+        estimator=known[0].estimator,
+        slope=slope,
+        interval=(slope - half_width, slope + half_width),
+        offset=float(line.intercept),
+        points=len(known),
+        theory=None if or_steeper is None else MONTE_CARLO,
+        or_steeper=bool(or_steeper),
+        agrees=agrees,
+    )
 
 
 def describe_disagreement(
     slope: PrecisionSlope, points: Sequence[PrecisionPoint]
 ) -> str | None:
-    """Return a sentence where a slope disagrees with theory, with the likeliest reason;
-    None where it agrees.
-    """
+    """Describe how a slope disagrees with theory and the likeliest reason; None if it agrees."""
     if slope.agrees is not False or slope.theory is None:
         return None
     if slope.slope <= slope.theory:
@@ -250,8 +291,9 @@ def describe_disagreement(
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Whether the last step between known points is less than half as steep as the
-    first ones were.
+    """Return whether the last step between known points is much flatter than the first ones.
+
+    That is less than half as steep.
     """
     known = sorted(
         (point for point in points if point.known), key=lambda point: point.spp
@@ -265,6 +307,7 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
 
 
 def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
+    """Return the next whole number of samples."""
     return math.ceil(samples - 1e-9)
 
 
@@ -274,79 +317,90 @@ def recommend_count(
     round_up: RoundUp = round_up_exactly,
     or_steeper: bool | None = None,
 ) -> Recommended | None:
-    """Return the least sample count at which one line reaches a relative error, and
-    what it takes there.
+    """Return the smallest sample count at which one line reaches a relative error.
 
-    Where the fitted line goes through the interval of every known point, of at least
-    four, it stands for them: it knows more than any one of them. Elsewhere the error is
-    interpolated between points on logarithmic axes; beyond the last one it follows the
-    fitted slope, or that of theory (see `fit_line`) where points are too few for a fit,
-    at most `FURTHEST` times as far, and not at all where the line levels off. A limit
-    counts as an error of that size. Time is interpolated, and beyond the last point
-    grows with the samples.
+    If the fitted line passes through the interval of every known point, of at least
+    four, it stands for them. Otherwise the error is interpolated between points on
+    logarithmic axes. Beyond the last one it follows the fitted slope, or that of theory
+    (see `fit_line`) if points are too few for a fit, at most `FURTHEST` times as far,
+    and not at all if the line levels off. A limit counts as an error of that size. Time
+    is interpolated, and beyond the last point grows with the samples.
     """
     if not points or not goal > 0.0:
         return None
     ordered = sorted(points, key=lambda point: point.spp)
-    known = [point for point in ordered if point.known]
     line = fit_line(ordered)
-    falls = max(line.slope, -1.0) if line else MONTE_CARLO
-
-    def fitted(spp: float) -> float:
-        return math.exp(line.offset + line.slope * math.log(spp)) if line else math.nan
-
-    explains = (
-        line is not None
-        and line.points > LEAST_POINTS
-        and line.slope <= -0.1
-        and all(
-            point.interval
-            and point.interval[0] <= fitted(point.spp) <= point.interval[1]
-            for point in known
-        )
-    )
-    if line is not None and explains:
-        samples = math.exp((math.log(goal) - line.offset) / line.slope)
-        least = float(ordered[0].spp)
-        largest = float(ordered[-1].spp)
-        basis = (
-            "measured"
-            if samples <= least
-            else "fitted"
-            if samples <= largest
-            else "extrapolated"
-        )
-        count = None if samples > FURTHEST * largest else max(samples, least)
+    explaining_line = line if line and _explains_points(line, ordered) else None
+    if explaining_line:
+        count, basis = _solve_line(explaining_line, ordered, goal)
     else:
         count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    error = (
-        fitted(spp)
-        if explains
-        else _interpolate_value(ordered, spp, [point.rms for point in ordered], falls)
-    )
-    seconds = _interpolate_value(
-        ordered, spp, [point.seconds for point in ordered], 1.0
-    )
+    if explaining_line:
+        error = _error_on_line(explaining_line, spp)
+    else:
+        slope = max(line.slope, -1.0) if line else MONTE_CARLO
+        error = _interpolate_value(
+            ordered, spp, [point.rms for point in ordered], slope
+        )
+    seconds = [point.seconds for point in ordered]
     return Recommended(
-        quantity=ordered[0].quantity, control=ordered[0].control, goal=goal, estimator=ordered[0].estimator, spp=spp,
-        seconds=seconds, error=error, basis=basis,
-    )  # fmt: skip
+        quantity=ordered[0].quantity,
+        control=ordered[0].control,
+        goal=goal,
+        estimator=ordered[0].estimator,
+        spp=spp,
+        seconds=_interpolate_value(ordered, spp, seconds, 1.0),
+        error=error,
+        basis=basis,
+    )
+
+
+def _error_on_line(line: PrecisionSlope, spp: float) -> float:
+    return math.exp(line.offset + line.slope * math.log(spp))
+
+
+def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
+    """Return whether a falling line passes through the interval of every known point."""
+    if line.points <= LEAST_POINTS or not line.slope <= -0.1:
+        return False
+    for point in ordered:
+        if not point.known:
+            continue
+        if not point.interval:
+            return False
+        lower, upper = point.interval
+        if not lower <= _error_on_line(line, point.spp) <= upper:
+            return False
+    return True
+
+
+def _solve_line(
+    line: PrecisionSlope, ordered: Sequence[PrecisionPoint], goal: float
+) -> tuple[float | None, str]:
+    """Return the samples at which a line reaches a goal, and the basis."""
+    samples = math.exp((math.log(goal) - line.offset) / line.slope)
+    smallest = float(ordered[0].spp)
+    largest = float(ordered[-1].spp)
+    if samples <= smallest:
+        return smallest, "measured"
+    if samples <= largest:
+        return samples, "fitted"
+    return (None if samples > FURTHEST * largest else samples), "extrapolated"
 
 
 def confirm_recommendation(
     found: Recommended, point: PrecisionPoint, round_up: RoundUp = round_up_exactly
 ) -> Recommended:
-    """Return a recommendation that rests on a point measured after it was chosen, with
-    seeds of its own.
+    """Return a recommendation that rests on a point measured after it was selected.
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks
-    smaller than it is. New measurements don't have that bias: what they say is
-    promised. Where it is more than the goal, the sample count grows as independent
-    samples need it, by (error / goal)^2, at most `FURTHEST` times, and the error
-    shrinks by the root.
+    smaller than it is. New measurements, with seeds of their own, don't have that bias.
+    If their error is above the goal, the sample count grows as independent samples need
+    it, by (error / goal)^2, at most `FURTHEST` times, and the error shrinks by the
+    root.
     """
     assert found.goal is not None and found.spp is not None
     spp = round_up(
@@ -369,7 +423,7 @@ def _interpolate_count(
     line: PrecisionSlope | None,
     or_steeper: bool | None,
 ) -> tuple[float | None, str]:
-    """The samples at which ordered points stay at or below a goal from there on."""
+    """Return the samples from which on ordered points stay at or below a goal, and the basis."""
     last = ordered[-1]
     if last.rms > goal:
         slope = line.slope if line else None if or_steeper is None else MONTE_CARLO
@@ -385,16 +439,14 @@ def _interpolate_count(
     if not first:
         return float(good.spp), "measured"
     before = ordered[first - 1]
-    share = math.log(before.rms / goal) / math.log(before.rms / good.rms)
-    return before.spp * (good.spp / before.spp) ** share, "interpolated"
+    fraction = math.log(before.rms / goal) / math.log(before.rms / good.rms)
+    return before.spp * (good.spp / before.spp) ** fraction, "interpolated"
 
 
 def _interpolate_value(
     ordered: Sequence[PrecisionPoint], spp: int, values: Sequence[float], slope: float
 ) -> float:
-    """A value at a sample count: interpolated, or continued along a slope, on
-    logarithmic axes.
-    """
+    """Interpolate a value at a sample count, on logarithmic axes; beyond, follow a slope."""
     counts = np.log([float(point.spp) for point in ordered])
     logs = np.log([max(1e-300, value) for value in values])
     beyond = max(0.0, math.log(spp) - counts[-1])

@@ -22,12 +22,12 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
     choice_description="advsearch.questions.recipe.description:describe",
     view=shown,
 )
-def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:
-    """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
+def recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
+    """Run a recipe: an experiment of several runs, with figures of them (docs/recipes.md).
 
     Args:
         recipe: the name of a bundled recipe, or a YAML file.
     """
     from advsearch.questions.recipe.carry_out import carried_out  # imports torch
 
-    return carried_out(asked)
+    return carried_out(context)

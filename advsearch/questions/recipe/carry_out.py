@@ -1,6 +1,4 @@
-"""`recipe`: an experiment that a YAML file describes: runs of the commands there are,
-and figures of their results.
-"""
+"""`recipe`: run an experiment that a YAML file describes, and make figures of its results."""
 
 from __future__ import annotations
 
@@ -54,10 +52,12 @@ from advsearch.questions.recipe.result import (
     RecipeResult,
 )
 
+# a full turn, degrees
 TURN = 360.0
-# under which a run's store keeps the recipe, so that it goes on as it began
+# the note of a run's store that holds the recipe, so that a resumed run repeats it
 NOTE = "recipe"
-DoneRun = tuple[PlannedRun, Any]  # with the result of an attack or of a sweep
+# with the result of an attack or of a sweep
+DoneRun = tuple[PlannedRun, Any]
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
     "rates": (rates.RatesOptions, rates.rates),
@@ -68,101 +68,141 @@ FIGURES: Mapping[str, tuple[type[Options], Any]] = {
     "scaling": (Options, rates.scaling),
     "surface": (Options, rates.surface),
 }
-"""The options that each kind takes, and what makes it of the rows."""
+"""The options of each kind of figure, and the function that makes it of rows."""
 
 TOGETHER = ("agreement", "scaling", "surface")
-"""Kinds that tell several models apart by themselves; of the others each model has
-one.
-"""
+"""Kinds of figures that show all models; of the other kinds each model has its own."""
 
 # options of figures that name columns
 NAMING = ("by", "series", "texture", "shape", "shares")
 # columns of every recipe
 OUTER = ("object", "environment", rates.MODEL, rates.PREDICTION, rates.PART)
-# stands for the parameters of a control that does not say beforehand which it has
+# stands for the parameters of a control that does not declare them
 ANY = "*"
 
 
-def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
-    """Carry out a recipe, but for what is done; what is seen not to work is refused
-    before anything is written.
+def carried_out(context: RunContext[RecipeConfig]) -> RecipeResult:
+    """Run a recipe, except for the parts that are already finished.
+
+    Raises:
+        InputError: before anything is written, if the recipe or its settings are wrong.
     """
-    config = asked.config
-    resumed = asked.resumed
-    noted = None
+    config = context.config
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    # a run that was stopped at once has noted no recipe
-    if resumed is not None and Store.is_in(resumed):
-        with Store.open_to_read(resumed) as store:
-            noted = store.noted(NOTE)
-    where = f"{resumed}: the recipe that it began with"
-    recipe = (
-        description.recipe_of(noted, where)
-        if noted
-        else description.read_recipe(config.recipe)
-    )
+    recipe = _load_recipe(context)
     runs = planned(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
-    if not noted:
+    if _read_noted_recipe(context) is None:
         check_described(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
-    asked.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
-    done, warnings = _carried_out(runs, asked)
+    context.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
+
+    done, warnings = _run_parts(runs, context)
+    recipe_figures = list[RecipeFigure]()
     if any(result.goes_on for _, result in done):
-        asked.ending = results.INTERRUPTED
+        context.ending = results.INTERRUPTED
     elif config.photographs is not None:
-        warnings += _take(
-            Path(config.photographs),
-            _photographed(recipe, [run for run, _ in done]),
-            asked.run,
+        photographed = _select_photographed(recipe, [run for run, _ in done])
+        warnings += _add_photographs(
+            Path(config.photographs), photographed, context.run
         )
-    settings = description.made_of(recipe, config).settings
-    usual = {
+    if context.ending != results.INTERRUPTED:
+        recipe_figures = list(_write_figures(recipe, config, done, context.run))
+    for _, result in done:
+        warnings += getattr(result, "warnings", ())
+    return _make_result(recipe, done, recipe_figures, warnings, context)
+
+
+def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | None:
+    """Read the recipe that a resumed run began with, None of a new run."""
+    resumed = context.resumed
+    # a run that was stopped at once has no store or has not noted its recipe
+    if resumed is None or not Store.is_in(resumed):
+        return None
+    with Store.open_to_read(resumed) as store:
+        return store.noted(NOTE) or None
+
+
+def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
+    """Load the recipe: as a resumed run began with it, or by its name or file."""
+    noted = _read_noted_recipe(context)
+    if noted is None:
+        return description.read_recipe(context.config.recipe)
+    return description.recipe_of(
+        noted, f"{context.resumed}: the recipe that it began with"
+    )
+
+
+def _make_result(
+    recipe: Recipe,
+    done: Sequence[DoneRun],
+    recipe_figures: list[RecipeFigure],
+    warnings: Sequence[str],
+    context: RunContext[RecipeConfig],
+) -> RecipeResult:
+    """Make the result of a recipe; a resumed run adds the seconds it took before."""
+    config = context.config
+    recipe_settings = description.made_of(recipe, config).settings
+    defaults = {
         "object": "",
         "environment": SceneConfig.default_environment,
         "model": "reference",
     }
-    listed = {
-        name: description.names_listed(settings.get(name) or other)
-        for name, other in usual.items()
+    names = {
+        setting: description.names_listed(recipe_settings.get(setting) or default)
+        for setting, default in defaults.items()
     }
-    warnings += [text for _, result in done for text in getattr(result, "warnings", ())]
-    result = asked.result(
-        RecipeResult, recipe=config.recipe, title=recipe.title, about=recipe.about, quick=config.quick,
-        objects=listed["object"], environment=",".join(listed["environment"]), model=",".join(listed["model"]),
-        controls=list(dict.fromkeys(name for run, _ in done for name in run.config.controls)),
-        parts=[
-            RecipePart(name=run.name, part=run.part, command=run.config.command, object=run.config.object,
-                       ending=result.ending, renders=sum(result.renders.values()))
-            for run, result in done
-        ],
-        figures=[] if asked.ending == results.INTERRUPTED else list(_figures(recipe, config, done, asked.run)),
+    controls = [name for run, _ in done for name in run.config.controls]
+    parts = [
+        RecipePart(
+            name=run.name,
+            part=run.part,
+            command=run.config.command,
+            object=run.config.object,
+            ending=result.ending,
+            renders=sum(result.renders.values()),
+        )
+        for run, result in done
+    ]
+    result = context.result(
+        RecipeResult,
+        recipe=config.recipe,
+        title=recipe.title,
+        about=recipe.about,
+        quick=config.quick,
+        objects=names["object"],
+        environment=",".join(names["environment"]),
+        model=",".join(names["model"]),
+        controls=list(dict.fromkeys(controls)),
+        parts=parts,
+        figures=recipe_figures,
         warnings=list(dict.fromkeys(warnings)),
-    )  # fmt: skip
-    # a run that was killed has not noted any seconds
-    if resumed is not None and (resumed / "summary.json").is_file():
-        result.seconds["total"] += getattr(
-            read_result(resumed), "seconds", {"total": 0.0}
-        )["total"]
+    )
+    # a run that was killed has no summary with seconds
+    if context.resumed is not None and (context.resumed / "summary.json").is_file():
+        previous = read_result(context.resumed)
+        result.seconds["total"] += getattr(previous, "seconds", {"total": 0.0})["total"]
     return result
 
 
 def check_described(recipe: Recipe, config: RecipeConfig) -> None:
-    """Read everything that a recipe says, so that an InputError tells what is wrong
-    before anything is rendered.
+    """Check the photographs and figures of a recipe before anything is rendered.
+
+    Raises:
+        InputError: if something that the recipe describes cannot work.
     """
     if config.photographs is not None:
-        if not (wanted := _photographed(recipe, planned(recipe, config))):
+        photographed = _select_photographed(recipe, planned(recipe, config))
+        if not photographed:
             raise InputError(
                 f"photographs: {config.recipe} keeps no pictures to compare them with; "
                 "recipe realism does"
             )
         photographs = workbench.load_photographs()
-        for run in wanted:
-            photographs.list_files(
-                Path(config.photographs) / Path(run.config.object).stem, run.config.task
-            )
+        for run in photographed:
+            directory = Path(config.photographs) / Path(run.config.object).stem
+            photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_options(figure, config.recipe)
         if kind == "cues" and config.task_name == wording.DETECTION:
@@ -174,133 +214,163 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
 
 
 def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
-    """Load all that the runs name, as a wrong name would end hours of rendering; return
-    each part's parameters.
+    """Load everything that the runs name, and return the parameters of each part.
+
+    A wrong name would otherwise end hours of rendering.
     """
-    known = dict[str, set[str]]()
+    parameters_of_settings = dict[str, set[str]]()
     columns = defaultdict[str, set[str]](set)
-    searches = {run.name: run.config for run in runs}
+    config_of_run = {run.name: run.config for run in runs}
     for run in runs:
-        plain = {
+        # runs that differ in these alone are loaded once
+        distinct_settings = {
             name: value
             for name, value in run.config.plain().items()
             if name not in ("seed", WORKERS)
         }
-        same = f"{plain} {run.around}"
-        if same not in known:
-            known[same] = _check_run(
-                run.config, searches[run.around] if run.around else None
-            )
-        columns[run.part] |= known[same]
+        key = f"{distinct_settings} {run.around}"
+        if key not in parameters_of_settings:
+            search = config_of_run[run.around] if run.around else None
+            parameters_of_settings[key] = _check_run(run.config, search)
+        columns[run.part] |= parameters_of_settings[key]
         if getattr(run.config, WORKERS, None) is not None:
             columns[run.part].add(WORKERS)
     return columns
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
-    """Load what a run names, and return the parameters of its rows; those of `search`
-    where it draws around one.
+    """Load what a run names, and return the parameters of its rows.
+
+    If it samples around the result of a search, `search` has the settings of that.
     """
     if search is None and isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
-    names = set[str]()
+    columns = set[str]()
     if search is None:
-        names.add(TRIAL)  # rows of an attack are its trials
+        columns.add(TRIAL)  # rows of an attack are its trials
         assert isinstance(config, AttackConfig)
         workbench.check_from_config(config)
     source = search or config
     for name in (*source.controls, *getattr(source, "over", {})):
         kind = name.partition(":")[0]
-        declared = (
-            workbench.CONTROLS[kind].parameters if kind in workbench.CONTROLS else ()
-        )
-        names |= {f"{name}.{parameter.name}" for parameter in declared} or {
-            f"{name}.{ANY}"
-        }
-    return names
+        parameters = []
+        if kind in workbench.CONTROLS:
+            parameters = [each.name for each in workbench.CONTROLS[kind].parameters]
+        columns |= {f"{name}.{parameter}" for parameter in parameters or [ANY]}
+    return columns
 
 
 def check_figures(
     recipe: Recipe, columns: Mapping[str, Collection[str]], where: str
 ) -> None:
-    """Refuse, by an InputError, a figure of a part or a column that there is not;
-    `columns` are those of each part.
+    """Check that the parts and columns that figures name exist.
+
+    Args:
+        recipe: the recipe with the figures.
+        columns: names of columns by part.
+        where: the recipe's file or name, for messages.
+
+    Raises:
+        InputError: if a part or a column does not exist.
+    """
+    for index, described in enumerate(recipe.figures, start=1):
+        kind, options = read_options(described, where)
+        location = f"It stands in {where}, figure {index} ({kind})"
+        baseline = getattr(options, "beside", None)
+        option_parts = [("of", part) for part in options.of]
+        if baseline:
+            option_parts.append(("beside", baseline))
+        known_parts = [*recipe.parts, PHOTOGRAPHS]
+        for option, part in option_parts:
+            if part not in known_parts:
+                raise errors.UnknownNameError(
+                    "part", part, known_parts, f"{location}, as `{option}`."
+                )
+        columns_of_part = {
+            part: part_columns
+            for part, part_columns in columns.items()
+            if part != baseline and part in (options.of or columns)
+        }
+        if not columns_of_part:
+            continue
+        for option in NAMING:
+            value = getattr(options, option, None) or ()
+            names = [value] if isinstance(value, str) else value
+            for name in names:
+                _check_column(recipe, name, option, columns_of_part, location)
+
+
+def _check_column(
+    recipe: Recipe,
+    name: str,
+    option: str,
+    columns_of_part: Mapping[str, Collection[str]],
+    location: str,
+) -> None:
+    """Check that all parts of a figure have a column.
+
+    Raises:
+        InputError: if no part has it, or only some have.
     """
     known = {*OUTER, *([rates.GROUP] if recipe.groups else [])}
-    for number, described in enumerate(recipe.figures, start=1):
-        kind, options = read_options(described, where)
-        place = f"It stands in {where}, figure {number} ({kind})"
-        beside = getattr(options, "beside", None)
-        for option, part in [
-            *(("of", part) for part in options.of),
-            *([("beside", beside)] if beside else []),
-        ]:
-            if part not in (*recipe.parts, PHOTOGRAPHS):
-                raise errors.UnknownNameError(
-                    "part",
-                    part,
-                    [*recipe.parts, PHOTOGRAPHS],
-                    f"{place}, as `{option}`.",
-                )
-        shown = {
-            part: has
-            for part, has in columns.items()
-            if part != beside and part in (options.of or columns)
-        }
-        for option in NAMING if shown else ():
-            value = getattr(options, option, None) or ()
-            for column in [value] if isinstance(value, str) else value:
-                names = {column, f"{column.partition('.')[0]}.{ANY}"}
-                lacking = [
-                    part
-                    for part, has in shown.items()
-                    if column not in known and not names & {*has}
-                ]
-                if len(lacking) == len(shown):
-                    others = {
-                        name
-                        for has in shown.values()
-                        for name in has
-                        if not name.endswith(ANY)
-                    }
-                    raise errors.UnknownNameError(
-                        "column", column, known | others, f"{place}, as `{option}`."
-                    )
-                if lacking:
-                    raise InputError(
-                        f"{place}: {lacking[0]} has no {column}; name the "
-                        "parts that have it as `of`"
-                    )
-
-
-def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun]:
-    """The runs that photographs are compared with: they keep all pictures, with which
-    those can be aligned.
-    """
-    drawn_anew = [run for run in runs if recipe.parts[run.part].drawn_as is None]
-    return [
-        run
-        for run in drawn_anew
-        if isinstance(run.config, SweepConfig) and run.config.keep_pictures == "all"
+    if name in known:
+        return
+    # a control that does not declare its parameters may have this one
+    matching = {name, f"{name.partition('.')[0]}.{ANY}"}
+    lacking = [
+        part
+        for part, columns in columns_of_part.items()
+        if matching.isdisjoint(columns)
     ]
+    if len(lacking) == len(columns_of_part):
+        for columns in columns_of_part.values():
+            known |= {column for column in columns if not column.endswith(ANY)}
+        raise errors.UnknownNameError(
+            "column", name, known, f"{location}, as `{option}`."
+        )
+    if lacking:
+        raise InputError(
+            f"{location}: {lacking[0]} has no {name}; name the "
+            "parts that have it as `of`"
+        )
 
 
-def _carried_out(
-    runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]
+def _select_photographed(
+    recipe: Recipe, runs: Sequence[PlannedRun]
+) -> list[PlannedRun]:
+    """Select the runs that photographs are compared with.
+
+    They are sweeps with configurations of their own that store all images, with which
+    photographs can be aligned.
+    """
+    selected = []
+    for run in runs:
+        repeats_another = recipe.parts[run.part].drawn_as is not None
+        if repeats_another or not isinstance(run.config, SweepConfig):
+            continue
+        if run.config.keep_pictures == "all":
+            selected.append(run)
+    return selected
+
+
+def _run_parts(
+    runs: Sequence[PlannedRun], context: RunContext[RecipeConfig]
 ) -> tuple[list[DoneRun], list[str]]:
-    """Carry out what is not done, until a run is interrupted; return the runs, and a
-    sentence for each left out.
+    """Run what is not finished, until a run is interrupted.
+
+    Returns:
+        The runs with their results, and a sentence for each run that was left out.
     """
     done = list[DoneRun]()
     left_out = list[str]()
     for number, run in enumerate(runs, start=1):
         config = run.config
-        asked.progress.message(
+        context.progress.message(
             f"run {number} of {len(runs)}: {run.part}, {config.object}"
         )
         if run.around is not None:
             search: Any = read_result(
-                RunDirectory.locate_part(asked.run.path, run.around)
+                RunDirectory.locate_part(context.run.path, run.around)
             )
             if search.distribution is None:
                 left_out.append(
@@ -310,7 +380,7 @@ def _carried_out(
                 )
                 continue
             config = around(config, search.distribution, search.configuration or {})
-        result = asked.run_part(run.name, config)
+        result = context.run_part(run.name, config)
         done.append((run, result))
         if result.goes_on:
             break
@@ -320,110 +390,159 @@ def _carried_out(
 def around(
     config: SceneConfig, distribution: Any, searched: Mapping[str, Any]
 ) -> SceneConfig:
-    """Draw evenly from the distribution that a search found, over the ranges that it
-    searched: mean and deviation are the same. An even distribution of deviation s is
-    sqrt(12) s wide. The ranges end where the search's did; angles that go all the way
-    round may pass that end, and take the whole turn at most.
+    """Return settings that sample uniformly around the distribution a search found.
+
+    Mean and standard deviation are the same: a uniform distribution of deviation s is
+    sqrt(12) s wide. Its range is clipped to that of the search. Angles whose range is
+    the full circle are not clipped, but span one turn at most.
+
+    Args:
+        config: settings of the run that samples.
+        distribution: mean of each parameter, and deviations as fractions of ranges.
+        searched: the parameters of the search with their ranges.
     """
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(
         distribution.mean.items(), distribution.deviation, strict=True
     ):
-        control, _, parameter = name.partition(".")
-        declared = next(
+        control, _, parameter_name = name.partition(".")
+        parameter = next(
             known
             for known in workbench.CONTROLS[control].parameters
-            if known.name == parameter
+            if known.name == parameter_name
         )
-        ends = searched[name].low, searched[name].high, mean.value
-        low, high, at = (
-            math.log(value) if declared.log else float(value) for value in ends
-        )
-        wide = math.sqrt(3.0) * deviation * (high - low)
-        if declared.periodic and high - low >= TURN:
-            drawn = [at - min(wide, TURN / 2), at + min(wide, TURN / 2)]
-        else:
-            drawn = [max(at - wide, low), min(at + wide, high)]
-        controls.setdefault(control, {})[parameter] = (
-            [math.exp(end) for end in drawn] if declared.log else drawn
+        controls.setdefault(control, {})[parameter_name] = _range_around(
+            mean.value, deviation, (searched[name].low, searched[name].high), parameter
         )
     return config.model_copy(update={"controls": controls, "sampler": "random"})
 
 
-def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list[str]:
-    """Take the photographs in a folder into the runs that are compared with some;
-    return what is missing.
+def _range_around(
+    mean: float, deviation: float, search_range: tuple[float, float], parameter: Any
+) -> list[float]:
+    """Return the range of a uniform distribution, inside the range of the search.
+
+    Args:
+        mean: mean of the distribution.
+        deviation: standard deviation as a fraction of the search's range.
+        search_range: bounds of the search.
+        parameter: the parameter, which may be logarithmic or periodic.
+    """
+    to_scale = math.log if parameter.log else float
+    lower, upper, center = (to_scale(value) for value in (*search_range, mean))
+    half_width = math.sqrt(3.0) * deviation * (upper - lower)
+    if parameter.periodic and upper - lower >= TURN:
+        half_width = min(half_width, TURN / 2)
+        bounds = [center - half_width, center + half_width]
+    else:
+        bounds = [max(center - half_width, lower), min(center + half_width, upper)]
+    if parameter.log:
+        return [math.exp(bound) for bound in bounds]
+    return bounds
+
+
+def _add_photographs(
+    folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory
+) -> list[str]:
+    """Add photographs to the runs that they are compared with.
+
+    Args:
+        folder: has a directory of photographs for each object, of its name.
+        wanted: the runs to add them to.
+        run: the run of the recipe.
+
+    Returns:
+        A sentence for each run without photographs.
+
+    Raises:
+        InputError: if no run has any.
     """
     photographs = workbench.load_photographs()
     missing = list[str]()
-    for each in wanted:
-        inside = folder / Path(each.config.object).stem
-        files = photographs.list_files(inside, each.config.task)
-        photographs.add_files(RunDirectory.locate_part(run.path, each.name), files)
-        missing += (
-            [] if files else [f"{each.config.object}: {inside} has no photographs."]
-        )
+    for planned_run in wanted:
+        object_name = planned_run.config.object
+        directory = folder / Path(object_name).stem
+        files = photographs.list_files(directory, planned_run.config.task)
+        part = RunDirectory.locate_part(run.path, planned_run.name)
+        photographs.add_files(part, files)
+        if not files:
+            missing.append(f"{object_name}: {directory} has no photographs.")
     if len(missing) == len(wanted):
-        names = ", ".join(Path(each.config.object).stem for each in wanted[:8])
+        stems = [Path(planned_run.config.object).stem for planned_run in wanted[:8]]
         raise InputError(
             "photographs: expected some in a folder for each object "
-            f"({names}) in {folder}, got none"
+            f"({', '.join(stems)}) in {folder}, got none"
         )
     return missing
 
 
-def _figures(
-    recipe: Recipe, config: RecipeConfig, done: Sequence[DoneRun], kept: RunDirectory
+def _write_figures(
+    recipe: Recipe,
+    config: RecipeConfig,
+    done: Sequence[DoneRun],
+    recipe_run: RunDirectory,
 ) -> Iterator[RecipeFigure]:
+    """Write the images of all figures of a recipe, and yield their content."""
+    rows = _read_frame(recipe, done, recipe_run)
+    number = 0
+    # all options are read before the first figure is made
+    kinds = [read_options(described, config.recipe) for described in recipe.figures]
+    for kind, options in kinds:
+        for figure in make(rows, kind, options):
+            number += 1
+            for suffix, data in files_of(figure).items():
+                recipe_run.write_file(f"images/figure-{number}.{suffix}", data)
+            yield RecipeFigure.of({"figure": kind, **vars(figure)})
+
+
+def _read_frame(
+    recipe: Recipe, done: Sequence[DoneRun], recipe_run: RunDirectory
+) -> Rows:
+    """Read the rows of all runs into one frame."""
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
     surfaces = dict[str, Any]()
     for run, result in done:
-        kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
+        row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
         if isinstance(run.config, SweepConfig):
-            kinds = {
+            row_kinds = {
                 run.part: ("sweep",),
                 PHOTOGRAPHS: workbench.load_photographs().row_kinds,
             }
-            surfaces |= {run.name: result.surface} if result.surface else {}
+            if result.surface:
+                surfaces[run.name] = result.surface
         workers = getattr(run.config, WORKERS, None)
         more = {} if workers is None else {WORKERS: workers}
-        for part, names in kinds.items():
-            folder = RunDirectory.locate_part(kept.path, run.name)
-            stored, of_them = read_rows(
-                part, folder, result, run.config.seed, names, **more
+        folder = RunDirectory.locate_part(recipe_run.path, run.name)
+        for part, kinds in row_kinds.items():
+            part_rows, part_units = read_rows(
+                part, folder, result, run.config.seed, kinds, **more
             )
-            rows = rows + stored
-            units = units | of_them
-    table = frame_of(
+            rows += part_rows
+            units |= part_units
+    return frame_of(
         rows,
         recipe.groups,
         units=units,
         surfaces=surfaces,
         cores=workbench.cores(),
-        folder=kept.path,
+        folder=recipe_run.path,
     )
-    wanted = [read_options(described, config.recipe) for described in recipe.figures]
-    every = (
-        (kind, made) for kind, options in wanted for made in make(table, kind, options)
-    )
-    for number, (kind, made) in enumerate(every, start=1):
-        for suffix, data in files_of(made).items():
-            kept.write_file(f"images/figure-{number}.{suffix}", data)
-        yield RecipeFigure.of({"figure": kind, **vars(made)})
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure and its options; refuse a kind that there is not, or
-    such an option.
+    """Return the kind of a figure and its options.
+
+    Raises:
+        InputError: if the kind or an option does not exist, or a value is wrong.
     """
     kind = str(described.get("figure", ""))
     if kind not in FIGURES:
         raise errors.UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
+    options_type, _ = FIGURES[kind]
+    values = {name: value for name, value in described.items() if name != "figure"}
     try:
-        return kind, FIGURES[kind][0](
-            **{name: value for name, value in described.items() if name != "figure"}
-        )
+        return kind, options_type(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
             f"{where}: figures: {kind}: {first_of(error)}; see docs/recipes.md"
@@ -431,25 +550,29 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
-    """Yield a figure, or one for each model; an InputError where it needs what the
-    predictions do not have.
+    """Yield a figure, or one for each model if the kind does not compare models.
+
+    Raises:
+        InputError: if the rows lack what the figure needs.
     """
-    parts = rows[rates.PART]
-    made = FIGURES[kind][1]
-    shown = rows[parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS]
-    together = (
-        kind in TOGETHER
-        or rates.MODEL in vars(options).values()
-        or rates.MODEL not in shown
-    )
-    models = {"": shown} if together else rates.by(shown, rates.MODEL)
-    for name, some in models.items():
-        figure = made(some, options)
+    part = rows[rates.PART]
+    _, make_figure = FIGURES[kind]
+    is_selected = part.isin(options.parts) if options.parts else part != PHOTOGRAPHS
+    selected = rows[is_selected]
+    compares_models = kind in TOGETHER or rates.MODEL in vars(options).values()
+    rows_of_model = {"": selected}
+    if not compares_models and rates.MODEL in selected:
+        rows_of_model = rates.by(selected, rates.MODEL)
+    for model, model_rows in rows_of_model.items():
+        figure = make_figure(model_rows, options)
         title = options.title or figure.title
-        yield replace(figure, title=title if len(models) == 1 else f"{title}: {name}")
+        if len(rows_of_model) > 1:
+            title = f"{title}: {model}"
+        yield replace(figure, title=title)
 
 
 def files_of(made: MadeFigure) -> dict[str, bytes]:
+    """Draw a figure, and return its files by suffix."""
 
     def draw(figure: Any) -> None:
         figure.suptitle(made.title, x=0.01, ha="left", fontsize=10, fontweight="bold")

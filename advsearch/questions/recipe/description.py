@@ -1,6 +1,4 @@
-"""A recipe as its YAML file describes it, and the runs that it comes to: a part is
-carried out once for each object.
-"""
+"""Recipes as their YAML files describe them, and the runs that they consist of."""
 
 from __future__ import annotations
 
@@ -30,9 +28,10 @@ CONFIGS: Mapping[str, type[SceneConfig]] = {
     "sweep": SweepConfig,
 }
 """The settings of a part, by its command."""
-PHOTOGRAPHS = "photographs"  # the part that photographs are of
+# the part that the rows of photographs belong to
+PHOTOGRAPHS = "photographs"
 OF_THE_COMMAND = (*settings.PLACE, "seed", "threads", "deterministic")
-"""Settings that are said with the command and not in its file."""
+"""Settings that belong to the command line and not into a recipe's file."""
 
 MOST_PARTS = 64
 MOST_FIGURES = 32
@@ -44,13 +43,16 @@ Settings = dict[str, object]
 
 
 class _Described(BaseModel):
+    """Base of what a recipe's file describes; unknown names are errors."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Part(_Described):
-    """Runs of one command, one for each object. It draws from the distributions that
-    the searches of the part `around` found, or the very configurations that the part
-    `drawn_as` does, which has the same ranges.
+    """Runs of one command, one for each object.
+
+    A part samples around the distributions that the searches of the part `around`
+    found, or the same configurations as the part `drawn_as`, which has the same ranges.
     """
 
     command: Literal["attack", "sweep"]
@@ -60,7 +62,8 @@ class Part(_Described):
 
     @field_validator("settings")
     @classmethod
-    def _not_own(cls, value: Settings) -> Settings:
+    def _reject_per_run_settings(cls, value: Settings) -> Settings:
+        """Reject settings that are the same for all parts."""
         for name in (*OF_THE_COMMAND, "object", "label"):
             if name in value:
                 raise ValueError(
@@ -70,9 +73,7 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """What `quick` makes different: settings of all parts, settings of each, and parts
-    that are left out.
-    """
+    """Changes that `quick` makes: to settings of all parts, of single parts, parts left out."""
 
     settings: Settings = Field(default_factory=dict)
     parts: dict[str, Settings] = Field(default_factory=dict)
@@ -80,10 +81,16 @@ class Changes(_Described):
 
 
 class Recipe(_Described):
-    """What a recipe's file says (docs/recipes.md): its question, what is done for a
-    result and whose experiment it is, settings of all parts, parts in the order in
-    which they are carried out, figures with a `figure`, their kind, and options, groups
-    of objects by name, and what is different when it should be quick.
+    """An experiment as a recipe's file describes it (docs/recipes.md).
+
+    Attributes:
+        title: the question it answers.
+        about: what is done for a result, and whose experiment it is.
+        settings: settings of all parts.
+        parts: parts by name, in the order in which they run.
+        figures: kind (`figure`) and options of each figure.
+        groups: names of objects by group.
+        quick: changes for a quick look.
     """
 
     title: Annotated[str, Field(min_length=1, max_length=200)]
@@ -98,7 +105,8 @@ class Recipe(_Described):
 
     @field_validator("settings")
     @classmethod
-    def _no_place(cls, value: Settings) -> Settings:
+    def _reject_command_settings(cls, value: Settings) -> Settings:
+        """Reject settings that belong to the command line."""
         for name in OF_THE_COMMAND:
             if name in value:
                 raise ValueError(
@@ -108,8 +116,10 @@ class Recipe(_Described):
 
     @field_validator("parts")
     @classmethod
-    def _names(cls, value: dict[str, Part]) -> dict[str, Part]:
-        for number, (name, part) in enumerate(value.items()):
+    def _check_part_names(cls, value: dict[str, Part]) -> dict[str, Part]:
+        """Check the names of parts, and that parts refer to earlier ones only."""
+        earlier = list[str]()
+        for name, part in value.items():
             if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
                 raise ValueError(
                     "expected names of small letters, digits and "
@@ -120,29 +130,31 @@ class Recipe(_Described):
                     f"expected another name than {name!r}, which photographs have"
                 )
             for key, other in (("around", part.around), ("drawn_as", part.drawn_as)):
-                if other is not None and other not in list(value)[:number]:
+                if other is not None and other not in earlier:
                     raise ValueError(
                         f"{name}: {key}: expected a part before it, got {other[:40]!r}"
                     )
+            earlier.append(name)
         return value
 
     def made_quick(self) -> Recipe:
+        """Return the recipe with the changes of `quick`.
+
+        Raises:
+            UnknownNameError: if a change is to a part that does not exist.
+        """
         for name in (*self.quick.parts, *self.quick.without):
             if name not in self.parts:
                 raise errors.UnknownNameError(
                     "part", name, self.parts, "It stands under `quick` in the recipe."
                 )
-        parts = {
-            name: part.model_copy(
-                update={
-                    "settings": settings.merged(
-                        part.settings, self.quick.parts.get(name, {})
-                    )
-                }
-            )
-            for name, part in self.parts.items()
-            if name not in self.quick.without
-        }
+        parts = dict[str, Part]()
+        for name, part in self.parts.items():
+            if name in self.quick.without:
+                continue
+            changes = self.quick.parts.get(name, {})
+            part_settings = settings.merged(part.settings, changes)
+            parts[name] = part.model_copy(update={"settings": part_settings})
         return self.model_copy(
             update={
                 "settings": settings.merged(self.settings, self.quick.settings),
@@ -152,18 +164,22 @@ class Recipe(_Described):
 
 
 def recipe_names() -> tuple[str, ...]:
-    return tuple(
-        sorted(
-            path.name[:-5] for path in BUNDLED.iterdir() if path.name.endswith(".yaml")
-        )
-    )
+    """Return the names of the bundled recipes, sorted."""
+    files = (path.name for path in BUNDLED.iterdir())
+    return tuple(sorted(name[:-5] for name in files if name.endswith(".yaml")))
 
 
 def titles() -> dict[str, str]:
+    """Return the titles of the bundled recipes by name."""
     return {name: read_recipe(name).title for name in recipe_names()}
 
 
 def recipe_yaml(name: str) -> str:
+    """Return the text of a bundled recipe's file.
+
+    Raises:
+        UnknownNameError: if there is no such recipe.
+    """
     if name not in recipe_names():
         raise errors.UnknownNameError(
             "recipe",
@@ -175,38 +191,39 @@ def recipe_yaml(name: str) -> str:
 
 
 def describe(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the text of a bundled recipe, and what it says as JSON values."""
+    """Return the text of a bundled recipe, and its content as JSON values."""
     text = recipe_yaml(name).rstrip("\n")
     return text, read_recipe(name).model_dump(mode="json")
 
 
 def read_recipe(name: str) -> Recipe:
-    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or
-    a folder before it.
+    """Read a bundled recipe by its name, or a YAML file by its path.
+
+    A path has a suffix or a directory.
     """
     if is_file_name(name):
         return recipe_of(settings.read_yaml(name), name)
-    recipe_yaml(name)
+    recipe_yaml(name)  # an unknown name is an error
     with resources.as_file(BUNDLED / f"{name}.yaml") as path:
         return recipe_of(settings.read_yaml(path), name)
 
 
 def is_file_name(name: str) -> bool:
+    """Return whether a recipe is named by the path of a file."""
     return "/" in name or Path(name).suffix != ""
 
 
 def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
-    """Return the recipe that a mapping in the file `where` describes; a FileFormatError
-    where it describes none.
+    """Parse the content of a recipe's file; `where` names the file in messages.
+
+    Raises:
+        FileFormatError: if it describes no recipe.
     """
+    values = {
+        name: value for name, value in data.items() if name not in ("schema", "command")
+    }
     try:
-        return Recipe(
-            **{
-                name: value
-                for name, value in data.items()
-                if name not in ("schema", "command")
-            }
-        )
+        return Recipe(**values)
     except ValidationError as error:
         raise errors.FileFormatError(
             f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one"
@@ -218,21 +235,16 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
 
 
 def first_of(error: ValidationError) -> str:
-    """Return what is wrong first, and where: ``parts.a.shell: Extra inputs are not
-    permitted``.
-    """
+    """Format the first problem: ``parts.a.shell: Extra inputs are not permitted``."""
     first = error.errors(include_url=False, include_input=False)[0]
-    return (
-        f"{'.'.join(map(str, first['loc']))[:80]}: "
-        f"{first['msg'].removeprefix('Value error, ')[:200]}"
-    )
+    location = ".".join(map(str, first["loc"]))
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{location[:80]}: {message[:200]}"
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a recipe; `around` is the folder of the run whose result says what is
-    drawn.
-    """
+    """A run of a recipe; `around` is the directory of the run whose result it samples around."""
 
     name: str
     part: str
@@ -241,61 +253,29 @@ class PlannedRun:
 
 
 def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
-    """Return the runs of a recipe in the order in which they are carried out; an
-    InputError names a part with a setting that its command has not. A run is about one
-    object; a search, about one environment and one model, too.
+    """Plan the runs of a recipe in the order in which they run.
+
+    A run has one object; a search has one environment and one model too.
+
+    Raises:
+        InputError: if a part has a setting that its command lacks, or there are too
+            many runs.
     """
-    chosen = made_of(recipe, config)
+    recipe = made_of(recipe, config)
     runs = list[PlannedRun]()
-    for name, part in chosen.parts.items():
-        where = f"{config.recipe}: parts: {name}"
-        kind = CONFIGS[part.command]
-        part_settings = {**chosen.settings, **part.settings}
-        usual = {}
-        if part.command == "attack":
-            usual = {
-                "environment": SceneConfig.default_environment,
-                "model": "reference",
-            }
-        axes = {
-            axis: names_listed(part_settings.get(axis) or names)
-            for axis, names in {"object": "", **usual}.items()
-        }
-        for number, values in enumerate(product(*axes.values())):
-            own: Settings = dict(zip(axes, values, strict=True))
+    for name, part in recipe.parts.items():
+        axes = _list_axes(recipe, part)
+        for index, values in enumerate(product(*axes.values())):
+            value_of_axis = dict(zip(axes, values, strict=True))
+            run_config = _make_run_config(recipe, name, index, value_of_axis, config)
             words = [
-                word
-                for axis, word in zip(axes, values, strict=True)
+                value
+                for axis, value in value_of_axis.items()
                 if axis == "object" or len(axes[axis]) > 1
             ]
-            # a seed of its own, so that no two runs draw the same
-            own["seed"] = seeds.stream(
-                config.seed, f"recipe {part.drawn_as or name} {number}"
-            )
-            own |= (
-                {"deterministic": True}
-                if config.deterministic
-                else {"threads": config.threads}
-            )
-            if (label := config.label_of(str(own["object"]))) is not None:
-                own["label"] = label
-            try:
-                made = kind(**{**part_settings, **own})
-            except settings.SettingsError as error:
-                raise settings.SettingsError(error.problems, where) from None
-            except errors.UnknownNameError:
-                raise
-            except InputError as error:
-                raise InputError(f"{where}: {error}") from None
-            folder = f"{number:02d}-{folder_name(words)}"
-            runs.append(
-                PlannedRun(
-                    f"{name}-{folder}",
-                    name,
-                    made,
-                    part.around and f"{part.around}-{folder}",
-                )
-            )
+            suffix = f"{index:02d}-{folder_name(words)}"
+            around = f"{part.around}-{suffix}" if part.around else part.around
+            runs.append(PlannedRun(f"{name}-{suffix}", name, run_config, around))
     if len(runs) > MOST_RUNS:
         raise InputError(
             f"{config.recipe}: expected at most {MOST_RUNS} runs, got "
@@ -304,21 +284,75 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     return runs
 
 
+def _list_axes(recipe: Recipe, part: Part) -> dict[str, list[str]]:
+    """Return the settings of a part whose values are combined to its runs."""
+    defaults = {"object": ""}
+    if part.command == "attack":
+        defaults["environment"] = SceneConfig.default_environment
+        defaults["model"] = "reference"
+    part_settings = {**recipe.settings, **part.settings}
+    return {
+        axis: names_listed(part_settings.get(axis) or default)
+        for axis, default in defaults.items()
+    }
+
+
+def _make_run_config(
+    recipe: Recipe,
+    name: str,
+    index: int,
+    value_of_axis: Mapping[str, str],
+    config: RecipeConfig,
+) -> SceneConfig:
+    """Make the settings of the run `index` of the part `name`."""
+    part = recipe.parts[name]
+    # different in each run, so that no two runs draw the same samples
+    seed_name = f"recipe {part.drawn_as or name} {index}"
+    run_settings: Settings = {
+        **recipe.settings,
+        **part.settings,
+        **value_of_axis,
+        "seed": seeds.stream(config.seed, seed_name),
+    }
+    if config.deterministic:
+        run_settings["deterministic"] = True
+    else:
+        run_settings["threads"] = config.threads
+    label = config.label_of(value_of_axis["object"])
+    if label is not None:
+        run_settings["label"] = label
+    where = f"{config.recipe}: parts: {name}"
+    config_type = CONFIGS[part.command]
+    try:
+        return config_type(**run_settings)
+    except settings.SettingsError as error:
+        raise settings.SettingsError(error.problems, where) from None
+    except errors.UnknownNameError:
+        raise
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
 def folder_name(words: Iterable[str]) -> str:
-    """Return a name for a folder of what files or names say, such as ``mug-studio``."""
-    stem, *others = words
-    return _safe_name(
-        "-".join([Path(stem).stem, *(_safe_name(Path(word).stem) for word in others)])
-    )
+    """Join names, or the stems of files, to the name of a directory: ``mug-studio``."""
+    first, *others = words
+    names = [Path(first).stem, *(_safe_name(Path(other).stem) for other in others)]
+    return _safe_name("-".join(names))
 
 
 def _safe_name(text: str) -> str:
+    """Reduce a text to lowercase letters, digits and hyphens."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:80] or "attack"
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
-    """Refuse, by an InputError, a part that would do more than its run: connect, or
-    start more processes than there are processors. A bundled recipe may.
+    """Reject a part that would do more than its run, unless the recipe is a bundled one.
+
+    That is to connect to other machines, or to start more processes than there are
+    cores.
+
+    Raises:
+        InputError: for the first such part.
     """
     if is_file_name(name) or recipe != read_recipe(name):
         for run in runs:
@@ -326,10 +360,13 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
 
 
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
-    """Return the recipe as it was asked for: quick or not, with the objects,
-    environments and models of `config`.
+    """Return the recipe with the settings of the command, and of `quick` if it is set.
+
+    Raises:
+        InputError: if neither names an object.
     """
-    chosen = recipe.made_quick() if config.quick else recipe
+    if config.quick:
+        recipe = recipe.made_quick()
     names = (
         "object",
         "environment",
@@ -344,19 +381,18 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
         "unit",
         "resolution",
     )
-    asked = {
-        name: value for name in names if (value := getattr(config, name)) is not None
-    }
-    all_settings: Settings = {**chosen.settings, **asked}
-    if "object" not in all_settings:
+    merged: Settings = dict(recipe.settings)
+    for name in names:
+        value = getattr(config, name)
+        if value is not None:
+            merged[name] = value
+    if "object" not in merged:
         raise InputError(f"object: expected one, since {config.recipe} names none")
-    return chosen.model_copy(update={"settings": all_settings})
+    return recipe.model_copy(update={"settings": merged})
 
 
 def names_listed(value: object) -> list[str]:
-    """Return names that stand in a list, or in a text with commas between them."""
-    return (
-        [str(name) for name in value]
-        if isinstance(value, (list, tuple))
-        else list(settings.split_names(str(value)))
-    )
+    """Return the names of a list, or of a text in which commas separate them."""
+    if isinstance(value, (list, tuple)):
+        return [str(name) for name in value]
+    return list(settings.split_names(str(value)))

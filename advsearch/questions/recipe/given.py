@@ -1,6 +1,4 @@
-"""Figures of which predictions are made: the most frequent, by shape or texture, over
-mixtures (ternary diagrams).
-"""
+"""Figures of predictions: the most frequent, by shape or texture, over mixtures."""
 
 from __future__ import annotations
 
@@ -19,78 +17,37 @@ from advsearch.extend import figures, statistics, wording
 from advsearch.questions.recipe import rates
 from advsearch.questions.recipe.rates import MadeFigure, Options, Rows, Tally
 
-# letters that a bar of the whole width has room for, and of a name that is cut short
+# characters that fit into a bar of the full width, and the least of a name cut short
 LETTERS = 85
 FEWEST_LETTERS = 4
 
+# a prediction with its count, and how many of these predictions are correct
+PredictionCount = tuple[Tally, int]
+
 
 class PredictionsOptions(Options):
-    """Options of the most frequent predictions."""
+    """Options of the most frequent predictions: by which column, and how many of them."""
 
     by: str
     most: int = Field(default=4, ge=1, le=10)
 
 
 def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
-    # how often each was given, and how often it was a right one
-    groups: dict[str, list[tuple[Tally, int]]] = {}
-    for value, some in rates.by(rows, options.by).items():
+    """Make a figure of the most frequent predictions by the values of a column."""
+    groups = dict[str, list[PredictionCount]]()
+    for value, group_rows in rates.by(rows, options.by).items():
         groups[value] = []
-        for label, _ in rates.most_frequent(some[rates.PREDICTION])[: options.most]:
-            flags = some[rates.PREDICTION] == label
-            groups[value].append(
-                (Tally.over(label, some, flags), int(some["correct"][flags].sum()))
-            )
-    wrong = {
-        value: each[0]
-        for value, each in groups.items()
-        if 2 * each[0][1] < each[0][0].times
-    }
-    known = len(groups) - len(wrong)
-    thing = rates.plural(options.by)
-    text = [
-        f"For {known} of {len(groups)} {thing} the most frequent prediction is "
-        "mostly a right one."
-    ]
-    text += [
-        f"For {value} it is {tally.name}, {tally.told('given')} and right in {right} "
-        "of these."
-        for value, (tally, right) in wrong.items()
-    ]
+        ranking = rates.most_frequent(group_rows[rates.PREDICTION])
+        for label, _ in ranking[: options.most]:
+            flags = group_rows[rates.PREDICTION] == label
+            tally = Tally.over(label, group_rows, flags)
+            n_right = int(group_rows["correct"][flags].sum())
+            groups[value].append((tally, n_right))
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        for place, given in enumerate(groups.values()):
-            left = 0.0
-            for tally, right in given:
-                share = tally.share or 0.0
-                colour = figures.BLUE if 2 * right >= tally.times else figures.RED
-                axes.barh(
-                    place,
-                    share,
-                    left=left,
-                    color=colour,
-                    alpha=0.5,
-                    height=0.72,
-                    edgecolor="white",
-                )
-                axes.text(
-                    left + share / 2,
-                    place,
-                    fitting(tally.name, share),
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                )
-                left += share
-            axes.barh(
-                place,
-                max(1.0 - left, 0.0),
-                left=left,
-                color=figures.GREY,
-                alpha=0.15,
-                height=0.72,
-            )
+        for position, counts in enumerate(groups.values()):
+            _draw_stacked_bar(axes, position, counts)
         axes.set_yticks(range(len(groups)), list(groups))
         axes.invert_yaxis()
         axes.set(
@@ -99,36 +56,98 @@ def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
             xlim=(0.0, 1.0),
         )
 
-    table = [
-        [value, tally.name, *tally.cells, right]
-        for value, given in groups.items()
-        for tally, right in given
-    ]
+    table = list[list[rates.Cell]]()
+    for value, counts in groups.items():
+        for tally, n_right in counts:
+            table.append([value, tally.name, *tally.cells, n_right])
     heads = [options.by, "prediction", "given in", *rates.COUNT, "right"]
     title = f"Most frequent predictions by {options.by}"
+    text = _describe_predictions(groups, rates.plural(options.by))
     return MadeFigure(title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
 
+def _describe_predictions(
+    groups: Mapping[str, Sequence[PredictionCount]], things: str
+) -> list[str]:
+    """Describe for how many groups the most frequent prediction is mostly correct."""
+    sentences = list[str]()
+    for value, counts in groups.items():
+        tally, n_right = counts[0]
+        if 2 * n_right < tally.times:
+            sentences.append(
+                f"For {value} it is {tally.name}, {tally.told('given')} and right in "
+                f"{n_right} of these."
+            )
+    n_mostly_right = len(groups) - len(sentences)
+    overview = (
+        f"For {n_mostly_right} of {len(groups)} {things} the most frequent prediction "
+        "is mostly a right one."
+    )
+    return [overview, *sentences]
+
+
+def _draw_stacked_bar(
+    axes: Any, position: int, counts: Sequence[PredictionCount]
+) -> None:
+    """Draw the most frequent predictions side by side, and all others in gray."""
+    left = 0.0
+    for tally, n_right in counts:
+        share = tally.share or 0.0
+        is_mostly_right = 2 * n_right >= tally.times
+        axes.barh(
+            position,
+            share,
+            left=left,
+            color=figures.BLUE if is_mostly_right else figures.RED,
+            alpha=0.5,
+            height=0.72,
+            edgecolor="white",
+        )
+        axes.text(
+            left + share / 2,
+            position,
+            fitting(tally.name, share),
+            ha="center",
+            va="center",
+            fontsize=7,
+        )
+        left += share
+    axes.barh(
+        position,
+        max(1.0 - left, 0.0),
+        left=left,
+        color=figures.GREY,
+        alpha=0.15,
+        height=0.72,
+    )
+
+
 def fitting(name: str, share: float) -> str:
-    """Return as much of a prediction's name as a bar has room for: the first of several
-    names, or its beginning.
+    """Shorten a prediction's name to what fits into its bar.
+
+    That is the full name, the first of several names, the beginning of it, or nothing.
     """
     room = int(share * LETTERS)
-    first = name.partition(",")[0]
-    cut = f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
-    return next((text for text in (name, first) if len(text) <= room), cut)
+    first_name = name.partition(",")[0]
+    for text in (name, first_name):
+        if len(text) <= room:
+            return text
+    if room > FEWEST_LETTERS:
+        return f"{first_name[: room - 1].rstrip()}…"
+    return ""
 
 
 # ---- shape and texture
-# ----------------------------------------------------------------------------------------------
 
-SEED = 0  # of the pairs that predict, and of the bootstrap
+# seed of the samples that predict, and of the bootstrap
+SEED = 0
 RESAMPLES = 2000
-FEWEST_PAIRS = 4  # pairs of object and texture: two of each
+# pairs of object and texture: two of each
+FEWEST_PAIRS = 4
 
 
 class CuesOptions(Options):
-    """Options of cues; for a texture, `classes` are the predictions that name it."""
+    """Options of cues: columns of texture and shape, and the classes that name a texture."""
 
     texture: str = "material.which"
     shape: str = "object"
@@ -136,130 +155,138 @@ class CuesOptions(Options):
 
 
 def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
-    """Count how often the prediction is the object and how often the texture, and which
-    of both foretells it better.
-    """
+    """Make a figure of how often the prediction is the object or its texture.
 
-    textures = rates.by(rows, options.texture)
-    naming = dict[str, Any]()
-    for texture, some in textures.items():
-        classes = set(options.classes.get(texture, ()))
-        # the whole prediction, or one of the names that it consists of
-        parts = some[rates.PREDICTION].map(
-            lambda label: {label.strip(), *map(str.strip, label.split(","))}
-        )
-        naming[texture] = ~parts.map(classes.isdisjoint)
-    shapes = {name: Tally.over(name, some) for name, some in textures.items()}
-    named = {
-        name: Tally.over(name, some, naming[name]) for name, some in textures.items()
-    }
+    Its sentences also say which of both cues predicts the predictions better.
+    """
+    names_texture = dict[str, Any]()
+    by_shape = dict[str, Tally]()
+    by_texture = dict[str, Tally]()
+    for texture, texture_rows in rates.by(rows, options.texture).items():
+        classes = options.classes.get(texture, ())
+        names_texture[texture] = _names_class(texture_rows[rates.PREDICTION], classes)
+        by_shape[texture] = Tally.over(texture, texture_rows)
+        by_texture[texture] = Tally.over(texture, texture_rows, names_texture[texture])
+
     text = [
         "The prediction is the object, whatever its texture: "
         f"{Tally.over('', rows).told('so')}."
     ]
-    if asked := [name for name in textures if options.classes.get(name)]:
-        flags = pd.concat([naming[name] for name in asked])
+    with_classes = [name for name in names_texture if options.classes.get(name)]
+    if with_classes:
+        flags = pd.concat([names_texture[name] for name in with_classes])
         total = Tally.over("", rows.loc[flags.index], flags)
         text.append(
-            f"The prediction names the texture ({', '.join(asked)}): "
+            f"The prediction names the texture ({', '.join(with_classes)}): "
             f"{total.told('so')}."
         )
-        text += (
-            []
-            if total.share
-            else ["A model that has no class for a texture cannot name it."]
-        )
-    text.append(_which(predicted(rows, options)))
+        if not total.share:
+            text.append("A model that has no class for a texture cannot name it.")
+    text.append(_compare_cues(predicted(rows, options)))
     text += rates.extremes(
-        list(shapes.values()), "The hardest texture", "the easiest", "textures"
+        list(by_shape.values()), "The hardest texture", "the easiest", "textures"
     )
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        ordered = sorted(shapes, key=lambda name: shapes[name].share or 0.0)
-        shape, texture = (
-            [counts[name].share or 0.0 for name in ordered]
-            for counts in (shapes, named)
-        )
-        axes.barh(
-            ordered,
-            shape,
-            color=figures.BLUE,
-            alpha=0.55,
-            height=0.66,
-            label="the object",
-        )
-        axes.barh(
-            ordered,
-            texture,
-            left=shape,
-            color=figures.RED,
-            alpha=0.55,
-            height=0.66,
-            label="the texture",
-        )
-        for place, name in enumerate(ordered):
-            axes.plot(
-                shapes[name].interval(), [place, place], color="#1c1d20", linewidth=1.2
-            )
-        axes.set(
-            xlabel="share of predictions; line: 95 % interval of the object's",
-            xlim=(0.0, 1.0),
-        )
-        axes.grid(True, axis="x")
-        figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
-
-    table = [[name, *shapes[name].cells, named[name].times] for name in textures]
-    heads = [options.texture, "the object", *rates.COUNT, "the texture"]
-    title = "Predictions by shape and by texture"
     return MadeFigure(
-        title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures))
+        "Predictions by shape and by texture",
+        text,
+        [options.texture, "the object", *rates.COUNT, "the texture"],
+        [[name, *by_shape[name].cells, by_texture[name].times] for name in by_shape],
+        lambda figure: _draw_cues(figure, by_shape, by_texture),
+        (6.0, 1.7 + 0.27 * len(by_shape)),
     )
+
+
+def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
+    """Return which predictions (n,) are one of the classes, in full or in a list."""
+    names = predictions.map(
+        lambda label: {label.strip(), *map(str.strip, label.split(","))}
+    )
+    return ~names.map(set(classes).isdisjoint)
+
+
+def _draw_cues(
+    figure: Any, by_shape: Mapping[str, Tally], by_texture: Mapping[str, Tally]
+) -> None:
+    """Draw for each texture the fractions of predictions by shape and by texture."""
+    axes = figure.subplots()
+    ordered = sorted(by_shape, key=lambda name: by_shape[name].share or 0.0)
+    shape_shares = [by_shape[name].share or 0.0 for name in ordered]
+    texture_shares = [by_texture[name].share or 0.0 for name in ordered]
+    style = {"alpha": 0.55, "height": 0.66}
+    axes.barh(ordered, shape_shares, color=figures.BLUE, label="the object", **style)
+    axes.barh(
+        ordered,
+        texture_shares,
+        left=shape_shares,
+        color=figures.RED,
+        label="the texture",
+        **style,
+    )
+    for position, name in enumerate(ordered):
+        axes.plot(
+            by_shape[name].interval(),
+            [position, position],
+            color="#1c1d20",
+            linewidth=1.2,
+        )
+    axes.set(
+        xlabel="share of predictions; line: 95 % interval of the object's",
+        xlim=(0.0, 1.0),
+    )
+    axes.grid(True, axis="x")
+    figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
 
 
 def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
-    """Foretell the predictions about each object with each texture by those about it
-    with others, and with others by it; return of each pair how many predictions there
-    are, and how many of them the shape and the texture foretell. A cue predicts the
-    most frequent one of as many predictions: those about the same object with other
-    textures, and about the same texture on other objects, drawn so that both are as
-    many as the fewer are. None of the predicted predictions is among them, so that a
-    model which goes by neither cue is predicted as well by both.
+    """Count how many predictions the shape and the texture predict, by pair of both.
+
+    A cue predicts the most frequent of the predictions about the same object with
+    other textures, or about the same texture on other objects. Both are sampled to the
+    size of the smaller set. A predicted prediction is in neither set, so that a model
+    that goes by neither cue is predicted equally well by both.
+
+    Returns:
+        For each pair of object and texture: the number of predictions, those that the
+        shape predicts, and those that the texture predicts.
     """
     generator = random.Random(SEED)
-    counts = []
     groups = rows.groupby(
         [rates.column(rows, options.shape), rates.column(rows, options.texture)],
         sort=False,
     )
-    pairs = {pair: list(some[rates.PREDICTION]) for pair, some in groups}
-    for (shape, texture), given in pairs.items():
-        same_shape = [
-            label
-            for (s, t), more in pairs.items()
-            if s == shape and t != texture
-            for label in more
-        ]
-        same_texture = [
-            label
-            for (s, t), more in pairs.items()
-            if t == texture and s != shape
-            for label in more
-        ]
-        if drawn := min(len(same_shape), len(same_texture)):
-            cues = (
-                rates.most_frequent(generator.sample(cue, drawn))[0][0]
-                for cue in (same_shape, same_texture)
+    labels_of_pair = {
+        pair: list(pair_rows[rates.PREDICTION]) for pair, pair_rows in groups
+    }
+    counts = list[tuple[int, int, int]]()
+    for (shape, texture), labels in labels_of_pair.items():
+        same_shape = list[str]()
+        same_texture = list[str]()
+        for (other_shape, other_texture), other_labels in labels_of_pair.items():
+            if other_shape == shape and other_texture != texture:
+                same_shape += other_labels
+            if other_texture == texture and other_shape != shape:
+                same_texture += other_labels
+        n_samples = min(len(same_shape), len(same_texture))
+        if n_samples:
+            by_shape = _most_frequent_of_sample(same_shape, n_samples, generator)
+            by_texture = _most_frequent_of_sample(same_texture, n_samples, generator)
+            counts.append(
+                (len(labels), labels.count(by_shape), labels.count(by_texture))
             )
-            by_shape, by_texture = map(given.count, cues)
-            counts.append((len(given), by_shape, by_texture))
     return counts
 
 
-def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
-    """By how much more the shape predicts than the texture, both of the same
-    predictions. Predictions about one pair go together: the interval is a percentile
-    bootstrap over pairs.
+def _most_frequent_of_sample(
+    labels: Sequence[str], n_samples: int, generator: random.Random
+) -> str:
+    return rates.most_frequent(generator.sample(labels, n_samples))[0][0]
+
+
+def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
+    """Describe by how many percentage points the shape predicts better.
+
+    Predictions about one pair of object and texture are dependent: the interval is a
+    percentile bootstrap over pairs. `pairs` are counts as `predicted` returns them.
     """
     if len(pairs) < FEWEST_PAIRS:
         return (
@@ -267,50 +294,42 @@ def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
             "takes at least two objects and "
             f"two textures, {FEWEST_PAIRS} pairs in all."
         )
-
-    def ahead(some: Sequence[tuple[int, int, int]]) -> float:
-        return (
-            100
-            * sum(shape - texture for _, shape, texture in some)
-            / sum(given for given, _, _ in some)
-        )
-
     generator = random.Random(SEED)
-    outside = round(RESAMPLES * 0.025)
-    drawn = sorted(
-        ahead(generator.choices(pairs, k=len(pairs))) for _ in range(RESAMPLES)
+    resampled = sorted(
+        _shape_advantage(generator.choices(pairs, k=len(pairs)))
+        for _ in range(RESAMPLES)
     )
-    low = drawn[outside]
-    high = drawn[-1 - outside]
-    total, shape, texture = map(sum, zip(*pairs, strict=True))
-    cue = (
-        "shape than by texture"
-        if low > 0.0
-        else "texture than by shape"
-        if high < 0.0
-        else ""
-    )
-    verdict = f"the model goes more by {cue}" if cue else "no difference is shown"
-    by_shape, by_texture = (
-        wording.percent(foretold / total) for foretold in (shape, texture)
-    )
+    n_outside = round(RESAMPLES * 0.025)
+    lower = resampled[n_outside]
+    upper = resampled[-1 - n_outside]
+    verdict = "no difference is shown"
+    if lower > 0.0:
+        verdict = "the model goes more by shape than by texture"
+    elif upper < 0.0:
+        verdict = "the model goes more by texture than by shape"
+    total, n_by_shape, n_by_texture = map(sum, zip(*pairs, strict=True))
     return (
         "The most frequent prediction about the same object with other textures is "
-        f"given in {by_shape}, "
+        f"given in {wording.percent(n_by_shape / total)}, "
         "and that about the same texture on other objects, of as many predictions, in "
-        f"{by_texture}: "
-        f"{ahead(pairs):.0f} points more by shape (95 % interval {low:.0f} to "
-        f"{high:.0f}, over pairs of object and "
+        f"{wording.percent(n_by_texture / total)}: "
+        f"{_shape_advantage(pairs):.0f} points more by shape "
+        f"(95 % interval {lower:.0f} to {upper:.0f}, over pairs of object and "
         f"texture): {verdict}."
     )
 
 
+def _shape_advantage(pairs: Sequence[tuple[int, int, int]]) -> float:
+    """Compute the percentage points by which the shape predicts better."""
+    difference = sum(by_shape - by_texture for _, by_shape, by_texture in pairs)
+    return 100 * difference / sum(total for total, _, _ in pairs)
+
+
 # ---- mixtures
-# -------------------------------------------------------------------------------------------------------
 
 Doubles = npt.NDArray[np.float64]
 Shares = tuple[float, float, float]
-# how far along the first and the second share it is, and whether it points down
+# indices along the first and the second share, and whether it points down
 Triangle = tuple[int, int, bool]
 MEANINGLESS = (
     "The prediction is {} in every picture, so that shares of predictions tell "
@@ -320,9 +339,11 @@ MEANINGLESS = (
 
 
 class TernaryOptions(Options):
-    """Options of ternary diagrams of three shares. Of normalised ones the colours of
-    each prediction end at its own largest share, and those of leads begin at the
-    smallest; `side` is triangles along a side.
+    """Options of ternary diagrams of three fractions.
+
+    With `normalised` the colors of each prediction end at its own largest fraction, and
+    those of margins begin at the smallest. `side` is the number of triangles along a
+    side.
     """
 
     shares: tuple[str, str, str]
@@ -332,215 +353,293 @@ class TernaryOptions(Options):
 
 
 def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
-    """Count where in a mixture each prediction is given; where all are the same, how
-    far the right one leads.
+    """Make a figure of where in a mixture each prediction is frequent.
+
+    If all predictions are the same, it shows the margin of the right label instead.
     """
-    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
-    sums = amounts.sum(axis=1, keepdims=True)
+    mixtures = _read_mixtures(rows, options)
     names = [rates.bare(name) for name in options.shares]
-    mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
-    most = mixtures.argmax(axis=1)  # of what most of each mixture is
+    main_ingredient = mixtures.argmax(axis=1)  # (n,)
     corners = all_triangles(options.side)
-    places = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
-    inside = [(places == triangle).to_numpy() for triangle in corners]
-    given = rates.most_frequent(rows[rates.PREDICTION])
-    lead = rows["margin"].astype(float).to_numpy()
-    leads = {
-        name: lead[(most == number) & ~np.isnan(lead)]
-        for number, name in enumerate(names)
+    triangles = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
+    in_triangle = [(triangles == triangle).to_numpy() for triangle in corners]
+
+    ranking = rates.most_frequent(rows[rates.PREDICTION])
+    margins = _margins_by_ingredient(rows, names, main_ingredient)
+    by_margin = len(ranking) == 1 and min(map(len, margins.values())) >= 2
+    ranking = ranking[: options.most]
+    if by_margin:
+        text, heads, table = _describe_margins(ranking[0][0], margins)
+    else:
+        text, heads, table = _describe_ingredients(
+            rows, ranking, names, main_ingredient
+        )
+    panels = dict[str, list[float | None]]()
+    for label, _ in ranking:
+        values = (rows[rates.PREDICTION] == label).to_numpy()
+        if by_margin:
+            values = rows["margin"].astype(float).to_numpy()
+        panels[label] = _mean_by_triangle(values, in_triangle)
+    n_empty = sum(not is_inside.any() for is_inside in in_triangle)
+    if n_empty:
+        text.append(
+            f"No picture was drawn in {n_empty} of {len(corners)} parts of the "
+            "diagram, which are hatched."
+        )
+
+    def draw(figure: Any) -> None:
+        _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
+
+    size = (max(2.4 * len(panels), 4.8), 3.5)
+    title = f"Predictions over {', '.join(names)}"
+    return MadeFigure(title, text, heads, table, draw, size)
+
+
+def _read_mixtures(rows: Rows, options: TernaryOptions) -> Doubles:
+    """Return the amounts of three ingredients (n, 3), divided by their sum."""
+    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
+    total = amounts.sum(axis=1, keepdims=True)
+    return amounts / np.where(total == 0.0, 1.0, total)
+
+
+def _margins_by_ingredient(
+    rows: Rows, names: Sequence[str], main_ingredient: npt.NDArray[np.intp]
+) -> dict[str, Doubles]:
+    """Return the known margins of the mixtures in which each ingredient is largest."""
+    margin = rows["margin"].astype(float).to_numpy()
+    is_known = ~np.isnan(margin)
+    return {
+        name: margin[(main_ingredient == index) & is_known]
+        for index, name in enumerate(names)
     }
-    by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
+
+
+def _mean_by_triangle(
+    values: npt.NDArray[Any], in_triangle: Sequence[npt.NDArray[np.bool_]]
+) -> list[float | None]:
+    """Compute the mean of values (n,) in each triangle, None where there are none."""
+    means = list[float | None]()
+    for is_inside in in_triangle:
+        known = values[is_inside & ~np.isnan(values)]
+        means.append(float(known.mean()) if len(known) else None)
+    return means
+
+
+def _describe_margins(
+    label: str, margins: Mapping[str, Doubles]
+) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
+    """Describe the margins by main ingredient: sentences, heads and rows of a table."""
+    text = [MEANINGLESS.format(label), _compare_margins(margins)]
+    heads = [
+        "where most is",
+        "pictures",
+        "mean lead of the right label",
+        "standard error",
+    ]
+    table: list[list[rates.Cell]] = [
+        [name, len(values), float(values.mean()), _standard_error(values)]
+        for name, values in margins.items()
+    ]
+    return text, heads, table
+
+
+def _describe_ingredients(
+    rows: Rows,
+    ranking: Sequence[tuple[str, int]],
+    names: Sequence[str],
+    main_ingredient: npt.NDArray[np.intp],
+) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
+    """Describe predictions by main ingredient: sentences, heads and rows of a table."""
     text = list[str]()
     table = list[list[rates.Cell]]()
-    panels = dict[str, list[float | None]]()
     heads = ["prediction", "where most is", "given in", *rates.COUNT]
-    if by_lead:
-        text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
-        heads = [
-            "where most is",
-            "pictures",
-            "mean lead of the right label",
-            "standard error",
-        ]
-        table = [
-            [name, len(values), float(values.mean()), _error(values)]
-            for name, values in leads.items()
-        ]
-    for label, times in given[: options.most]:
-        flags = (rows[rates.PREDICTION] == label).to_numpy()
-        values = lead if by_lead else flags
-        known = [values[here & ~np.isnan(values)] for here in inside]
-        panels[label] = [float(some.mean()) if len(some) else None for some in known]
-        if by_lead:
-            break
-        by_most = [
-            Tally.over(name, rows[most == k], flags[most == k])
-            for k, name in enumerate(names)
-        ]
+    for label, times in ranking:
+        is_label = (rows[rates.PREDICTION] == label).to_numpy()
+        tallies = []
+        for index, name in enumerate(names):
+            is_main = main_ingredient == index
+            tallies.append(Tally.over(name, rows[is_main], is_label[is_main]))
         whose = f"{label}, {wording.percent(times / len(rows))} of all predictions, is"
-        if len({tally.share for tally in by_most if tally.total}) == 1:
+        if len({tally.share for tally in tallies if tally.total}) == 1:
             text.append(
                 f"{whose} given as often whatever most of the mixture is: no "
                 "difference is shown."
             )
         else:
-            least = f"{whose} rarest where most of the mixture"
-            most_often = "most frequent where most of it"
-            text += rates.extremes(by_most, least, most_often, "ingredients", "given")
-        table += [[label, tally.name, *tally.cells] for tally in by_most]
-    if empty := sum(not here.any() for here in inside):
-        text.append(
-            f"No picture was drawn in {empty} of {len(corners)} parts of the "
-            "diagram, which are hatched."
-        )
-
-    def draw(figure: Any) -> None:
-        each = figure.subplots(1, len(panels), squeeze=False)[0]
-        label = "mean lead of the right label" if by_lead else "share of predictions"
-        for axes, (label, values) in zip(each, panels.items(), strict=True):
-            colours = _panel(axes, label, values, list(corners.values()), names)
-            known = [value for value in values if value is not None]
-            low = min(known) if options.normalised and by_lead else min([*known, 0.0])
-            colours.set_clim(
-                low, max([*known, 1e-9]) if options.normalised or by_lead else 1.0
+            rarest = f"{whose} rarest where most of the mixture"
+            most_frequent = "most frequent where most of it"
+            text += rates.extremes(
+                tallies, rarest, most_frequent, "ingredients", "given"
             )
-            if options.normalised:
-                figure.colorbar(
-                    colours, ax=axes, shrink=0.7, location="bottom", label=label
-                )
-        if not options.normalised:
+        table += [[label, tally.name, *tally.cells] for tally in tallies]
+    return text, heads, table
+
+
+def _draw_panels(
+    figure: Any,
+    panels: Mapping[str, Sequence[float | None]],
+    corners: Sequence[Sequence[Shares]],
+    names: Sequence[str],
+    by_margin: bool,
+    options: TernaryOptions,
+) -> None:
+    """Draw a ternary diagram for each prediction, with one or several color bars."""
+    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
+        triangles = _draw_panel(axes, prediction, values, corners, names)
+        known = [value for value in values if value is not None]
+        lower = min([*known, 0.0])
+        upper = 1.0
+        if options.normalised and by_margin:
+            lower = min(known)
+        if options.normalised or by_margin:
+            upper = max([*known, 1e-9])
+        triangles.set_clim(lower, upper)
+        if options.normalised:
             figure.colorbar(
-                colours,
-                ax=list(each),
-                shrink=0.7 / len(each),
-                location="bottom",
-                label=label,
+                triangles, ax=axes, shrink=0.7, location="bottom", label=prediction
             )
-
-    title = f"Predictions over {', '.join(names)}"
-    return MadeFigure(
-        title, text, heads, table, draw, (max(2.4 * len(panels), 4.8), 3.5)
-    )
+    if not options.normalised:
+        figure.colorbar(
+            triangles,
+            ax=list(all_axes),
+            shrink=0.7 / len(all_axes),
+            location="bottom",
+            # TODO: label it by what all panels show, not by the last prediction
+            label=prediction,
+        )
 
 
 def triangle_of(mixture: Sequence[float], side: int) -> Triangle:
-    """Return the triangle that three shares (3,) lie in, of a diagram with so many
-    along a side.
+    """Return the triangle of a ternary diagram that three fractions (3,) lie in.
+
+    `side` is the number of triangles along a side.
     """
-    a, b, c = (int(share * side) for share in mixture)
-    while a + b + c >= side:  # where triangles meet
-        a, b, c = (
-            (a - 1, b, c)
-            if a >= max(b, c)
-            else (a, b - 1, c)
-            if b >= c
-            else (a, b, c - 1)
-        )
+    a, b, c = (int(fraction * side) for fraction in mixture)
+    while a + b + c >= side:  # a corner of triangles: move towards the largest
+        if a >= max(b, c):
+            a -= 1
+        elif b >= c:
+            b -= 1
+        else:
+            c -= 1
     return a, b, a + b + c < side - 1
 
 
 def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
-    """Return every triangle of the diagram with the shares at its corners."""
+    """Return the triangles of a ternary diagram with the fractions at their corners."""
 
-    def at(x: int, y: int) -> Shares:
+    def mixture_at(x: int, y: int) -> Shares:
         return x / side, y / side, (side - x - y) / side
 
     corners = {}
     for a in range(side):
         for b in range(side - a):
-            corners[a, b, False] = at(a, b), at(a + 1, b), at(a, b + 1)
+            shared_edge = mixture_at(a + 1, b), mixture_at(a, b + 1)
+            corners[a, b, False] = (mixture_at(a, b), *shared_edge)
             if a + b < side - 1:
-                corners[a, b, True] = at(a + 1, b + 1), at(a, b + 1), at(a + 1, b)
+                corners[a, b, True] = (
+                    mixture_at(a + 1, b + 1),
+                    mixture_at(a, b + 1),
+                    mixture_at(a + 1, b),
+                )
     return corners
 
 
-def _told_leads(leads: Mapping[str, Doubles]) -> str:
-    """The smallest mean lead beside the largest, by normal intervals widened for a
-    choice among all.
+def _compare_margins(margins: Mapping[str, Doubles]) -> str:
+    """Compare the smallest and the largest mean margin by normal intervals.
+
+    For the comparison they are widened for a choice among all (Bonferroni).
     """
-    least, most = (
-        pick(leads, key=lambda name: leads[name].mean()) for pick in (min, max)
-    )
-    usual, wide = (
-        NormalDist().inv_cdf(
-            1.0 - (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * among)
+    smallest = min(margins, key=lambda name: margins[name].mean())
+    largest = max(margins, key=lambda name: margins[name].mean())
+    descriptions = []
+    for name in (smallest, largest):
+        lower, upper = _mean_interval(margins[name])
+        descriptions.append(
+            f"{name}: {margins[name].mean():.3g} "
+            f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins[name])} pictures)"
         )
-        for among in (1, len(leads))
-    )
-
-    def ends(name: str, deviations: float) -> tuple[float, float]:
-        mean = leads[name].mean()
-        half = deviations * _error(leads[name])
-        return mean - half, mean + half
-
-    told = [
-        f"{name}: {leads[name].mean():.3g} (95 % interval {low:.3g} to {high:.3g}, "
-        f"{len(leads[name])} pictures)"
-        for name, (low, high) in ((name, ends(name, usual)) for name in (least, most))
-    ]
-    shown = ends(least, wide)[1] < ends(most, wide)[0]
-    verdict = (
-        "The difference is shown: {} do not overlap"
-        if shown
-        else "No difference is shown: {} overlap"
-    )
-    widened = f"their intervals, widened for having been chosen among {len(leads)},"
+    widened = f"their intervals, widened for having been chosen among {len(margins)},"
+    verdict = f"No difference is shown: {widened} overlap"
+    _, upper_of_smallest = _mean_interval(margins[smallest], len(margins))
+    lower_of_largest, _ = _mean_interval(margins[largest], len(margins))
+    if upper_of_smallest < lower_of_largest:
+        verdict = f"The difference is shown: {widened} do not overlap"
     return (
-        f"It leads least where most of the mixture is {told[0]}; most where most of it "
-        f"is {told[1]}. "
-        f"{verdict.format(widened)}."
+        f"It leads least where most of the mixture is {descriptions[0]}; most where "
+        f"most of it is {descriptions[1]}. {verdict}."
     )
 
 
-def _error(values: Doubles) -> float:
+def _mean_interval(values: Doubles, n_compared: int = 1) -> tuple[float, float]:
+    """Return the normal interval of a mean, widened for a choice among `n_compared`."""
+    alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
+    half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
+    mean = values.mean()
+    return mean - half_width, mean + half_width
+
+
+def _standard_error(values: Doubles) -> float:
+    """Compute the standard error of the mean of values (n,)."""
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
-def _panel(
+def _draw_panel(
     axes: Any,
     label: str,
     values: Sequence[float | None],
     corners: Sequence[Sequence[Shares]],
     names: Sequence[str],
 ) -> Any:
+    """Draw a ternary diagram, and return its colored triangles for a color bar.
+
+    The first ingredient is at the left corner, the third at the top. Triangles without
+    a value are hatched.
+    """
     from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 
-    # the first share at the left, the third at the top
-    def place(shares: Shares) -> tuple[float, float]:
-        return shares[1] + shares[2] / 2.0, shares[2] * math.sqrt(3.0) / 2.0
-
-    known = list[Any]()
-    empty = list[Any]()
-    for three, value in zip(corners, values, strict=True):
-        (empty if value is None else known).append([place(corner) for corner in three])
-    coloured = PolyCollection(
-        known,
+    colored = list[Any]()
+    hatched = list[Any]()
+    for mixtures, value in zip(corners, values, strict=True):
+        points = [_to_plane(mixture) for mixture in mixtures]
+        (hatched if value is None else colored).append(points)
+    triangles = PolyCollection(
+        colored,
         array=[value for value in values if value is not None],
         cmap="viridis",
         edgecolors="face",
     )
-    axes.add_collection(coloured)
+    axes.add_collection(triangles)
     axes.add_collection(
         PolyCollection(
-            empty, facecolors="#eeeeef", edgecolors="#b9bbc0", hatch="////", linewidth=0
+            hatched,
+            facecolors="#eeeeef",
+            edgecolors="#b9bbc0",
+            hatch="////",
+            linewidth=0,
         )
     )
-    outer = [
-        place(corner) for corner in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    ]
-    axes.plot(*zip(*outer, outer[0], strict=True), color="#1c1d20", linewidth=0.8)
-    for (x, y), name in zip(outer, names, strict=True):
-        away, side = (-4, "top") if y < 0.1 else (4, "bottom")
+    pure = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    outline = [_to_plane(mixture) for mixture in pure]
+    axes.plot(*zip(*outline, outline[0], strict=True), color="#1c1d20", linewidth=0.8)
+    for (x, y), name in zip(outline, names, strict=True):
+        is_base = y < 0.1
         axes.annotate(
             name,
             (x, y),
-            (0, away),
+            (0, -4 if is_base else 4),
             textcoords="offset points",
             ha="center",
-            va=side,
+            va="top" if is_base else "bottom",
             fontsize=8,
         )
     axes.set_title(label, fontsize=9, loc="center", pad=14)
     axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
     axes.axis("off")
-    return coloured
+    return triangles
+
+
+def _to_plane(mixture: Shares) -> tuple[float, float]:
+    """Convert three fractions to a point in the unit-sided triangle."""
+    return mixture[1] + mixture[2] / 2.0, mixture[2] * math.sqrt(3.0) / 2.0

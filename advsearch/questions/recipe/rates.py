@@ -1,6 +1,4 @@
-"""Figures of how often: right or wrong predictions, photographs that agree with
-renderings, pictures a second, and parts of a surface that go with wrong predictions.
-"""
+"""Figures of rates: accuracy, agreement with photographs, throughput, surface parts."""
 
 from __future__ import annotations
 
@@ -30,9 +28,7 @@ from advsearch.extend import (
 )
 from advsearch.questions.recipe.description import PHOTOGRAPHS
 
-# ---------------------------------------------------------------------------------------------------------------------
-# The rows of a recipe's runs as one frame, and what all figures make of it: counts,
-# sentences, a picture.
+# ---- The rows of a recipe's runs as one frame, and what all figures share
 
 PREDICTION = "answer"
 GROUP = "group"
@@ -40,58 +36,72 @@ PART = "part"
 TRIAL = "trial"
 MODEL = "model"
 WORKERS = "workers"
-"""Columns beside parameters: what the model said, the group that an object is in, the
-part of the recipe, which trial of an attack it is, the model, and the number of
-processes that shared a sweep, of sweeps that say it.
+"""Columns other than parameters.
+
+They hold the model's prediction, the group of the object, the part of the recipe, the
+kind of trial (of an attack), the model, and the number of worker processes (of sweeps
+that set it).
 """
 
 OTHERS = "other objects"
 
 TRIALS = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
           "baseline verification": "random search"}  # fmt: skip
-"""The rows of an attack that are in the frame, and what figures call them."""
+"""The kinds of an attack's rows that are in the frame, and their names in figures."""
 
-# columns of a count behind the one of what is counted
+# columns of a table for one proportion, after the column of its numerator
 COUNT = ["of", "share", "low", "high"]
 Cell = str | int | float | None
 Numbers = npt.NDArray[np.float64]
-Rows = Any  # pd.DataFrame, which has no types
+# a pd.DataFrame, which has no types
+Rows = Any
 
 
 def read_rows(
     part: str, folder: Path, summary: Any, seed: int, kinds: Sequence[str], **more: Cell
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Return the rows of some kinds that a run has stored, and the units of their parameters. Each has what it shows
-    (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
-    when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
-    draws of one seed are the same ones, also in another part."""
+    """Read the stored rows of a run, and the units of their parameters.
+
+    Each row has `object`, `environment`, `model` and the parameters; the prediction
+    (`answer`, `correct`, `margin`); `time`, when it was stored (seconds since 1970);
+    and `unit`, the independent unit that it belongs to. Rows with the same draw of
+    the same seed share a unit, also across parts.
+
+    Args:
+        part: part of the recipe that the run belongs to.
+        folder: directory of the run.
+        summary: result of the run.
+        seed: seed of the run.
+        kinds: kinds of stored rows to read.
+        **more: further columns, equal in all rows.
+    """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    drawn = None
+    draws = None
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
-            drawn = workbench.units_of(store, is_drawn=summary.sampler is not None)
+            draws = workbench.units_of(store, is_drawn=summary.sampler is not None)
         for row in store.rows():
-            if row.kind not in kinds or (row.kind == "sweep" and row.is_out_of_view):
+            if row.kind not in kinds:
+                continue
+            if row.kind == "sweep" and row.is_out_of_view:
                 continue
             values: dict[str, Any] = {
-                name: about["value"] for name, about in row.values.items()
+                name: stored["value"] for name, stored in row.values.items()
             }
-            units |= {name: about["unit"] for name, about in row.values.items()}
+            units |= {name: stored["unit"] for name, stored in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"
-            if row.kind == "sweep" and drawn is not None:
-                unit = f"{seed} {drawn.of(row.step)}"
+            if row.kind == "sweep" and draws is not None:
+                unit = f"{seed} {draws.of(row.step)}"
             if summary.command == "attack":
-                values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
+                values[TRIAL] = TRIALS[row.kind]
+                unit = f"{seed} {row.step}"
             for name in ("object", "environment", MODEL):
-                values[name] = wording.figure_value(
-                    str(values.get(name, getattr(summary, name)))
-                )
-            values |= {
-                PREDICTION: row.label or "none",
-                "correct": bool(row.correct),
-                "margin": row.margin,
-            }
+                value = values.get(name, getattr(summary, name))
+                values[name] = wording.figure_value(str(value))
+            values[PREDICTION] = row.label or "none"
+            values["correct"] = bool(row.correct)
+            values["margin"] = row.margin
             rows.append({**values, "time": row.time, PART: part, "unit": unit, **more})
     return rows, units
 
@@ -99,33 +109,43 @@ def read_rows(
 def frame_of(
     rows: Iterable[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **facts: Any
 ) -> Rows:
-    """Return rows as a frame, with the groups that name their objects if there are any;
-    its ``attrs`` are the facts.
+    """Make a frame of rows, with a column for the group of each object.
+
+    Args:
+        rows: rows as `read_rows` returns them.
+        groups: names of objects by group; the first group that names an object has
+            it. Without groups the frame has no such column.
+        **facts: what becomes the frame's ``attrs``.
     """
     frame = pd.DataFrame(rows)
     if groups:
-        named = {
-            name: group
-            for group, objects in reversed(list(groups.items()))
-            for name in objects
-        }
-        frame[GROUP] = [named.get(name, OTHERS) for name in frame["object"]]
+        group_of_object = dict[str, str]()
+        for group, objects in groups.items():
+            for name in objects:
+                group_of_object.setdefault(name, group)
+        frame[GROUP] = [group_of_object.get(name, OTHERS) for name in frame["object"]]
     frame.attrs = facts
     return frame
 
 
 def column(rows: Rows, name: str) -> Any:
-    """Return what each row has in a column; an InputError where some have nothing."""
+    """Return a column that has a value in each row.
+
+    Raises:
+        InputError: if the column does not exist or lacks values.
+    """
     if name not in rows or rows[name].isna().any():
-        named = rows.columns.drop(["correct", "margin", "time", "unit"])
-        known = ", ".join(other for other in named if rows[other].notna().all())
+        candidates = rows.columns.drop(["correct", "margin", "time", "unit"])
+        known = ", ".join(other for other in candidates if rows[other].notna().all())
         raise InputError(f"figures: expected one of {known}, got {name[:60]!r}")
     return rows[name]
 
 
 def numbers(rows: Rows, name: str) -> Any:
-    """Return what each row has in a column of numbers; an InputError where it has
-    names.
+    """Return a column of numbers.
+
+    Raises:
+        InputError: if the column lacks values or holds names.
     """
     if not pd.api.types.is_numeric_dtype(column(rows, name)):
         raise InputError(
@@ -135,73 +155,80 @@ def numbers(rows: Rows, name: str) -> Any:
 
 
 def unit_of(rows: Rows, name: str) -> str:
-    """Return the unit of a column as it stands behind a number: a space and the unit,
-    or nothing.
-    """
-    return (
-        ""
-        if (unit := rows.attrs["units"].get(name, "")) in ("", "1", "name")
-        else f" {unit}"
-    )
+    """Format the unit of a column to follow a number: " m", or "" if it has none."""
+    unit = rows.attrs["units"].get(name, "")
+    if unit in ("", "1", "name"):
+        return ""
+    return f" {unit}"
 
 
 def by(rows: Rows, name: str) -> dict[str, Rows]:
-    """Return the rows by what they have in a column, in the order in which that first
-    comes; numbers by size.
+    """Split rows by their value in a column.
+
+    Numbers are in ascending order, names in the order of their first row.
     """
-    size = pd.api.types.is_numeric_dtype(column(rows, name))
+    is_numeric = pd.api.types.is_numeric_dtype(column(rows, name))
     return {
-        wording.figure_value(value): some
-        for value, some in rows.groupby(name, sort=size)
+        wording.figure_value(value): group_rows
+        for value, group_rows in rows.groupby(name, sort=is_numeric)
     }
 
 
 def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
-    """Return predictions with how often each was given, the most frequent first."""
+    """Count predictions, the most frequent first; ties are in alphabetical order."""
     return sorted(Counter(predictions).items(), key=lambda item: (-item[1], item[0]))
 
 
 class Tally:
-    """How many of some rows are counted: of each independent unit, such as a drive,
-    `counted` (n,) of its `of` (n,); in all `times` of `total`, and the mean over units
-    of their share, None where there are no rows.
+    """Count rows of independent units, and estimate the fraction that is counted.
+
+    A unit is what rows share that are not independent, such as a draw of a seed.
+    `counted` (n,) of its `of` (n,) rows are counted in each unit; in all, `times` of
+    `total`. `share` is the mean over units of their fraction, None without rows.
     """
 
     def __init__(self, name: str, counted: Numbers, of: Numbers) -> None:
         self.name = name
         self.counted = counted
         self.of = of
-        self.times, self.total = round(float(counted.sum())), round(float(of.sum()))
-        self.share = (
-            statistics.clustered.mean_share(counted, of) if self.total else None
-        )
+        self.times = round(float(counted.sum()))
+        self.total = round(float(of.sum()))
+        self.share = None
+        if self.total:
+            self.share = statistics.clustered.mean_share(counted, of)
 
     @classmethod
     def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
-        """Count rows: those with right predictions, or those that flags (n,) say."""
-        counted = np.asarray(
-            rows["correct"] if flags is None else flags, dtype=np.float64
-        )
-        units = pd.factorize(rows["unit"])[0]
-        of_units = statistics.clustered.per_unit(np.ones(len(rows)), units)
-        return cls(name, statistics.clustered.per_unit(counted, units), of_units)
+        """Count rows by unit: those that are flagged (n,), by default the correct ones."""
+        if flags is None:
+            flags = rows["correct"]
+        is_counted = np.asarray(flags, dtype=np.float64)
+        unit_index = pd.factorize(rows["unit"])[0]
+        unit_counts = statistics.clustered.per_unit(is_counted, unit_index)
+        unit_sizes = statistics.clustered.per_unit(np.ones(len(rows)), unit_index)
+        return cls(name, unit_counts, unit_sizes)
 
     def called(self, name: str) -> Tally:
+        """Return the same counts under another name."""
         return Tally(name, self.counted, self.of)
 
     @property
     def cells(self) -> list[Cell]:
-        return [self.times, self.total, self.share, *(self.interval() or (None, None))]
+        """Cells of a table: numerator, denominator, fraction, and its 95 % interval."""
+        bounds = self.interval() or (None, None)
+        return [self.times, self.total, self.share, *bounds]
 
     @property
     def drawn(self) -> tuple[float, results.Interval] | None:
-        return (
-            None if self.share is None else (self.share, self.interval() or (0.0, 1.0))
-        )
+        """The fraction with its 95 % interval, as a bar chart takes it."""
+        if self.share is None:
+            return None
+        return self.share, self.interval() or (0.0, 1.0)
 
     def interval(self, among: int = 1) -> results.Interval | None:
-        """Return the 95 % interval of the share, widened for a choice among so many
-        (Bonferroni).
+        """Return the 95 % interval of the fraction.
+
+        With `among` > 1 it is widened for a choice among as many (Bonferroni).
         """
         if not self.total:
             return None
@@ -209,8 +236,9 @@ class Tally:
         return statistics.clustered.share_interval(self.counted, self.of, confidence)
 
     def told(self, verb: str = "right") -> str:
-        """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is
-        counted.
+        """Format the fraction: ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``.
+
+        `verb` is what is counted.
         """
         share = (
             f"{wording.percent(self.share)}, 95 % interval "
@@ -219,9 +247,7 @@ class Tally:
         return f"{verb} in {self.times} of {self.total} ({share})"
 
     def below(self, other: Tally, among: int = 1) -> bool:
-        """Return whether the interval of this share lies below that of another, both
-        widened.
-        """
+        """Return whether this interval lies below that of another tally, both widened."""
         lower = self.interval(among)
         upper = other.interval(among)
         return lower is not None and upper is not None and lower[1] < upper[0]
@@ -230,50 +256,59 @@ class Tally:
 def extremes(
     counts: Sequence[Tally], worst: str, best: str, thing: str, verb: str = "right"
 ) -> list[str]:
-    """Return which of several has the lowest share and which the highest, and whether
-    that is more than chance: the two were chosen among k for being extreme, so that
-    they are compared by intervals of confidence 1 - 0.05 / k, which hold for all k
-    together. Where these overlap, no difference is shown. `verb` is what is counted.
+    """Describe which tally has the lowest fraction and which has the highest.
+
+    The two were selected among k for being extreme. Therefore they are compared by
+    intervals of confidence 1 - 0.05 / k, which hold for all k together. Where these
+    overlap, no difference is shown.
+
+    Args:
+        counts: the tallies; those without rows are left out.
+        worst: beginning of the sentence about the lowest, such as "Lowest".
+        best: beginning of the part about the highest.
+        thing: plural of what the tallies are of.
+        verb: what is counted.
     """
-    known = [count for count in counts if count.total]
+    known = [tally for tally in counts if tally.total]
     if len(known) < 2:
-        return [f"{count.name}: {count.told(verb)}." for count in known]
-    shares = [count.share or 0.0 for count in known]
-    low = known[int(np.argmin(shares))]
-    high = known[int(np.argmax(shares))]
-    if low.share == high.share:
+        return [f"{tally.name}: {tally.told(verb)}." for tally in known]
+    shares = [tally.share or 0.0 for tally in known]
+    lowest = known[int(np.argmin(shares))]
+    highest = known[int(np.argmax(shares))]
+    if lowest.share == highest.share:
         return [
             f"All {len(known)} {thing} have the same share, "
-            f"{wording.percent(low.share)}: no difference is shown."
+            f"{wording.percent(lowest.share)}: no difference is shown."
         ]
-    named = []
-    for tally in (low, high):
-        ties = shares.count(tally.share or 0.0) - 1
-        also = f" (as {ties} other{'s' if ties > 1 else ''})" if ties else ""
-        named.append(f"is {tally.name}{also}: {tally.told(verb)}")
+
+    descriptions = []
+    for tally in (lowest, highest):
+        n_ties = shares.count(tally.share or 0.0) - 1
+        ties = ""
+        if n_ties:
+            plural_ending = "s" if n_ties > 1 else ""
+            ties = f" (as {n_ties} other{plural_ending})"
+        descriptions.append(f"is {tally.name}{ties}: {tally.told(verb)}")
     widened = (
         f"the intervals of the two, widened for having been chosen among {len(known)},"
     )
-    return [
-        f"{worst} {named[0]}; {best} {named[1]}.",
-        f"The difference is shown: {widened} do not overlap."
-        if low.below(high, len(known))
-        else f"No difference between the {thing} is shown: {widened} overlap.",
-    ]
+    verdict = f"No difference between the {thing} is shown: {widened} overlap."
+    if lowest.below(highest, len(known)):
+        verdict = f"The difference is shown: {widened} do not overlap."
+    return [f"{worst} {descriptions[0]}; {best} {descriptions[1]}.", verdict]
 
 
 def plural(name: str) -> str:
-    """Return what several values of a column are called: ``environments``,
-    ``materials``, ``values of pose.yaw``.
+    """Return the plural that names the values of a column.
+
+    Examples are ``environments``, ``materials`` and ``values of pose.yaw``.
     """
+    if name == TRIAL:
+        return "kinds of trials"
     control, _, parameter = name.partition(".")
-    return (
-        "kinds of trials"
-        if name == TRIAL
-        else f"{control}s"
-        if parameter in ("", "which")
-        else f"values of {name}"
-    )
+    if parameter in ("", "which"):
+        return f"{control}s"
+    return f"values of {name}"
 
 
 def bare(name: str) -> str:
@@ -282,8 +317,9 @@ def bare(name: str) -> str:
 
 
 class Options(BaseModel):
-    """Options that every figure has: a title in place of its own, and the parts whose
-    rows it shows; all where none is named.
+    """Options of every figure: its title, and the parts whose rows it shows.
+
+    An empty title means the figure's default title, no parts mean all.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -293,13 +329,15 @@ class Options(BaseModel):
 
     @property
     def parts(self) -> tuple[str, ...]:
+        """The parts of the recipe whose rows the figure needs; empty for all."""
         return self.of
 
 
 @dataclass(frozen=True)
 class MadeFigure:
-    """A figure: title, sentences, a table of its numbers, what draws all but the title,
-    and its size in inches.
+    """Content of a figure: sentences, a table, and what draws all but the title.
+
+    `draw` takes a matplotlib figure; `size` is in inches.
     """
 
     title: str
@@ -310,15 +348,16 @@ class MadeFigure:
     size: tuple[float, float]
 
 
-# parts of a range where lines are drawn along it, and letters that stand level under a
-# column
+# default bins of a range that lines are drawn over
 BINS = 12
+# characters of a label that fit under a column without being rotated
 FITTING = 4
-Cells = Mapping[str, Sequence[Tally]]  # counts by the name of a row, one of each series
+# counts by the name of a row, one for each series
+Cells = Mapping[str, Sequence[Tally]]
 
 
 class RatesOptions(Options):
-    """What the shares are by, and how they are drawn; docs/recipes.md has each."""
+    """Columns that rates are split by, and how they are drawn; see docs/recipes.md."""
 
     by: str
     series: str | None = None
@@ -333,227 +372,345 @@ class RatesOptions(Options):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        return (*self.of, *([self.beside] if self.beside and self.of else []))
+        """The parts of the recipe whose rows the figure needs; empty for all."""
+        if self.beside and self.of:
+            return (*self.of, self.beside)
+        return self.of
 
     @property
     def what(self) -> str:
+        """The label of the axis: the column, or the distance from a value of it."""
         if self.away_from is None:
             return self.by
         return f"the distance of {self.by} from {wording.figure_value(self.away_from)}"
 
 
 def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
+    """Make a figure of the fractions of right or wrong predictions.
+
+    Raises:
+        InputError: if there are no rows, or the columns don't suit the options.
+    """
     verb = "wrong" if options.wrong else "right"
-    form = options.form
-    second = options.series
-    beside = rows[rows[PART] == options.beside]
+    baseline_rows = rows[rows[PART] == options.beside]
     rows = rows[rows[PART] != options.beside]
     if rows.empty:
         raise InputError(
             "figures: rates: expected rows of a part beside "
             f"{options.beside!r}, got none"
         )
-    lines = list(by(rows, second)) if second else [""]
-    groups, middles = _groups(rows, options)
+    series_values = list(by(rows, options.series)) if options.series else [""]
+    series = [options.names.get(value, value) for value in series_values]
+    cells, bin_centers = _count_cells(rows, series_values, options)
+    totals = _count_series("all", rows, series_values, options)
+    bars = dict(cells)
 
-    def called(name: str) -> str:
-        return options.names.get(name, name)
+    text = _describe_cells(cells, series, bin_centers is not None, options)
+    text += _describe_series(cells, totals, series, options)
+    if options.beside and len(baseline_rows):
+        name = options.names.get(options.beside, options.beside)
+        tallies = _count_series("", baseline_rows, series_values, options)
+        text += _compare_with_baseline(name, tallies, totals, series, verb)
+        # the baseline comes first
+        bars = {name: tallies, **cells}
 
-    def counts(name: str, some: Rows) -> list[Tally]:
-        split = by(some, second) if second and len(some) else {"": some}
-        each = [split.get(line, some[:0]) for line in lines]
-        return [
-            Tally.over(name, part, part["correct"] != options.wrong) for part in each
-        ]
+    def draw(figure: Any) -> None:
+        if options.form == "lines":
+            positions = bin_centers or range(len(cells))
+            unit = unit_of(rows, options.by).strip()
+            _draw_rate_lines(figure, cells, series, positions, unit, options)
+        else:
+            _draw_rates(figure, bars, cells, series, options)
 
-    cells = {called(name): counts(name, some) for name, some in groups.items()}
-    if (
-        form == "bars"
-        and middles is None
-        and not is_numeric_dtype(column(rows, options.by))
-    ):
-        cells = dict(sorted(cells.items(), key=lambda item: -(item[1][0].share or 0.0)))
-    series = [called(name) for name in lines]
-    totals = counts("all", rows)
-    of_what = f"{bare(second or '')} "  # a number says what it is of: "severity 3"
-    of_series = [of_what * (name[:1] in tuple("-0123456789")) + name for name in series]
-    thing = plural(options.by) + (f" and {plural(second)}" if second else "")
-    apart = (
-        {called(options.beside): counts("", beside)}
-        if options.beside and len(beside)
-        else {}
+    series_column = [options.series] if options.series else []
+    return MadeFigure(
+        f"{'Error' if options.wrong else 'Accuracy'} by {_split_columns(options)}",
+        text,
+        [options.by, *series_column, verb, *COUNT],
+        _tabulate_rates(bars, totals, series, options),
+        draw,
+        _choose_size(len(bars), len(cells), len(series), options),
     )
+
+
+def _split_columns(options: RatesOptions) -> str:
+    """Name the columns that rates are split by: ``environments and models``."""
+    columns = plural(options.by)
+    if options.series:
+        columns += f" and {plural(options.series)}"
+    return columns
+
+
+def _count_cells(
+    rows: Rows, series_values: Sequence[str], options: RatesOptions
+) -> tuple[dict[str, list[Tally]], list[float] | None]:
+    """Count the rows of each group and series; also return the centers of bins.
+
+    Bars of names are sorted by the fraction of the first series, the highest first.
+    """
+    groups, bin_centers = _group_rows(rows, options)
+    cells = dict[str, list[Tally]]()
+    for value, group_rows in groups.items():
+        name = options.names.get(value, value)
+        cells[name] = _count_series(name, group_rows, series_values, options)
+    is_binned = bin_centers is not None
+    is_numeric = is_numeric_dtype(column(rows, options.by))
+    if options.form == "bars" and not is_binned and not is_numeric:
+        order = sorted(cells, key=lambda name: -(cells[name][0].share or 0.0))
+        cells = {name: cells[name] for name in order}
+    return cells, bin_centers
+
+
+def _count_series(
+    name: str, rows: Rows, series_values: Sequence[str], options: RatesOptions
+) -> list[Tally]:
+    """Count right or wrong predictions in each series, in the order of the series."""
+    rows_of_series = {"": rows}
+    if options.series and len(rows):
+        rows_of_series = by(rows, options.series)
+    tallies = []
+    for value in series_values:
+        series_rows = rows_of_series.get(value, rows[:0])
+        is_counted = series_rows["correct"] != options.wrong
+        tallies.append(Tally.over(name, series_rows, is_counted))
+    return tallies
+
+
+def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
+    """Return names of series for sentences; a number says of what: ``severity 3``."""
+    column_name = bare(options.series or "")
+    names = []
+    for name in series:
+        starts_like_number = name[:1] in tuple("-0123456789")
+        names.append(f"{column_name} {name}" if starts_like_number else name)
+    return names
+
+
+def _describe_cells(
+    cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
+) -> list[str]:
+    """Describe the lowest and the highest cell: over a map, or of each series."""
+    verb = "wrong" if options.wrong else "right"
+    if options.form == "map":
+        pairs = []
+        for row_name, tallies in cells.items():
+            names = _name_series(series, options)
+            for name, tally in zip(names, tallies, strict=True):
+                pairs.append(tally.called(f"{row_name} with {name}"))
+        things = f"pairs of {_split_columns(options)}"
+        return extremes(pairs, "The lowest pair", "the highest", things, verb)
+
     text = list[str]()
-    if form == "map":
-        pairs = [
-            tally.called(f"{row} with {name}")
-            for row, each in cells.items()
-            for name, tally in zip(of_series, each, strict=True)
-        ]
+    where = f" where {options.what}" if is_binned else ""
+    for index, name in enumerate(series):
+        tallies = [row[index].called(row_name) for row_name, row in cells.items()]
+        n_known = sum(tally.total > 0 for tally in tallies)
+        if len(series) > 1 and n_known < 2:
+            continue  # a single row is described by `_describe_series`
+        lowest = f"For {name}, lowest" if len(series) > 1 else "Lowest"
         text += extremes(
-            pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb
+            tallies,
+            f"{lowest}{where}",
+            f"highest{where}",
+            plural(options.by),
+            verb,
         )
-    else:
-        where = f" where {options.what}" if middles else ""
-        for number, name in enumerate(series):
-            along = [each[number].called(row) for row, each in cells.items()]
-            # of one row all is said below
-            if len(series) < 2 or sum(tally.total > 0 for tally in along) > 1:
-                worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
-                text += extremes(
-                    along,
-                    f"{worst}{where}",
-                    f"highest{where}",
-                    plural(options.by),
-                    verb,
-                )
-    # in one text, so that figures by other columns do not repeat it
-    if second and len(series) > 1:
-        overall = [
-            tally.called(f"that of {name}")
-            for name, tally in zip(of_series, totals, strict=True)
-        ]
-        of_all = extremes(
-            overall, "Over all, the lowest share", "the highest", plural(second), verb
-        )
-        text.append(" ".join(of_all))
-    for number, name in enumerate(
-        series[1:] if options.wrong and second == MODEL else (), start=1
-    ):
-        # the mean over rows of each model's errors over those of the first; rows
-        # without any of that are left out
-        if ratios := [
-            (each[number].share or 0.0) / each[0].share
-            for each in cells.values()
-            if each[0].share
-        ]:
+    return text
+
+
+def _describe_series(
+    cells: Cells,
+    totals: Sequence[Tally],
+    series: Sequence[str],
+    options: RatesOptions,
+) -> list[str]:
+    """Compare the series over all rows, and models by their mean relative error."""
+    if not options.series or len(series) < 2:
+        return []
+    overall = []
+    for name, tally in zip(_name_series(series, options), totals, strict=True):
+        overall.append(tally.called(f"that of {name}"))
+    sentences = extremes(
+        overall,
+        "Over all, the lowest share",
+        "the highest",
+        plural(options.series),
+        "wrong" if options.wrong else "right",
+    )
+    # one text, so that figures by other columns do not repeat it
+    text = [" ".join(sentences)]
+    if not options.wrong or options.series != MODEL:
+        return text
+    for index, name in enumerate(series[1:], start=1):
+        # The mean over rows of the errors divided by those of the first model; rows
+        # in which that has none are left out.
+        ratios = []
+        for tallies in cells.values():
+            if tallies[0].share:
+                ratios.append((tallies[index].share or 0.0) / tallies[0].share)
+        if ratios:
             mean = 100.0 * sum(ratios) / len(ratios)
             text.append(
                 f"Relative to {series[0]}, in AlexNet's place, the mCE of "
                 f"{name} is {mean:.0f} %."
             )
-    for name, alone in apart.items():
-        for line, tally, total in zip(series, alone, totals, strict=True):
-            more = (
-                "is shown"
-                if tally.below(total) or total.below(tally)
-                else "is not shown"
-            )
-            whose = f"{line}, " if len(series) > 1 else ""
-            text.append(
-                f"{whose}{name}: {tally.told(verb)}; the others: "
-                f"{total.told(verb)}. A difference {more}."
-            )
-    every = {**apart, **cells, **({"all": totals} if second else {})}
-    counted = [
-        (name, line, tally)
-        for name, each in every.items()
-        for line, tally in zip(series, each, strict=True)
-    ]
-    table = [
-        [name, *([line] if second else []), *tally.cells]
-        for name, line, tally in counted
-    ]
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        label = f"{verb}, share"
-        if form == "map":
-            _draw_map(axes, cells, series, label)
-            axes.set(ylabel=options.by, xlabel=second or "")
-        elif form == "lines":
-            _draw_lines(axes, cells, series, middles or range(len(cells)))
-            unit = unit_of(rows, options.by)
-            across = f"{options.what} [{unit[1:]}]" if unit else options.what
-            axes.set(xlabel=across, ylabel=f"{label} with 95 % interval")
-        else:
-            shares = {
-                name: [tally.drawn for tally in each]
-                for name, each in {**apart, **cells}.items()
-            }
-            figures.draw_shares(axes, shares, series)
-            axes.set(xlabel=f"{label} with 95 % interval")
-        if len(series) > 1 and form != "map":
-            figure.legend(loc="outside lower center", ncols=min(len(series), 3))
-
-    size = (
-        (6.0, 3.4)
-        if form == "lines"
-        else (6.0, 1.4 + (0.2 + 0.09 * len(series)) * len({**apart, **cells}))
-    )
-    if form == "map":
-        size = max(2.8 + 0.42 * len(series), 5.4), 1.9 + 0.28 * len(cells)
-    title = f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
-    return MadeFigure(
-        title,
-        text,
-        [options.by, *([second] if second else []), verb, *COUNT],
-        table,
-        draw,
-        size,
-    )
+    return text
 
 
-def _groups(
+def _compare_with_baseline(
+    name: str,
+    tallies: Sequence[Tally],
+    totals: Sequence[Tally],
+    series: Sequence[str],
+    verb: str,
+) -> list[str]:
+    """Compare the part `name` with all other rows, a sentence for each series."""
+    text = []
+    for series_name, tally, total in zip(series, tallies, totals, strict=True):
+        differs = tally.below(total) or total.below(tally)
+        verdict = "is shown" if differs else "is not shown"
+        whose = f"{series_name}, " if len(series) > 1 else ""
+        text.append(
+            f"{whose}{name}: {tally.told(verb)}; the others: "
+            f"{total.told(verb)}. A difference {verdict}."
+        )
+    return text
+
+
+def _tabulate_rates(
+    cells: Cells,
+    totals: Sequence[Tally],
+    series: Sequence[str],
+    options: RatesOptions,
+) -> list[list[Cell]]:
+    """Return the table of a rates figure; with series, their totals come last."""
+    tallies_of_row = dict(cells)
+    if options.series:
+        tallies_of_row["all"] = totals
+    table = list[list[Cell]]()
+    for row_name, tallies in tallies_of_row.items():
+        for series_name, tally in zip(series, tallies, strict=True):
+            series_cell = [series_name] if options.series else []
+            table.append([row_name, *series_cell, *tally.cells])
+    return table
+
+
+def _choose_size(
+    n_bars: int, n_rows: int, n_series: int, options: RatesOptions
+) -> tuple[float, float]:
+    """Return width and height of a rates figure, inches."""
+    if options.form == "map":
+        return max(2.8 + 0.42 * n_series, 5.4), 1.9 + 0.28 * n_rows
+    if options.form == "lines":
+        return 6.0, 3.4
+    return 6.0, 1.4 + (0.2 + 0.09 * n_series) * n_bars
+
+
+def _draw_rates(
+    figure: Any,
+    bars: Cells,
+    cells: Cells,
+    series: Sequence[str],
+    options: RatesOptions,
+) -> None:
+    """Draw a map of the cells, or bars; only bars have the baseline."""
+    axes = figure.subplots()
+    label = f"{'wrong' if options.wrong else 'right'}, share"
+    if options.form == "map":
+        _draw_map(axes, cells, series, label)
+        axes.set(ylabel=options.by, xlabel=options.series or "")
+        return
+    shares = {
+        row_name: [tally.drawn for tally in tallies]
+        for row_name, tallies in bars.items()
+    }
+    figures.draw_shares(axes, shares, series)
+    axes.set(xlabel=f"{label} with 95 % interval")
+    if len(series) > 1:
+        figure.legend(loc="outside lower center", ncols=min(len(series), 3))
+
+
+def _draw_rate_lines(
+    figure: Any,
+    cells: Cells,
+    series: Sequence[str],
+    positions: Sequence[float],
+    unit: str,
+    options: RatesOptions,
+) -> None:
+    """Draw a line for each series over the bins of a parameter."""
+    axes = figure.subplots()
+    _draw_lines(axes, cells, series, positions)
+    label = f"{'wrong' if options.wrong else 'right'}, share"
+    x_label = f"{options.what} [{unit}]" if unit else options.what
+    axes.set(xlabel=x_label, ylabel=f"{label} with 95 % interval")
+    if len(series) > 1:
+        figure.legend(loc="outside lower center", ncols=min(len(series), 3))
+
+
+def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
-    """The rows by their values, or by the parts of a range with the middle of each."""
+    """Split rows by a column's values, or by bins; also return the centers of bins."""
     if options.bins is None and options.form != "lines":
         return by(rows, options.by), None
-    values = numbers(rows, options.by)
-    bins = options.bins or BINS
-    unit = unit_of(rows, options.by)
-    if options.away_from is not None:
-        values = (values - options.away_from).abs()
-        if options.turn is not None:  # the shorter way round
-            values = np.minimum(
-                values % options.turn, options.turn - values % options.turn
-            )
-    low, high = options.range or (values.min(), values.max())
-    if not high > low:
+    values = _read_binned_values(rows, options)
+    n_bins = options.bins or BINS
+    lower, upper = options.range or (values.min(), values.max())
+    if not upper > lower:
         raise InputError(
             f"figures: rates: expected values of {options.by} that "
-            f"differ, got {low:g} to {high:g}"
+            f"differ, got {lower:g} to {upper:g}"
         )
-    places = ((values - low) / (high - low) * bins).clip(upper=bins - 1).where(
-        values.between(low, high)
-    ) // 1
-    ends = list(
-        pairwise(low + (high - low) * number / bins for number in range(bins + 1))
-    )
-    named = [
-        f"{wording.figure_value(begin)} to {wording.figure_value(end)}{unit}"
-        for begin, end in ends
-    ]
-    return {name: rows[places == place] for place, name in enumerate(named)}, [
-        (a + b) / 2 for a, b in ends
-    ]
+    position = (values - lower) / (upper - lower) * n_bins
+    in_range = values.between(lower, upper)
+    bin_index = position.clip(upper=n_bins - 1).where(in_range) // 1
+    edges = (lower + (upper - lower) * index / n_bins for index in range(n_bins + 1))
+    groups = dict[str, Rows]()
+    centers = list[float]()
+    for index, (start, end) in enumerate(pairwise(edges)):
+        bounds = f"{wording.figure_value(start)} to {wording.figure_value(end)}"
+        name = bounds + unit_of(rows, options.by)
+        groups[name] = rows[bin_index == index]
+        centers.append((start + end) / 2)
+    return groups, centers
+
+
+def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
+    """Return the column that is binned, or its distances from a value."""
+    values = numbers(rows, options.by)
+    if options.away_from is None:
+        return values
+    distance = (values - options.away_from).abs()
+    if options.turn is None:
+        return distance
+    # the shorter way round a circle
+    return np.minimum(distance % options.turn, options.turn - distance % options.turn)
 
 
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
+    """Draw the fractions as a matrix of colors with percentages in it."""
     shares = [
-        [math.nan if tally.share is None else tally.share for tally in each]
-        for each in cells.values()
+        [math.nan if tally.share is None else tally.share for tally in tallies]
+        for tallies in cells.values()
     ]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
-    for (up, across), share in np.ndenumerate(shares):
-        if not math.isnan(share):
-            colour = "white" if abs(share - 0.5) > 0.3 else "black"
-            axes.text(
-                across,
-                up,
-                f"{100 * share:.0f}",
-                ha="center",
-                va="center",
-                color=colour,
-                fontsize=7.5,
-            )
-    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    axes.set_xticks(
-        range(len(series)),
-        series,
-        **(turned if max(map(len, series)) > FITTING else {}),
-    )
+    for (row, column_index), share in np.ndenumerate(shares):
+        if math.isnan(share):
+            continue
+        axes.text(
+            column_index,
+            row,
+            f"{100 * share:.0f}",
+            ha="center",
+            va="center",
+            color="white" if abs(share - 0.5) > 0.3 else "black",
+            fontsize=7.5,
+        )
+    label_style = dict[str, Any]()
+    if max(map(len, series)) > FITTING:
+        label_style = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(len(series)), series, **label_style)
     axes.set_yticks(range(len(cells)), list(cells))
     axes.figure.colorbar(
         image,
@@ -564,27 +721,30 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 
 
 def _draw_lines(
-    axes: Any, cells: Cells, series: Sequence[str], middles: Sequence[float]
+    axes: Any, cells: Cells, series: Sequence[str], bin_positions: Sequence[float]
 ) -> None:
-    for number, name in enumerate(series):
-        known = [
-            (at, each[number])
-            for at, each in zip(middles, cells.values(), strict=True)
-            if each[number].total
-        ]
-        at = [place for place, _ in known]
-        colour = figures.SERIES[number % len(figures.SERIES)]
-        low, high = (
-            [(tally.interval() or (0.0, 1.0))[end] for _, tally in known]
-            for end in (0, 1)
-        )
-        axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
-        mark = figures.MARKS[number % len(figures.MARKS)]
+    """Draw the fractions of each series, with their 95 % intervals as bands."""
+    for index, name in enumerate(series):
+        positions = list[float]()
+        shares = list[float | None]()
+        lower = list[float]()
+        upper = list[float]()
+        for position, tallies in zip(bin_positions, cells.values(), strict=True):
+            tally = tallies[index]
+            if not tally.total:
+                continue
+            interval = tally.interval() or (0.0, 1.0)
+            positions.append(position)
+            shares.append(tally.share)
+            lower.append(interval[0])
+            upper.append(interval[1])
+        color = figures.SERIES[index % len(figures.SERIES)]
+        axes.fill_between(positions, lower, upper, color=color, alpha=0.15, linewidth=0)
         axes.plot(
-            at,
-            [tally.share for _, tally in known],
-            color=colour,
-            marker=mark,
+            positions,
+            shares,
+            color=color,
+            marker=figures.MARKS[index % len(figures.MARKS)],
             ms=4,
             label=name,
         )
@@ -602,8 +762,10 @@ ALL = "all objects"
 
 
 class AgreementOptions(Options):
-    """Options of agreements: the part whose renderings are compared with photographs,
-    and parts that picture the same configurations under other conditions.
+    """Options of agreements: the rendered part, and the parts to compare it with.
+
+    The first of `of` has the renderings that photographs are compared with, the others
+    show the same configurations under other conditions.
     """
 
     of: tuple[str, ...] = Field(min_length=1)
@@ -611,12 +773,17 @@ class AgreementOptions(Options):
 
     @property
     def parts(self) -> tuple[str, ...]:
+        """The parts of the recipe whose rows the figure needs."""
         return (*self.of, PHOTOGRAPHS)
 
 
 def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
-    """Count in how many pairs the model is right, or wrong, about a rendering and
-    another picture of the same alike.
+    """Compare predictions about renderings with those about other images of the same.
+
+    A pair agrees if the model is right about both or wrong about both.
+
+    Raises:
+        InputError: if a part has no rows or other configurations.
     """
     renderings = rows[rows[PART] == options.of[0]].dropna(axis=1, how="all")
     if renderings.empty:
@@ -624,164 +791,155 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
             "figures: agreement: expected predictions of a part "
             f"{options.of[0]!r}, got none"
         )
-    of_each = {PREDICTION, PART, "correct", "margin", "time", "unit"}
-    # the values of renderings; others may have more
-    shared = [name for name in renderings if name not in of_each]
+    objects = [ALL, *renderings["object"].unique()]
+    bars: dict[str, list[Tally]] = {name: [] for name in objects}
     text = list[str]()
     table = list[list[Cell]]()
     series = list[str]()
-    bars: dict[str, list[Tally]] = {
-        thing: [] for thing in (ALL, *renderings["object"].unique())
-    }
     for part in (PHOTOGRAPHS, *options.of[1:]):
-        others = rows[rows[PART] == part]
-        name = options.names.get(part, part)
-        pairs = others.merge(renderings, on=shared, suffixes=("", " rendered"))
-        alone = len(others) - len(pairs)
-        if part == PHOTOGRAPHS and others.empty:
+        part_rows = rows[rows[PART] == part]
+        if part == PHOTOGRAPHS and part_rows.empty:
             text.append(NO_PHOTOGRAPHS)
             continue
-        if part != PHOTOGRAPHS and alone:
+        pairs = _pair_rows(part_rows, renderings)
+        n_unpaired = len(part_rows) - len(pairs)
+        if part != PHOTOGRAPHS and n_unpaired:
             raise InputError(
                 f"figures: agreement: expected {part} to have the "
                 f"configurations of {options.of[0]}"
             )
-        series.append(name)
-        for thing, tallies in bars.items():
-            some = pairs if thing == ALL else pairs[pairs["object"] == thing]
-            first = some["correct rendered"]
-            second = some["correct"]
-            four = [
-                int(((first == a) & (second == b)).sum())
-                for a in (True, False)
-                for b in (True, False)
-            ]
-            same = int((some[f"{PREDICTION} rendered"] == some[PREDICTION]).sum())
-            tallies.append(tally := Tally.over(thing, some, first == second))
-            table.append([name, thing, *four, same, *tally.cells])
-            if thing == ALL and len(some):
-                text.append(
-                    f"Renderings and {name}: "
-                    f"{tally.told('right about both or wrong about both')}. "
-                    f"{_where(True, some)} {_where(False, some)} "
-                    f"The prediction is the same in {same} of {len(some)} "
-                    f"({wording.percent(same / len(some))})."
-                )
+        series_name = options.names.get(part, part)
+        series.append(series_name)
+        for name, tallies in bars.items():
+            object_pairs = pairs if name == ALL else pairs[pairs["object"] == name]
+            tally, cells = _count_agreement(name, object_pairs)
+            tallies.append(tally)
+            table.append([series_name, name, *cells])
+        if len(pairs):
+            text.append(_describe_agreement(series_name, bars[ALL][-1], pairs))
         if part == PHOTOGRAPHS:
-            text += (
-                ["The intervals take photographs as independent."] if len(pairs) else []
-            )
-            belong = "belongs" if alone == 1 else "belong"
-            text += (
-                [
-                    f"{alone} of the photographs {belong} to no rendering and so to "
-                    "no pair."
-                ]
-                if alone
-                else []
-            )
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        shares = {name: [tally.drawn for tally in each] for name, each in bars.items()}
-        figures.draw_shares(axes, shares, series)
-        axes.set(xlabel="share that agrees, with 95 % interval")
-        figure.legend(loc="outside lower center", ncols=1)
+            text += _describe_photographs(len(pairs), n_unpaired)
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
-    heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT]
-    size = 6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)
     return MadeFigure(
-        "Renderings and other pictures of the same", text, heads, table, draw, size
+        "Renderings and other pictures of the same",
+        text,
+        ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT],
+        table,
+        lambda figure: _draw_agreement(figure, bars, series),
+        (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
 
 
-def _where(right: bool, pairs: Rows) -> str:
+def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
+    """Draw bars of the fraction of pairs that agree, for all and for each object."""
+    axes = figure.subplots()
+    shares = {
+        name: [tally.drawn for tally in tallies] for name, tallies in bars.items()
+    }
+    figures.draw_shares(axes, shares, series)
+    axes.set(xlabel="share that agrees, with 95 % interval")
+    figure.legend(loc="outside lower center", ncols=1)
+
+
+def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
+    """Join rows with the renderings of the same configuration.
+
+    A row may have more parameters than its rendering. Columns of the rendering that
+    the row has too end in `` rendered``.
+    """
+    per_row = {PREDICTION, PART, "correct", "margin", "time", "unit"}
+    configuration = [name for name in renderings if name not in per_row]
+    return part_rows.merge(renderings, on=configuration, suffixes=("", " rendered"))
+
+
+def _count_agreement(name: str, pairs: Rows) -> tuple[Tally, list[Cell]]:
+    """Count the pairs that agree; also return the cells of the table's row."""
+    of_rendering = pairs["correct rendered"]
+    of_other = pairs["correct"]
+    confusion = list[Cell]()
+    for rendering_is_right in (True, False):
+        for other_is_right in (True, False):
+            is_counted = (of_rendering == rendering_is_right) & (
+                of_other == other_is_right
+            )
+            confusion.append(int(is_counted.sum()))
+    tally = Tally.over(name, pairs, of_rendering == of_other)
+    return tally, [*confusion, _count_same_prediction(pairs), *tally.cells]
+
+
+def _count_same_prediction(pairs: Rows) -> int:
+    return int((pairs[f"{PREDICTION} rendered"] == pairs[PREDICTION]).sum())
+
+
+def _describe_agreement(name: str, tally: Tally, pairs: Rows) -> str:
+    """Describe how often predictions about renderings and other images agree."""
+    n_same = _count_same_prediction(pairs)
+    return (
+        f"Renderings and {name}: "
+        f"{tally.told('right about both or wrong about both')}. "
+        f"{_describe_where(True, pairs)} {_describe_where(False, pairs)} "
+        f"The prediction is the same in {n_same} of {len(pairs)} "
+        f"({wording.percent(n_same / len(pairs))})."
+    )
+
+
+def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
+    """State what holds for pairs with photographs, and how many have no rendering."""
+    text = []
+    if n_pairs:
+        text.append("The intervals take photographs as independent.")
+    if n_unpaired:
+        belong = "belongs" if n_unpaired == 1 else "belong"
+        text.append(
+            f"{n_unpaired} of the photographs {belong} to no rendering and so to "
+            "no pair."
+        )
+    return text
+
+
+def _describe_where(right: bool, pairs: Rows) -> str:
+    """Describe the other image of pairs whose rendering was predicted right or wrong."""
     verb = "right" if right else "wrong"
-    some = pairs[pairs["correct rendered"] == right]
-    if some.empty:
+    selected = pairs[pairs["correct rendered"] == right]
+    if selected.empty:
         return f"It is {verb} about none of the renderings."
-    told = Tally.over("", some, some["correct"] == right).told(verb)
-    return f"Where it is {verb} about the rendering, it is {told} about the other."
+    rate = Tally.over("", selected, selected["correct"] == right).told(verb)
+    return f"Where it is {verb} about the rendering, it is {rate} about the other."
 
 
 def scaling(rows: Rows, options: Options) -> MadeFigure:
-    """Measure the pictures a second of sweeps by the number of workers that shared
-    them.
+    """Make a figure of the throughput of sweeps, images per second, by worker count.
+
+    Raises:
+        InputError: if no sweep sets `workers`, or a run is too short.
     """
     if WORKERS not in rows:
         raise InputError(
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
-    # without rows of sweeps that say none
-    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(_rate)
-    by_count = {
-        int(workers): found.droplevel(0) for workers, found in runs.groupby(level=0)
+    # grouping leaves out the rows of sweeps that do not set the workers
+    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(
+        _compute_throughput
+    )
+    rates_by_count = {
+        int(workers): run_rates.droplevel(0)
+        for workers, run_rates in runs.groupby(level=0)
     }
-    fewest, slowest = next(iter(by_count.items()))
-    text = list[str]()
     table = list[list[Cell]]()
-    for workers, found in by_count.items():
-        gains = (found / slowest.reindex(found.index)).dropna()
-        table += [
-            [workers, str(name), float(rate), gains.get(name)]
-            for name, rate in found.items()
-        ]
-        told = f"{wording.count(workers, 'worker')}: {_spread(found)} pictures a second"
-        if workers > fewest and len(gains):
-            share = 100 * gains.median() * fewest / workers
-            told += (
-                f", {_spread(gains)} times as many as "
-                f"{wording.count(fewest, 'worker')} ({share:.0f} % of linear)"
-            )
-        text.append(f"{told}.")
-    if (few := min(map(len, by_count.values()))) > 1:
-        text.append(
-            f"Medians of {few} runs, one of each object, with the lowest and the "
-            "highest, which enclose the median of "
-            f"all such runs with a confidence of {100 * (1 - 0.5 ** (few - 1)):.3g} %."
-        )
+    for workers, run_rates in rates_by_count.items():
+        gains = _compute_gains(run_rates, rates_by_count)
+        for name, rate in run_rates.items():
+            table.append([workers, str(name), float(rate), gains.get(name)])
     cores = wording.count(rows.attrs["cores"], "core")
+    text = _describe_scaling(rates_by_count)
     text.append(
         f"This machine gives {cores}; what other programs took of it meanwhile "
         "is in these numbers."
     )
 
     def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        counts = list(by_count)
-        straight = [slowest.median() / fewest * workers for workers in counts]
-        axes.plot(
-            counts,
-            straight,
-            color="0.7",
-            label=f"linear, from {wording.count(fewest, 'worker')}",
-        )
-        for workers, found in by_count.items():
-            axes.plot(
-                [workers] * 2,
-                [found.min(), found.max()],
-                color=figures.BLUE,
-                alpha=0.45,
-                linewidth=3,
-            )
-        middle = [found.median() for found in by_count.values()]
-        axes.plot(
-            counts,
-            middle,
-            "o-",
-            color=figures.BLUE,
-            ms=5,
-            label="median; bar: lowest to highest run",
-        )
-        axes.set_xticks(counts, list(map(str, counts)))
-        axes.set(
-            xlabel="workers",
-            ylabel="pictures a second",
-            ylim=(0.0, 1.08 * max(*straight, runs.max())),
-        )
-        axes.grid(True, axis="y")
-        figure.legend(loc="outside lower center", ncols=2)
+        _draw_scaling(figure, rates_by_count, runs.max())
 
     heads = [
         "workers",
@@ -794,34 +952,115 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
     )
 
 
-def _rate(times: Any) -> float:
-    """Pictures a second, without the first quarter, in which workers load; rows of one
-    batch are stored at once.
+def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
+    """Divide the rates of runs by those of the same objects with the fewest workers."""
+    slowest = next(iter(rates_by_count.values()))
+    return (run_rates / slowest.reindex(run_rates.index)).dropna()
+
+
+def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
+    """Describe the throughput of each worker count, relative to the fewest workers."""
+    fewest = next(iter(rates_by_count))
+    text = list[str]()
+    for workers, run_rates in rates_by_count.items():
+        sentence = (
+            f"{wording.count(workers, 'worker')}: "
+            f"{_format_spread(run_rates)} pictures a second"
+        )
+        gains = _compute_gains(run_rates, rates_by_count)
+        if workers > fewest and len(gains):
+            efficiency = 100 * gains.median() * fewest / workers
+            sentence += (
+                f", {_format_spread(gains)} times as many as "
+                f"{wording.count(fewest, 'worker')} ({efficiency:.0f} % of linear)"
+            )
+        text.append(f"{sentence}.")
+    min_runs = min(map(len, rates_by_count.values()))
+    if min_runs > 1:
+        # The median of the population lies outside the range of n runs only if all n
+        # are on one side of it.
+        confidence = 100 * (1 - 0.5 ** (min_runs - 1))
+        text.append(
+            f"Medians of {min_runs} runs, one of each object, with the lowest and the "
+            "highest, which enclose the median of "
+            f"all such runs with a confidence of {confidence:.3g} %."
+        )
+    return text
+
+
+def _draw_scaling(
+    figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
+) -> None:
+    """Draw median and range of the throughput over worker counts, and linear scaling."""
+    axes = figure.subplots()
+    counts = list(rates_by_count)
+    fewest, slowest = next(iter(rates_by_count.items()))
+    linear = [slowest.median() / fewest * workers for workers in counts]
+    axes.plot(
+        counts,
+        linear,
+        color="0.7",
+        label=f"linear, from {wording.count(fewest, 'worker')}",
+    )
+    for workers, run_rates in rates_by_count.items():
+        axes.plot(
+            [workers] * 2,
+            [run_rates.min(), run_rates.max()],
+            color=figures.BLUE,
+            alpha=0.45,
+            linewidth=3,
+        )
+    axes.plot(
+        counts,
+        [run_rates.median() for run_rates in rates_by_count.values()],
+        "o-",
+        color=figures.BLUE,
+        ms=5,
+        label="median; bar: lowest to highest run",
+    )
+    axes.set_xticks(counts, list(map(str, counts)))
+    axes.set(
+        xlabel="workers",
+        ylabel="pictures a second",
+        ylim=(0.0, 1.08 * max(*linear, max_rate)),
+    )
+    axes.grid(True, axis="y")
+    figure.legend(loc="outside lower center", ncols=2)
+
+
+def _compute_throughput(times: Any) -> float:
+    """Compute images per second from the times (n,) when the rows of a run were stored.
+
+    The first quarter is left out, in which workers load. Rows of one batch are stored
+    at once.
+
+    Raises:
+        InputError: if the rest is a single batch.
     """
     times = np.sort(times)
-    begun = times[len(times) // 4]
-    if times[-1] <= begun:
+    start = times[len(times) // 4]
+    if times[-1] <= start:
         raise InputError(
             "figures: scaling: expected runs of several batches; ask for "
             "more `samples`, or set `batch`"
         )
-    return float((times > begun).sum() / (times[-1] - begun))
+    return float((times > start).sum() / (times[-1] - start))
 
 
-def _spread(values: Any) -> str:
-    """The median, and where there are several values the ends of them: ``1.9 (1.8 to
-    2)``.
-    """
-    text = f"{values.median():.3g}"
-    return (
-        f"{text} ({values.min():.3g} to {values.max():.3g})"
-        if len(values) > 1
-        else text
-    )
+def _format_spread(values: Any) -> str:
+    """Format the median of values, and their range if there are several."""
+    median = f"{values.median():.3g}"
+    if len(values) < 2:
+        return median
+    return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
 def surface(rows: Rows, options: Options) -> MadeFigure:
-    """Show which parts of each object, when seen, go with wrong predictions."""
+    """Make a figure of the surface parts that are visible when predictions are wrong.
+
+    Raises:
+        InputError: if no sweep has `surface: true`.
+    """
     surfaces = rows.attrs["surfaces"]
     if not surfaces:
         raise InputError(
@@ -832,31 +1071,28 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
     def draw(figure: Any) -> None:
         from matplotlib.image import imread  # matplotlib takes half a second
 
-        for axes, run in zip(
-            figure.subplots(len(surfaces), squeeze=False)[:, 0], surfaces, strict=True
-        ):
-            axes.imshow(
-                imread(
-                    RunDirectory.locate_part(rows.attrs["folder"], run)
-                    / "images"
-                    / "surface.png"
-                )
-            )
+        all_axes = figure.subplots(len(surfaces), squeeze=False)[:, 0]
+        for axes, run in zip(all_axes, surfaces, strict=True):
+            directory = RunDirectory.locate_part(rows.attrs["folder"], run)
+            axes.imshow(imread(directory / "images" / "surface.png"))
             axes.axis("off")
 
-    table: list[list[Cell]] = [
-        [
-            part.object,
-            wording.short_name(part.model),
-            part.part,
-            part.seen,
-            part.compared,
-            part.worse,
-            part.better,
-        ]
-        for found in surfaces.values()
-        for part in found.tables
-    ]
+    table = list[list[Cell]]()
+    text = list[str]()
+    for run_surface in surfaces.values():
+        text += workbench.surface_sentences(run_surface)
+        for part in run_surface.tables:
+            table.append(
+                [
+                    part.object,
+                    wording.short_name(part.model),
+                    part.part,
+                    part.seen,
+                    part.compared,
+                    part.worse,
+                    part.better,
+                ]
+            )
     heads = [
         "object",
         "model",
@@ -865,11 +1101,6 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
         "compared",
         "with wrong predictions",
         "with right predictions",
-    ]
-    text = [
-        sentence
-        for found in surfaces.values()
-        for sentence in workbench.surface_sentences(found)
     ]
     title = "Which parts of the surface go with wrong predictions"
     return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

@@ -1,6 +1,4 @@
-"""The settings of `recipe`, and its result: what its runs were, its figures with their
-numbers, and what they say.
-"""
+"""Settings and result of `recipe`: its runs, and its figures with numbers and sentences."""
 
 from __future__ import annotations
 
@@ -30,15 +28,12 @@ Cell = str | int | float | None
 
 NAMED = "what the recipe names"
 
-
-# whose validators check the settings of the same names
+# its validators check the settings of the same names
 SCENE_SETTINGS: Any = SceneConfig
 
 
 class RecipeConfig(Config):
-    """Everything that decides what `recipe` does: which recipe, and on what objects,
-    environments and models.
-    """
+    """Settings of `recipe`: which recipe, and on which objects, environments and models."""
 
     command: ClassVar[str] = "recipe"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
@@ -63,7 +58,9 @@ class RecipeConfig(Config):
         expects="names of environments or .hdr or .exr files",
     )
     up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
-    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting_as_in(SceneConfig, "facing")
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting_as_in(
+        SceneConfig, "facing"
+    )
     size: float | None = setting_as_in(SceneConfig, "size")
     unit: Literal["mm", "cm", "m", "in"] | None = setting_as_in(SceneConfig, "unit")
     resolution: tuple[int, int] | None = setting_as_in(
@@ -127,40 +124,34 @@ class RecipeConfig(Config):
 
     @field_validator("photographs")
     @classmethod
-    def _folder_from_anywhere(cls, value: str | None) -> str | None:
-        """A run is gone on with from any folder."""
+    def _resolve_photographs(cls, value: str | None) -> str | None:
+        """Make the path absolute, since a run is resumed from any directory."""
         return None if value is None else str(Path(value).expanduser().resolve())
 
     @field_validator("label")
     @classmethod
-    def _labels_with_names(cls, value: dict[str, str]) -> dict[str, str]:
-        if any(
-            not text.strip(" ,\t\n") or "\0" in name + text
-            for name, text in value.items()
-        ):
-            raise ValueError("an empty name")
+    def _check_labels(cls, value: dict[str, str]) -> dict[str, str]:
+        """Reject empty labels and zero bytes."""
+        for name, label in value.items():
+            if not label.strip(" ,\t\n") or "\0" in name + label:
+                raise ValueError("an empty name")
         return value
 
     @property
     def title(self) -> tuple[str, ...]:
-        return (
-            Path(self.recipe).stem,
-            *(Path(name).stem for name in settings.split_names(self.object or "")[:1]),
-        )
+        """The names that a run's directory is named after: the recipe and an object."""
+        objects = settings.split_names(self.object or "")
+        return Path(self.recipe).stem, *(Path(name).stem for name in objects[:1])
 
     @property
     def task_name(self) -> str | None:
-        """The name of the task, or None where the recipe says it."""
-        return (
-            self.task
-            if self.task is None or isinstance(self.task, str)
-            else str(self.task["name"])
-        )
+        """The name of the task, or None if the recipe states it."""
+        if self.task is None or isinstance(self.task, str):
+            return self.task
+        return str(self.task["name"])
 
     def label_of(self, name: str) -> str | None:
-        """Return what was said to be the right label for an object; None for its
-        own.
-        """
+        """Return the right label that the settings give an object, None for its own."""
         return (
             self.label.get(name)
             or self.label.get(Path(name).stem)
@@ -168,7 +159,7 @@ class RecipeConfig(Config):
         )
 
 
-# columns of a figure's numbers that are a share and the ends of its 95 % interval
+# columns of a figure's numbers that are a fraction and the bounds of its 95 % interval
 SHARES = ("share", "low", "high")
 
 
@@ -184,7 +175,7 @@ class RecipePart(results.Fields):
 
 
 class RecipeFigure(results.Fields):
-    """One figure: its numbers, and what they say."""
+    """One figure: its numbers, and sentences about them."""
 
     figure: str = Field(description="its kind")
     title: str
@@ -196,7 +187,7 @@ class RecipeFigure(results.Fields):
 
 
 class RecipeResult(views.InNotebook, RunResult):
-    """What a recipe came to: its runs, its figures and what they say."""
+    """Result of a recipe: its runs, its figures and what they show."""
 
     command: ClassVar[str] = "recipe"
 
@@ -218,86 +209,88 @@ class RecipeResult(views.InNotebook, RunResult):
 
 
 def shown(result: RecipeResult) -> ShownResult:
-    """Return each figure with what it says and its numbers, and the runs that it
-    took.
-    """
+    """Lay out a result: each figure with its sentences and numbers, then the runs."""
     sections = [ResultPart(text=[result.about], only="page")]
-    for number, (made, texts) in enumerate(
-        zip(result.figures, told_once(result.figures), strict=True), start=1
+    sentences = told_once(result.figures)
+    for number, (figure, text) in enumerate(
+        zip(result.figures, sentences, strict=True), start=1
     ):
-        rows = [list(map(_cell, made.columns, row)) for row in made.rows]
-        sections.append(
-            ResultPart(made.title, texts, figure=f"images/figure-{number}.png")
-        )
+        image = f"images/figure-{number}.png"
+        sections.append(ResultPart(figure.title, text, figure=image))
+        rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
         sections.append(
             ResultPart(
-                "The numbers", heads=made.columns, rows=rows, folded=True, only="page"
+                "The numbers", heads=figure.columns, rows=rows, folded=True, only="page"
             )
         )
-    rows = [
-        [run.name, run.command, run.ending, str(run.renders)] for run in result.parts
-    ]
-    heads = ("run in parts/", "command", "ending", "renders")
-    names = [run.name for run in result.parts]
-    title = wording.count(len(result.parts), "run")
-    sections.append(
-        ResultPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page")
-    )
-    of_what = result.objects, result.environment.split(","), result.model.split(",")
-    objects, environments, models = (
-        ", ".join(map(wording.short_name, listed)) for listed in of_what
-    )
+    sections.append(_list_runs(result.parts))
+    objects = ", ".join(map(wording.short_name, result.objects))
+    environments = _shorten_names(result.environment)
+    models = _shorten_names(result.model)
     facts = {
         "objects": objects,
         "environments": environments,
         "models": models,
         "runs": str(len(result.parts)),
+        "renders": str(sum(run.renders for run in result.parts)),
     }
-    facts |= {"renders": str(sum(run.renders for run in result.parts))}
-    quick = (
-        ["Made with few and small pictures, to see what comes out; no result."]
-        if result.quick
-        else []
-    )
+    remarks = list[str]()
+    if result.quick:
+        remarks.append(
+            "Made with few and small pictures, to see what comes out; no result."
+        )
+    recipe_name = PurePath(result.recipe).stem
     return ShownResult(
-        result.title,
-        sections,
-        facts,
-        [PurePath(result.recipe).stem, models, objects],
-        quick,
+        result.title, sections, facts, [recipe_name, models, objects], remarks
     )
 
 
-def _cell(column: str, value: Cell) -> str:
+def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
+    """Make the table of a recipe's runs."""
+    rows = [[run.name, run.command, run.ending, str(run.renders)] for run in parts]
+    return ResultPart(
+        wording.count(len(parts), "run"),
+        heads=("run in parts/", "command", "ending", "renders"),
+        rows=rows,
+        parts=[run.name for run in parts],
+        folded=True,
+        only="page",
+    )
+
+
+def _shorten_names(names: str) -> str:
+    """Shorten each of the names that commas separate."""
+    return ", ".join(map(wording.short_name, names.split(",")))
+
+
+def _format_cell(column: str, value: Cell) -> str:
+    """Format a cell of a figure's numbers."""
     if column in SHARES:
         return wording.percent(value) if isinstance(value, (int, float)) else ""
-    return (
-        f"{value:.4g}"
-        if isinstance(value, float)
-        else ""
-        if value is None
-        else str(value)
-    )
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "" if value is None else str(value)
 
 
 def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
-    """Return what each figure says without counts that a figure before it has told;
-    where nothing is left, that.
+    """Return the sentences of each figure without counts that an earlier one reports.
+
+    If nothing is left, a sentence says so.
     """
-    said = set[str]()
-    told = list[list[str]]()
-    for before, figure in zip([None, *figures], figures, strict=False):
+    reported = set[str]()
+    remaining = list[list[str]]()
+    previous: RecipeFigure | None = None
+    for figure in figures:
         new = [
-            text
-            for text in figure.text
-            if text not in said or not re.search(r"\d of \d", text)
+            sentence
+            for sentence in figure.text
+            if sentence not in reported or not re.search(r"\d of \d", sentence)
         ]
-        same = before is not None and figure.text == before.text
-        nothing = [
-            "It says the same as the figure before it."
-            if same
-            else "It says what figures before it say."
-        ]
-        told.append(nothing if same or not new else new)
-        said |= set(figure.text)
-    return told
+        if previous is not None and figure.text == previous.text:
+            new = ["It says the same as the figure before it."]
+        elif not new:
+            new = ["It says what figures before it say."]
+        remaining.append(new)
+        reported |= set(figure.text)
+        previous = figure
+    return remaining

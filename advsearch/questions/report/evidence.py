@@ -1,6 +1,4 @@
-"""Runs as evidence: their claims, what they were about, what varied, how it was
-measured, what is left out.
-"""
+"""Runs as evidence: claims, subject, what varied, how it was measured, what is excluded."""
 
 from __future__ import annotations
 
@@ -46,10 +44,6 @@ from advsearch.questions.report.result import ConditionShare, Evidence, Evidence
 if TYPE_CHECKING:
     from advsearch.extend import workbench
 
-# ---------------------------------------------------------------------------------------------------------------------
-# What an engineer reads of a run beside its claims: shares by condition, whether a
-# criterion is met, how common conditions are, the operational design domain in words,
-# and what is not shown.
 
 DOMAIN = {
     "place": ("environment", "background"),
@@ -68,26 +62,26 @@ DOMAIN = {
     "ways and speeds": ("path",),
     "camera and picture": ("camera", "lens", "sensor", "corruption"),
 }
-"""The parts of an operational design domain, and the axes and controls that each is
-about.
-"""
-OTHER = "other"  # the part of what belongs to none of them
+"""The parts of an operational design domain, with their axes and controls."""
+# the part of axes and controls that belong to no other
+OTHER = "other"
 
 # how common the values of axes are: weights by axis and value
 Exposure = Mapping[str, Mapping[str, float]]
 
 
 def is_attack(result: results.Result) -> TypeGuard[workbench.AttackSummary]:
-    """Whether a result is that of one attack, and not of a study of several."""
+    """Return whether a result is that of a single attack, not of a study of several."""
     return isinstance(result, workbench.get_experiment("attack").result)
 
 
 def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
-    """Whether a result is that of a sweep."""
+    """Return whether a result is that of a sweep."""
     return isinstance(result, workbench.get_experiment("sweep").result)
 
 
 def nothing_claimed(why: str) -> views.Claim:
+    """Return the claim of a run that carries none, with the reason."""
     return views.Claim(
         kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None
     )
@@ -96,72 +90,77 @@ def nothing_claimed(why: str) -> views.Claim:
 def conditions_of(
     result: results.Result, photographs: Sequence[Any] | None = None
 ) -> list[ConditionShare]:
-    """Return the share of right predictions by each value of each axis of a sweep; or
-    that of its photographs which agree with the rendering that they were aligned with:
-    right in both or wrong in both.
+    """Count right predictions by each value of each axis of a sweep.
+
+    Given the rows of photographs, count instead how many of them agree with the
+    rendering that they are aligned with: right in both or wrong in both.
     """
     conditions = []
     for row in result.axes if is_sweep(result) else ():
         right = row.correct
         total = row.configurations
-        # none of one draw
+        # a single draw has no interval
         interval: tuple[float, float] | None = row.interval or (0.0, 1.0)
         if photographs is not None:
-            agree = [
-                bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])
-                for photo in photographs
-                if row.axis in photo.values
-                and _has(photo.values[row.axis]["value"], row.value)
-            ]
-            right = sum(agree)
-            total = len(agree)
-            interval = (
-                statistics.intervals.clopper_pearson(right, total) if total else None
+            right, total = _count_agreeing(photographs, row.axis, row.value)
+            interval = None
+            if total:
+                interval = statistics.intervals.clopper_pearson(right, total)
+        if not total or interval is None:
+            continue
+        bounds = row.value if isinstance(row.value, tuple) else (row.value,)
+        value = " to ".join(map(wording.number_text, bounds))
+        unit = "" if row.unit == "1" else row.unit
+        conditions.append(
+            ConditionShare(
+                condition=f"{row.axis} {value} {unit}".strip(),
+                axis=row.axis,
+                value=value,
+                right=right,
+                total=total,
+                interval=interval,
             )
-        if total and interval is not None:
-            value = " to ".join(
-                map(
-                    wording.number_text,
-                    row.value if isinstance(row.value, tuple) else (row.value,),
-                )
-            )
-            unit = "" if row.unit == "1" else row.unit
-            conditions.append(
-                ConditionShare(
-                    condition=f"{row.axis} {value} {unit}".strip(), axis=row.axis, value=value, right=right,
-                    total=total, interval=interval,
-                )
-            )  # fmt: skip
+        )
     return conditions
 
 
-def _has(value: float | str, of: workbench.AxisValue) -> bool:
+def _count_agreeing(
+    photographs: Sequence[Any], axis: str, value: workbench.AxisValue
+) -> tuple[int, int]:
+    """Count photographs under a condition: those that agree, and all."""
+    agrees = []
+    for photo in photographs:
+        if axis in photo.values and _has_value(photo.values[axis]["value"], value):
+            photo_is_right = bool(cast(Any, photo.payload)["photo"]["right"])
+            agrees.append(bool(photo.correct) == photo_is_right)
+    return sum(agrees), len(agrees)
+
+
+def _has_value(value: float | str, of: workbench.AxisValue) -> bool:
+    """Return whether a value is that of an axis, or in its range."""
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
 
 
 def triggering_conditions(result: results.Result) -> list[str]:
+    """Return rules under which the model is wrong more often."""
     triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
 
 def met(criterion: float, interval: results.Interval) -> str:
-    """Return whether a share is surely at least as large as asked, surely not, or
-    neither.
-    """
-    return (
-        "met"
-        if interval[0] >= criterion
-        else "not met"
-        if interval[1] < criterion
-        else "open"
-    )
+    """Return whether an interval is above a criterion (met), below (not met) or open."""
+    lower, upper = interval
+    if lower >= criterion:
+        return "met"
+    return "not met" if upper < criterion else "open"
 
 
 def chosen_axes(result: results.Result) -> list[str]:
-    """Return the axes of a sweep whose several values somebody chose: they are not
-    drawn, so that a share over them is one of these values.
+    """Return the axes of a sweep with several values that somebody chose.
+
+    They are not sampled, so that a fraction over them depends on the choice.
     """
     counts = Counter[str]()
     if is_sweep(result):
@@ -179,55 +178,68 @@ def criterion_lines(
     criterion: float,
     chosen: Sequence[str] = (),
 ) -> list[str]:
-    """Return what a criterion, that so large a share is right, comes to. A share of
-    failures has none.
+    """Describe whether a criterion, a minimum fraction that is right, is met.
 
-    Where the values of axes are `chosen`, each condition is judged by itself: a share
-    over all of them would change with the choice. Without conditions, the share says
-    that it is over these values.
+    If values of axes were chosen, each condition is evaluated separately: a fraction
+    over all of them would change with the choice. Without conditions, the sentences
+    state that choice. A fraction of failures has no criterion.
+
+    Args:
+        claims: claims of the run.
+        conditions: fractions by condition.
+        criterion: the minimum fraction.
+        chosen: axes whose values were chosen.
     """
-    lines = []
-    if not (chosen and conditions):
-        over = (
-            (
-                f" Over the values of {', '.join(chosen)} that were chosen: others "
-                "give "
-                "another share."
-            )
-            if chosen
-            else ""
-        )
-        lines = [
-            f"At least {wording.percent(criterion)}: {met(criterion, extent.interval)} "
-            f"by {extent.count} of "
-            f"{extent.total} {extent.what}, 95 % interval "
-            f"{wording.interval_text(extent.interval)}.{over}"
-            for extent in (claim.extent for claim in claims if claim.extent is not None)
-            if "right" in extent.what or "held-out" in extent.what
-        ]
     verdicts = {row.condition: met(criterion, row.interval) for row in conditions}
+    lines = []
     if chosen and conditions:
-        named = ", ".join(chosen)
         counts = Counter(verdicts.values())
         lines.append(
             f"At least {wording.percent(criterion)}, each condition by its own 95 % "
             f"interval: met in {counts['met']}, "
             f"not met in {counts['not met']} and open in {counts['open']} of "
             f"{len(verdicts)}. There is no verdict over "
-            f"all: the values of {named} were chosen."
+            f"all: the values of {', '.join(chosen)} were chosen."
         )
+    else:
+        lines += _criterion_of_claims(claims, criterion, chosen)
     for verdict in ("not met", "open") if chosen else ("not met",):
-        if where := [
-            condition for condition, told in verdicts.items() if told == verdict
-        ]:
-            lines.append(f"{verdict.capitalize()} where: {', '.join(where)}.")
+        names = [condition for condition, known in verdicts.items() if known == verdict]
+        if names:
+            lines.append(f"{verdict.capitalize()} where: {', '.join(names)}.")
+    return lines
+
+
+def _criterion_of_claims(
+    claims: Sequence[views.Claim], criterion: float, chosen: Sequence[str]
+) -> list[str]:
+    """Describe for each claimed fraction of right predictions if a criterion is met."""
+    remark = ""
+    if chosen:
+        remark = (
+            f" Over the values of {', '.join(chosen)} that were chosen: others "
+            "give another share."
+        )
+    lines = []
+    for claim in claims:
+        extent = claim.extent
+        if extent is None:
+            continue
+        if "right" in extent.what or "held-out" in extent.what:
+            lines.append(
+                f"At least {wording.percent(criterion)}: "
+                f"{met(criterion, extent.interval)} by {extent.count} of "
+                f"{extent.total} {extent.what}, 95 % interval "
+                f"{wording.interval_text(extent.interval)}.{remark}"
+            )
     return lines
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
-    """Return what a YAML file says of how common values are, such as ``environment:
-    {street: 0.8, street-wet: 0.2}``; an InputError where it is missing, or says
-    something else.
+    """Read weights of values by axis, such as ``environment: {street: 0.8, wet: 0.2}``.
+
+    Raises:
+        InputError: if the YAML file is missing, or has no weights.
     """
     exposure: dict[str, dict[str, float]] = {}
     for axis, weights in settings.read_yaml(path).items():
@@ -237,11 +249,10 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
                 f"each, such as {{street: 0.8}}"
             )
         for value, weight in weights.items():
-            if (
-                isinstance(weight, bool)
-                or not isinstance(weight, (int, float))
-                or not 0.0 <= weight <= 1e9
-            ):
+            is_number = isinstance(weight, (int, float)) and not isinstance(
+                weight, bool
+            )
+            if not is_number or not 0.0 <= weight <= 1e9:
                 raise InputError(
                     f"exposure: {path}: {axis}: {value}: expected a "
                     f"number of at least 0, got {weight!r}"
@@ -257,12 +268,16 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
 def exposure_lines(
     result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure
 ) -> list[str]:
-    """Return the share of right predictions where the values of an axis are as common
-    as weights say: the weighted mean of the shares, between those of the ends of
-    intervals that hold together (Bonferroni).
+    """Describe the fraction of right predictions weighted by how common values are.
+
+    It is the weighted mean of the fractions; its bounds are those of the bounds of
+    intervals that hold jointly (Bonferroni).
+
+    Raises:
+        UnknownNameError: if a weighted value is none of its axis.
     """
     lines = []
-    independent = is_sweep(result) and result.units is None
+    is_independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
         rows = {row.value: row for row in conditions if row.axis == axis}
         if not rows:
@@ -272,31 +287,42 @@ def exposure_lines(
                 raise errors.UnknownNameError(
                     f"value of {axis} in the exposure", value, rows
                 )
-        total = sum(weights.values())
-        if not independent:
+        if not is_independent:
             lines.append(
                 f"Weighted by {axis}: not told, as predictions share draws "
                 "(frames of a drive do)."
             )
             continue
-        sure = 1.0 - 0.05 / len(weights)
-        mean = low = high = 0.0
-        for value, weight in weights.items():
-            row = rows[value]
-            part = weight / total
-            ends = statistics.intervals.clopper_pearson(row.right, row.total, sure)
-            mean = mean + part * row.right / row.total
-            low = low + part * ends[0]
-            high = high + part * ends[1]
-        shares = ", ".join(
+        mean, lower, upper = _weighted_mean(rows, weights)
+        total = sum(weights.values())
+        fractions = ", ".join(
             f"{value} {wording.percent(weight / total)}"
             for value, weight in weights.items()
         )
         lines.append(
-            f"Weighted by {axis} ({shares}): right in {wording.percent(mean)}, "
-            f"95 % interval {wording.interval_text((low, high))}."
+            f"Weighted by {axis} ({fractions}): right in {wording.percent(mean)}, "
+            f"95 % interval {wording.interval_text((lower, upper))}."
         )
     return lines
+
+
+def _weighted_mean(
+    rows: Mapping[str, ConditionShare], weights: Mapping[str, float]
+) -> tuple[float, float, float]:
+    """Return the weighted mean of fractions, and its lower and upper bound."""
+    total = sum(weights.values())
+    confidence = 1.0 - 0.05 / len(weights)
+    mean = lower = upper = 0.0
+    for value, weight in weights.items():
+        row = rows[value]
+        fraction = weight / total
+        interval = statistics.intervals.clopper_pearson(
+            row.right, row.total, confidence
+        )
+        mean = mean + fraction * row.right / row.total
+        lower = lower + fraction * interval[0]
+        upper = upper + fraction * interval[1]
+    return mean, lower, upper
 
 
 class Variation(Enum):
@@ -308,15 +334,14 @@ class Variation(Enum):
 
 
 class DomainPart(NamedTuple):
-    """What a part of an operational design domain was, in words, and whether that
-    varied.
-    """
+    """A part of an operational design domain: a description, and whether it varied."""
 
     variation: Variation
     description: str
 
     @property
     def text(self) -> str:
+        """The description with the variation before it."""
         return ": ".join(filter(None, (self.variation.value, self.description)))
 
 
@@ -325,45 +350,32 @@ def domain_of(
     recorded: Sequence[RecordedSettings],
     searched: Sequence[str],
 ) -> dict[str, DomainPart]:
-    """Return the parts of an operational design domain by name: within what each
-    varied, or what it was.
+    """Describe the parts of an operational design domain: ranges, or fixed values.
+
+    Args:
+        result: result of the run.
+        recorded: settings that it recorded.
+        searched: sentences on what varied.
     """
-    fixed = defaultdict[str, list[str]](list)
-    fixed["place"].append(
-        str(getattr(result, "environment", "") or stated(recorded, "environment"))
-    )
-    things = filter(
-        None, (str(getattr(result, "object", "") or ""), stated(recorded, "things"))
-    )
-    fixed["road users and things"].append("; ".join(things))
-    fixed["camera and picture"].append(stated(recorded, "camera"))
-    values = dict.fromkeys(
-        (str(name), str(value))
-        for settings in recorded
-        if isinstance(given := settings.values.get("set"), Mapping)
-        for name, value in given.items()
-    )
-    for name, value in values:
-        fixed[part_of_domain(name)].append(f"{name} {value}")
-    moving = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
+    fixed = _fixed_domain(result, recorded)
+    controls = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
     domain = dict[str, DomainPart]()
     for part in (*DOMAIN, OTHER):
         varied = [line for line in searched if part_of_domain(line) == part]
-        varied = varied or [name for name in moving if part_of_domain(name) == part]
-        for drive in (
-            (getattr(result, "drives", None) or [])[:1]
-            if part == "ways and speeds"
-            else ()
-        ):
+        if not varied:
+            varied = [name for name in controls if part_of_domain(name) == part]
+        drives = getattr(result, "drives", None) or []
+        if part == "ways and speeds" and drives:
+            drive = drives[0]
             varied.append(
                 f"{drive.drives} drives of {drive.seconds:g} s, "
                 f"{drive.frames} frames each"
             )
-        was = "; ".join(filter(None, fixed[part]))
+        fixed_text = "; ".join(filter(None, fixed[part]))
         if varied:
             domain[part] = DomainPart(Variation.VARIED, "; ".join(varied))
-        elif part != OTHER or was:
-            domain[part] = DomainPart(Variation.FIXED, was)
+        elif part != OTHER or fixed_text:
+            domain[part] = DomainPart(Variation.FIXED, fixed_text)
     if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
             if domain[part].variation is Variation.FIXED:
@@ -371,18 +383,39 @@ def domain_of(
     return domain
 
 
+def _fixed_domain(
+    result: results.Result, recorded: Sequence[RecordedSettings]
+) -> dict[str, list[str]]:
+    """Return the fixed values of each part of an operational design domain."""
+    fixed = defaultdict[str, list[str]](list)
+    environment = getattr(result, "environment", "") or stated(recorded, "environment")
+    fixed["place"].append(str(environment))
+    things = (str(getattr(result, "object", "") or ""), stated(recorded, "things"))
+    fixed["road users and things"].append("; ".join(filter(None, things)))
+    fixed["camera and picture"].append(stated(recorded, "camera"))
+    # each value once
+    values = dict[tuple[str, str], None]()
+    for run_settings in recorded:
+        fixed_values = run_settings.values.get("set")
+        if isinstance(fixed_values, Mapping):
+            for name, value in fixed_values.items():
+                values[str(name), str(value)] = None
+    for name, value in values:
+        fixed[part_of_domain(name)].append(f"{name} {value}")
+    return fixed
+
+
 def part_of_domain(name: str) -> str:
-    """Return the part of a domain that an axis, a control or a parameter of a scene is
-    about.
-    """
-    begins = re.match(r"\w+", name)
-    for part, names in DOMAIN.items():
-        if begins is not None and begins[0] in names:
-            return part
+    """Return the part of a domain that an axis, a control or a parameter belongs to."""
+    beginning = re.match(r"\w+", name)
+    if beginning is not None:
+        for part, names in DOMAIN.items():
+            if beginning[0] in names:
+                return part
     return OTHER
 
 
-# of a run that say most of what it found, best first
+# images of a run that show most of its result, best first
 PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")
 
 RULES = (
@@ -408,33 +441,28 @@ QUICK = (
 
 
 def claims_of(result: results.Result) -> list[views.Claim]:
+    """Return the claims of a run; a run without any has a reason."""
     if result.goes_on:
-        state = (
-            "is running"
-            if getattr(result, "ending", "") == results.RUNNING
-            else "is not finished"
-        )
+        is_running = getattr(result, "ending", "") == results.RUNNING
+        reason = f"the run {'is running' if is_running else 'is not finished'}"
+        if result.brief:
+            reason += f"; so far: {result.brief}"
+        return [nothing_claimed(reason)]
+    read_claims = workbench.get_experiment(result.command).claims
+    if not read_claims:
         return [
             nothing_claimed(
-                f"the run {state}"
-                + (f"; so far: {result.brief}" if result.brief else "")
+                f"the command {result.command} does not measure how often a model is "
+                "right"
             )
         ]
-    if claims := workbench.get_experiment(result.command).claims:
-        return list(claims(result)) or [
-            nothing_claimed("nothing in this run came to its end")
-        ]
-    return [
-        nothing_claimed(
-            f"the command {result.command} does not measure how often a model is right"
-        )
+    return list(read_claims(result)) or [
+        nothing_claimed("nothing in this run came to its end")
     ]
 
 
 def photo_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement (`advsearch.photo_agreement`); none
-    where it is empty.
-    """
+    """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not empty."""
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
@@ -455,30 +483,36 @@ def photo_claims(photos: Any) -> list[views.Claim]:
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
-    """Return what has to be known of runs together, from their models and the digests
-    of these files, a text a run.
+    """Warn if several runs are of different models.
+
+    Args:
+        models: name of the model of each run.
+        digests: digests of the model's files of each run, as a text.
     """
     warnings = []
     names = sorted(set(models))
     if len(names) > 1:
-        different = f"The runs are of different models: {', '.join(names)}."
-        warnings.append(f"{different} A claim about one is none about another.")
+        warnings.append(
+            f"The runs are of different models: {', '.join(names)}. "
+            "A claim about one is none about another."
+        )
+    digests_of_model = defaultdict[str, set[str]](set)
+    for model, digest in zip(models, digests, strict=True):
+        if digest:
+            digests_of_model[model].add(digest)
     for name in names:
-        known = {
-            text
-            for model, text in zip(models, digests, strict=True)
-            if model == name and text
-        }
-        if len(known) > 1:
+        n_versions = len(digests_of_model[name])
+        if n_versions > 1:
             warnings.append(
                 f"{name}: its file was not the same in all runs, so that "
-                f"they are of {len(known)} models."
+                f"they are of {n_versions} models."
             )
     return warnings
 
 
 NOT_NOTED = "not noted"
-NO_MAP = "none"  # the environment of a scene that has lights of its own
+# the environment of a scene with its own lights
+NO_MAP = "none"
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
 NOT_WEIGHTED = (
@@ -493,31 +527,66 @@ def evidence_of(
     recorded: Sequence[RecordedSettings],
     made: Mapping[str, str],
 ) -> EvidenceRun:
-    """Return a run with what a reader needs to judge its claims: the settings that it
-    recorded, its own first, and versions and digests as it noted them.
+    """Return a run with what a reader needs to evaluate its claims.
+
+    Args:
+        name: name of the run.
+        result: its result.
+        claims: its claims.
+        recorded: the settings that it recorded, its own first.
+        made: versions and digests that it noted.
     """
-    settings = recorded[0].values if recorded else {}
+    run_settings = recorded[0].values if recorded else {}
+    values = {field: getattr(result, field) for field in type(result).model_fields}
+    renders = values.get("renders")
+    renders_text = "those of its parts" if renders is None else str(renders)
+    if isinstance(renders, Mapping):
+        counts = [f"{number} {name}" for name, number in renders.items() if number]
+        renders_text = ", ".join(counts) or "none"
+    seconds = values.get("seconds") or {}
+    setting_texts = dict[str, str]()
+    for each in recorded:
+        setting_texts |= each.as_text()
+    return EvidenceRun(
+        run=name,
+        command=result.command,
+        ending=str(values.get("ending") or "done"),
+        claims=list(claims),
+        about=_describe_subject(result, recorded),
+        searched=searched_lines(result, run_settings),
+        measured=_describe_measurement(result, run_settings, recorded),
+        excluded=_describe_excluded(result, claims),
+        settings=setting_texts,
+        cost={
+            "Renders": renders_text,
+            "Time": wording.seconds_text(seconds.get("total")),
+        },
+        made_with=dict(made) or {"versions and files": NOT_NOTED},
+        command_line=str(values.get("command_line") or ""),
+    )
+
+
+def _describe_subject(
+    result: results.Result, recorded: Sequence[RecordedSettings]
+) -> dict[str, str]:
+    """Return object, environment, model, task and what counts as right, by name."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     right = values.get("label_set") or stated(
         recorded, "label", "the object's own label"
     )
-    lit_by = str(values.get("environment") or "")
-    moving = {
-        name.partition(":")[0]
-        for which in ("over", "controls")
-        for name in values.get(which) or ()
-    }
-    if lit_by and {"environment", "sky"} & moving:
-        attacked = is_attack(result)
-        lit_by = (
-            f"varied, see below; the clean scene has {lit_by}"
-            if attacked
-            else f"{lit_by}, varied"
-        )
-    about = {
+    environment = str(values.get("environment") or "")
+    varied = set[str]()
+    for field in ("over", "controls"):
+        varied |= {name.partition(":")[0] for name in values.get(field) or ()}
+    if environment and {"environment", "sky"} & varied:
+        if is_attack(result):
+            environment = f"varied, see below; the clean scene has {environment}"
+        else:
+            environment = f"{environment}, varied"
+    subject = {
         "Object": str(objects or ""),
-        "Environment": lit_by,
+        "Environment": environment,
         "Model": str(values.get("model") or ""),
         "Names of its classes": stated(recorded, "labels"),
         "Prompt": stated(recorded, "prompt"),
@@ -527,68 +596,21 @@ def evidence_of(
         "Counts as right": ", ".join(right) if isinstance(right, list) else right,
         "Sought": str(values.get("goal") or ""),
     }
-    renders = values.get("renders")
-    seconds = values.get("seconds") or {}
-    if isinstance(renders, Mapping):
-        renders = (
-            ", ".join(f"{number} {name}" for name, number in renders.items() if number)
-            or "none"
-        )
-    return EvidenceRun(
-        run=name, command=result.command, ending=str(values.get("ending") or "done"), claims=list(claims),
-        about={key: text for key, text in about.items() if text}, searched=searched_lines(result, settings),
-        measured=_measured(result, settings, recorded), excluded=_excluded(result, claims),
-        settings={name: text for one in recorded for name, text in one.as_text().items()},
-        cost={
-            "Renders": "those of its parts" if renders is None else str(renders),
-            "Time": wording.seconds_text(seconds.get("total")),
-        },
-        made_with=dict(made) or {"versions and files": NOT_NOTED}, command_line=str(values.get("command_line") or ""),
-    )  # fmt: skip
+    return {name: text for name, text in subject.items() if text}
 
 
 def searched_lines(result: results.Result, settings: Mapping[str, object]) -> list[str]:
+    """Describe what varied in a run: parameters with ranges, and controls."""
     lines = []
     if is_attack(result):
-        lines.append(
-            workbench.get_experiment(result.command).view(result).facts["changed"]
-        )
-        lines += [
-            f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
-            for name, found in (result.configuration or {}).items()
-            if found.low is not None and found.high is not None
-        ]
-        lines += (
-            [f"{' and '.join(result.over)}, drawn anew for every picture"]
-            if result.over
-            else []
-        )
-        lines += [
-            f"{name}: {_span(varied)}, by chance"
-            for name, varied in result.conditions.items()
-        ]
+        lines += _searched_by_attack(result)
     elif is_sweep(result):
-        axes = dict[tuple[str, str], list[Any]]()
-        for row in result.axes:
-            if row.axis not in result.drawn:
-                axes.setdefault((row.axis, row.unit), []).append(row.value)
-        for (axis, unit), values in axes.items():
-            text = ", ".join(map(wording.number_text, values))
-            if all(isinstance(value, tuple) for value in values):  # parts of one range
-                text = (
-                    f"{min(low for low, _ in values):.4g} to "
-                    f"{max(high for _, high in values):.4g}"
-                )
-            lines.append(f"{axis}: {text} {unit}".rstrip())
-        lines += [
-            f"{name}: {_span(varied)}, drawn by chance"
-            for name, varied in result.drawn.items()
-        ]
+        lines += _searched_by_sweep(result)
     controls = settings.get("controls") or {}
     for control in getattr(result, "controls", ()):
-        given = controls.get(control) if isinstance(controls, Mapping) else None
-        if given:
-            lines.append(f"{control}, as set: {json.dumps(given, ensure_ascii=False)}")
+        ranges = controls.get(control) if isinstance(controls, Mapping) else None
+        if ranges:
+            lines.append(f"{control}, as set: {json.dumps(ranges, ensure_ascii=False)}")
         elif not any(line.startswith((control, f"{control}.")) for line in lines):
             lines.append(f"{control}: everything that it searches by default")
     for name in () if is_attack(result) else ("epsilon", "epsilons"):
@@ -597,21 +619,56 @@ def searched_lines(result: results.Result, settings: Mapping[str, object]) -> li
     return lines
 
 
-def _span(varied: results.VariedValue) -> str:
+def _searched_by_attack(result: workbench.AttackSummary) -> list[str]:
+    """Describe what an attack searched, and under which conditions."""
+    view = workbench.get_experiment(result.command).view
+    lines = [view(result).facts["changed"]]
+    for name, value in (result.configuration or {}).items():
+        if value.low is not None and value.high is not None:
+            lines.append(
+                f"{name}: {value.low:.4g} to {value.high:.4g} {value.unit}".rstrip()
+            )
+    if result.over:
+        lines.append(f"{' and '.join(result.over)}, drawn anew for every picture")
+    for name, varied in result.conditions.items():
+        lines.append(f"{name}: {_format_range(varied)}, by chance")
+    return lines
+
+
+def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
+    """Describe the axes of a sweep, and what it sampled."""
+    axes = dict[tuple[str, str], list[Any]]()
+    for row in result.axes:
+        if row.axis not in result.drawn:
+            axes.setdefault((row.axis, row.unit), []).append(row.value)
+    lines = []
+    for (axis, unit), values in axes.items():
+        text = ", ".join(map(wording.number_text, values))
+        if all(isinstance(value, tuple) for value in values):  # bins of a range
+            lower = min(low for low, _ in values)
+            upper = max(high for _, high in values)
+            text = f"{lower:.4g} to {upper:.4g}"
+        lines.append(f"{axis}: {text} {unit}".rstrip())
+    for name, varied in result.drawn.items():
+        lines.append(f"{name}: {_format_range(varied)}, drawn by chance")
+    return lines
+
+
+def _format_range(varied: results.VariedValue) -> str:
+    """Format the range of a sampled parameter, or its names."""
     if varied.low is None or varied.high is None:
         return " or ".join(varied.names or ["something"])
-    return (
-        f"{varied.low:.4g} to {varied.high:.4g} "
-        f"{'' if varied.unit == '1' else varied.unit}"
-    ).rstrip()
+    unit = "" if varied.unit == "1" else varied.unit
+    return f"{varied.low:.4g} to {varied.high:.4g} {unit}".rstrip()
 
 
-def _measured(
+def _describe_measurement(
     result: results.Result,
     settings: Mapping[str, object],
     recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
-    tasks = [one.task for one in recorded if one.is_of_scene]
+    """Return policy, seed, samples and the like by name."""
+    tasks = [each.task for each in recorded if each.is_of_scene]
     trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
     facts = {
         "Policy": getattr(result, "policy", None),
@@ -623,47 +680,48 @@ def _measured(
         trials: settings.get("trials"),
         "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
-    named = {
+    texts = {
         name: str(value) for name, value in facts.items() if value not in (None, "")
     }
     if is_attack(result) and result.verified is not None:
-        rated = result.verified
+        verified = result.verified
         control = result.clean.control
-        counting = f"{rated.trials} renders with fresh seeds"
-        if result.over and control is not None and control.trials > rated.trials:
-            counting += (
+        counts = f"{verified.trials} renders with fresh seeds"
+        if result.over and control is not None and control.trials > verified.trials:
+            counts += (
                 f" that count, those of {control.trials} in which the clean "
                 "scene is right"
             )
-        named["Verification"] = f"{counting}, {rated.spp} samples a pixel"
+        texts["Verification"] = f"{counts}, {verified.spp} samples a pixel"
     formation = getattr(result, "image_formation", None)
-    gains = getattr(result, "gains", None)
-    return (
-        {**named, "Pictures": wording.formation_text(formation, gains)}
-        if formation
-        else named
-    )
+    if formation:
+        gains = getattr(result, "gains", None)
+        texts["Pictures"] = wording.formation_text(formation, gains)
+    return texts
 
 
-def _excluded(result: results.Result, claims: Sequence[views.Claim]) -> list[str]:
+def _describe_excluded(
+    result: results.Result, claims: Sequence[views.Claim]
+) -> list[str]:
+    """Describe what was not searched, was rejected, or went wrong."""
     lines = [
         "Nothing varied but what stands under What varied, and the noise of the "
         "renders."
     ]
     if is_attack(result):
         lines += workbench.get_experiment(result.command).view(result).cautions
-        bad = result.non_finite
-        if bad.objectives or bad.gradient_elements:
+        non_finite = result.non_finite
+        if non_finite.objectives or non_finite.gradient_elements:
             lines.append(
-                f"Not finite: {bad.objectives} objectives, "
-                f"{bad.gradient_elements} numbers of gradients."
+                f"Not finite: {non_finite.objectives} objectives, "
+                f"{non_finite.gradient_elements} numbers of gradients."
             )
-        lines += [
-            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} "
-            f"{moved.unit} in place of "
-            f"{wording.number_text(moved.scene)}: the control leaves that out."
-            for moved in result.clean.moved
-        ]
+        for adjusted in result.clean.moved:
+            used = f"{wording.number_text(adjusted.used)} {adjusted.unit}"
+            lines.append(
+                f"The clean scene has {adjusted.parameter} {used} in place of "
+                f"{wording.number_text(adjusted.scene)}: the control leaves that out."
+            )
     if is_sweep(result) and result.not_finite:
         lines.append(
             f"{result.not_finite} predictions were not numbers; they count as "
@@ -679,7 +737,8 @@ def _excluded(result: results.Result, claims: Sequence[views.Claim]) -> list[str
     return lines + list(getattr(result, "warnings", ()))
 
 
-MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
+# maximum bytes of a picture that is copied
+MOST_OF_PICTURE = 16 << 20
 
 
 def collected(
@@ -689,170 +748,261 @@ def collected(
     exposure: Exposure | None = None,
     by: str = "",
 ) -> tuple[Evidence, dict[str, bytes]]:
-    """Return runs, by their names or folders, as evidence, with the pictures that it
-    names; `criterion` is the share of right predictions that is asked for, `exposure`
-    how common the values of axes are, and `by` who answers for it.
+    """Return runs as evidence, with the pictures that it names.
+
+    Args:
+        runs: names or directories of the runs.
+        criterion: minimum fraction of right predictions.
+        exposure: weights of values by axis.
+        by: who is responsible for the evidence.
     """
-    told = list[EvidenceRun]()
+    evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
-    folders = dict[Path, Path]()
-    models = list[str]()
-    digests = list[str]()
-    for folder in map(directory.find_run, runs):
-        parts = [
-            part
-            for part in sorted((folder / directory.PARTS).glob("*"))
-            if directory.is_run(part)
-        ]
-        # the runs that it consists of
-        of_recipe = parts and own_settings(folder).get("command") == "recipe"
-        folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
-    for number, folder in enumerate(folders.values(), 1):
-        files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
-        files = [file for file in files if file.is_file() and not file.is_symlink()][:3]
-        own = {
-            f"pictures/{number}-{file.name}": stored_files.read_bytes(
-                file, "a picture", MOST_OF_PICTURE
-            )
-            for file in files
-        }
-        pictures |= own
-        run = _run(folder, criterion, exposure or {})
-        begun = ""
-        with suppress(OSError):  # when its settings were written
-            written = datetime.fromtimestamp(
-                (folder / directory.CONFIG).stat().st_mtime, timezone.utc
-            )
-            begun = f"{written:%Y-%m-%d %H:%M} UTC"
-        told.append(run.model_copy(update={"pictures": list(own), "begun": begun}))
-        if model := run.about.get("Model"):
-            of_model = model, model.rpartition("@")[2]
-            models.append(model)
-            digests.append(
-                " ".join(
-                    text for name, text in run.made_with.items() if name in of_model
-                )
-            )
-    unused = set(exposure or {}) - {row.axis for run in told for row in run.conditions}
-    warnings = [
-        *warnings_over(models, digests),
-        *(f"exposure: no run has the axis {axis}." for axis in sorted(unused)),
-    ]
+    for number, folder in enumerate(_list_folders(runs), 1):
+        run_pictures = _read_pictures(folder, number)
+        pictures |= run_pictures
+        run = _make_evidence_run(folder, criterion, exposure or {})
+        update = {"pictures": list(run_pictures), "begun": _format_start(folder)}
+        evidence_runs.append(run.model_copy(update=update))
+    known_axes = {row.axis for run in evidence_runs for row in run.conditions}
+    warnings = _compare_models(evidence_runs)
+    for axis in sorted(set(exposure or {}) - known_axes):
+        warnings.append(f"exposure: no run has the axis {axis}.")
     evidence = Evidence(
-        runs=told, warnings=warnings, rules=list(RULES), version=__version__, by=by, criterion=criterion,
+        runs=evidence_runs,
+        warnings=warnings,
+        rules=list(RULES),
+        version=__version__,
+        by=by,
+        criterion=criterion,
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
-    )  # fmt: skip
+    )
     return evidence, pictures
 
 
-def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceRun:
-    """One run; of one that has no summary, that it claims nothing."""
-    settings = own_settings(folder)
-    if not (folder / directory.summary.NAME).is_file():
-        facts = {
-            "Object": str(settings.get("object") or ""),
-            "Model": str(settings.get("model") or ""),
-        }
-        return EvidenceRun(
-            run=directory.typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
-            claims=[nothing_claimed("the run has no result yet: it is still working, "
-                                    "or was stopped")],
-            about={key: text for key, text in facts.items() if text}, searched=[], measured={}, excluded=[NO_CLAIM],
-            cost={}, made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
-            settings=RecordedSettings("", settings).as_text(),
-            command_line=f"advsearch run {folder / directory.CONFIG}",
-        )  # fmt: skip
-    result = read_result(folder)
-    photographs = list[views.Claim]()
-    rows = list[Any]()
-    if (folder / directory.PHOTOGRAPHS).is_dir():
-        from advsearch.extend import workbench  # it brings torch, which takes a second
+def _list_folders(runs: Sequence[str]) -> list[Path]:
+    """Return the directories of runs, each once; of a recipe, those of its parts."""
+    folders = dict[Path, Path]()
+    for folder in map(directory.find_run, runs):
+        candidates = sorted((folder / directory.PARTS).glob("*"))
+        parts = [part for part in candidates if directory.is_run(part)]
+        if parts and own_settings(folder).get("command") == "recipe":
+            folders |= {part.resolve(): part for part in parts}
+        else:
+            folders[folder.resolve()] = folder
+    return list(folders.values())
 
-        photographs = photo_claims(workbench.load_photographs().agreement(folder))
-        with Store.open_to_read(folder) as store:
-            rows = list(store.rows("photo")) if photographs else []
-    claims = [*claims_of(result), *photographs]
-    sweeps = sweeps_read(result)
-    read = [*sweeps, *attacks_read(settings)]
-    recorded = recorded_settings(folder, result, read)
-    made = made_with(folder, read)
+
+def _read_pictures(folder: Path, number: int) -> dict[str, bytes]:
+    """Read up to three pictures of a run, by their names in the evidence."""
+    files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
+    files = [file for file in files if file.is_file() and not file.is_symlink()]
+    return {
+        f"pictures/{number}-{file.name}": stored_files.read_bytes(
+            file, "a picture", MOST_OF_PICTURE
+        )
+        for file in files[:3]
+    }
+
+
+def _format_start(folder: Path) -> str:
+    """Format when a run's settings were written, "" if that is not known."""
+    with suppress(OSError):
+        seconds = (folder / directory.CONFIG).stat().st_mtime
+        return f"{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%d %H:%M} UTC"
+    return ""
+
+
+def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
+    """Warn if runs are of different models, by their names and their files' digests."""
+    models = list[str]()
+    digests = list[str]()
+    for run in runs:
+        model = run.about.get("Model")
+        if not model:
+            continue
+        file_names = (model, model.rpartition("@")[2])
+        texts = [text for name, text in run.made_with.items() if name in file_names]
+        models.append(model)
+        digests.append(" ".join(texts))
+    return warnings_over(models, digests)
+
+
+def _make_evidence_run(
+    folder: Path, criterion: float | None, exposure: Exposure
+) -> EvidenceRun:
+    """Return a run as evidence; a run without a summary claims nothing."""
+    if not (folder / directory.summary.NAME).is_file():
+        return _make_unfinished_run(folder)
+    result = read_result(folder)
+    claims_of_photographs, photo_rows = _read_photographs(folder)
+    claims = [*claims_of(result), *claims_of_photographs]
+    read_paths = [*sweeps_read(result), *attacks_read(own_settings(folder))]
+    recorded = recorded_settings(folder, result, read_paths)
+    versions = _collect_versions(folder, result, read_paths)
+    run = evidence_of(directory.typed_name(folder), result, claims, recorded, versions)
+
+    sweeps = _read_sweeps(result)
+    searched = _list_searched(folder, result, sweeps) or run.searched
+    domain = domain_of(sweeps[0][0] if sweeps else result, recorded, searched)
+    conditions = conditions_of(result)
+    weighted = exposure_lines(result, conditions, exposure)
+    criterion_text = list[str]()
+    if criterion is not None:
+        axes = _list_chosen_axes(result, sweeps)
+        criterion_text = criterion_lines(claims, conditions, criterion, axes)
+    return run.model_copy(
+        update={
+            "searched": searched,
+            "excluded": [*_remark_quick(folder), *run.excluded],
+            "criterion": criterion_text,
+            "triggering": triggering_conditions(result),
+            "exposure": weighted,
+            "conditions": conditions,
+            "photographs": conditions_of(result, photo_rows),
+            "domain": {name: part.text for name, part in domain.items()},
+            "not_shown": _describe_limits(
+                claims_of_photographs, domain, bool(weighted)
+            ),
+        }
+    )
+
+
+def _collect_versions(
+    folder: Path, result: results.Result, read_paths: Sequence[Path]
+) -> dict[str, str]:
+    """Return versions and digests of files, without an environment that is not used."""
+    versions = made_with(folder, read_paths)
     if getattr(result, "environment", "") == NO_MAP:
         from advsearch.extend import workbench  # it brings torch, which takes a second
 
-        made.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
-    run = evidence_of(directory.typed_name(folder), result, claims, recorded, made)
-    outer = own_settings(folder.resolve().parent.parent)
-    few = (
-        [QUICK]
-        if outer.get("command") == "recipe" and outer.get("quick") is True
-        else []
-    )
-    basis = []  # the sweeps whose rows it reads: it is about what varied there
-    for path in sweeps:
+        versions.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
+    return versions
+
+
+def _read_sweeps(
+    result: results.Result,
+) -> list[tuple[results.Result, Mapping[str, Any]]]:
+    """Read results and settings of the sweeps whose rows a result was made from.
+
+    The result is about what varied in them.
+    """
+    sweeps = list[tuple[results.Result, Mapping[str, Any]]]()
+    for path in sweeps_read(result):
         with suppress(errors.AdvsearchError):
-            basis.append((read_result(path), own_settings(path)))
-    searched = list(
-        dict.fromkeys(line for one in basis for line in searched_lines(*one))
-    )
-    if (noted_parts := noted_settings(folder, result)) is not None:
-        searched = _searched_by_claims(noted_parts.get(CLAIM))
-    searched = searched or run.searched
-    domain = domain_of(basis[0][0] if basis else result, recorded, searched)
-    chosen = list(
-        dict.fromkeys(
-            axis
-            for one in (result, *(swept for swept, _ in basis))
-            for axis in chosen_axes(one)
-        )
-    )
-    conditions = conditions_of(result)
-    weighted = exposure_lines(result, conditions, exposure)
-    compared = sum(claim.extent.total for claim in photographs if claim.extent)
-    photographed = (
-        f"Only {compared} photographs were" if compared else "No photograph was"
-    )
-    not_shown = [
-        f"{photographed} compared with renderings: all else is about renderings."
-    ]
-    if still := [
-        name for name, part in domain.items() if part.variation is Variation.FIXED
-    ]:
-        not_shown.append(f"Nothing is said of other values of: {', '.join(still)}.")
-    not_shown.append(WEIGHTED if weighted else NOT_WEIGHTED)
-    more = {
-        "searched": searched,
-        "excluded": [*few, *run.excluded],
-        "criterion": []
-        if criterion is None
-        else criterion_lines(claims, conditions, criterion, chosen),
-        "triggering": triggering_conditions(result),
-        "exposure": weighted,
-        "conditions": conditions,
-        "photographs": conditions_of(result, rows),
-        "domain": {name: part.text for name, part in domain.items()},
-        "not_shown": not_shown,
+            sweeps.append((read_result(path), own_settings(path)))
+    return sweeps
+
+
+def _list_chosen_axes(
+    result: results.Result,
+    sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
+) -> list[str]:
+    """Return the axes whose values were chosen, of a run and of sweeps, each once."""
+    axes = dict.fromkeys(chosen_axes(result))
+    for sweep, _ in sweeps:
+        axes |= dict.fromkeys(chosen_axes(sweep))
+    return list(axes)
+
+
+def _make_unfinished_run(folder: Path) -> EvidenceRun:
+    """Return a run without a summary as evidence: it claims nothing."""
+    run_settings = own_settings(folder)
+    subject = {
+        "Object": str(run_settings.get("object") or ""),
+        "Model": str(run_settings.get("model") or ""),
     }
-    return run.model_copy(update=more)
+    claim = nothing_claimed(
+        "the run has no result yet: it is still working, or was stopped"
+    )
+    return EvidenceRun(
+        run=directory.typed_name(folder),
+        command=str(run_settings.get("command") or "unknown"),
+        ending="none yet",
+        claims=[claim],
+        about={name: text for name, text in subject.items() if text},
+        searched=[],
+        measured={},
+        excluded=[NO_CLAIM],
+        cost={},
+        made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
+        settings=RecordedSettings("", run_settings).as_text(),
+        command_line=f"advsearch run {folder / directory.CONFIG}",
+    )
+
+
+def _read_photographs(folder: Path) -> tuple[list[views.Claim], list[Any]]:
+    """Return the claims and the rows of a run's photographs."""
+    if not (folder / directory.PHOTOGRAPHS).is_dir():
+        return [], []
+    from advsearch.extend import workbench  # it brings torch, which takes a second
+
+    claims = photo_claims(workbench.load_photographs().agreement(folder))
+    with Store.open_to_read(folder) as store:
+        rows = list(store.rows("photo")) if claims else []
+    return claims, rows
+
+
+def _list_searched(
+    folder: Path,
+    result: results.Result,
+    sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
+) -> list[str]:
+    """Describe what varied in the claims of a suite, or in the sweeps that were read."""
+    noted = noted_settings(folder, result)
+    if noted is not None:
+        return _searched_by_claims(noted.get(CLAIM))
+    lines = dict[str, None]()
+    for sweep, sweep_settings in sweeps:
+        lines |= dict.fromkeys(searched_lines(sweep, sweep_settings))
+    return list(lines)
+
+
+def _remark_quick(folder: Path) -> list[str]:
+    """Return a remark if a run is a part of a quick recipe."""
+    outer = own_settings(folder.resolve().parent.parent)
+    is_quick = outer.get("command") == "recipe" and outer.get("quick") is True
+    return [QUICK] if is_quick else []
+
+
+def _describe_limits(
+    claims_of_photographs: Sequence[views.Claim],
+    domain: Mapping[str, DomainPart],
+    is_weighted: bool,
+) -> list[str]:
+    """Describe what a reader must not conclude from a run."""
+    n_compared = sum(
+        claim.extent.total for claim in claims_of_photographs if claim.extent
+    )
+    photographed = "No photograph was"
+    if n_compared:
+        photographed = f"Only {n_compared} photographs were"
+    lines = [f"{photographed} compared with renderings: all else is about renderings."]
+    fixed = [name for name, part in domain.items() if part.variation is Variation.FIXED]
+    if fixed:
+        lines.append(f"Nothing is said of other values of: {', '.join(fixed)}.")
+    lines.append(WEIGHTED if is_weighted else NOT_WEIGHTED)
+    return lines
 
 
 def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[str]:
-    """Return what varied in the claims of a suite, by the settings of each; None for
-    settings that can't be read.
+    """Describe what varied in the claims of a suite.
+
+    `claims` are the settings of each, None if they cannot be read.
     """
     if claims is None:
         return ["as the claims of its suite say, which cannot be read any more"]
-    lines = defaultdict[str, list[str]](list)
+    names_of_line = defaultdict[str, list[str]](list)
     for name, claim_settings in claims.items():
         controls = claim_settings.get("controls") or {}
         if not isinstance(controls, Mapping):
             controls = dict.fromkeys(str(controls).split(","))
-        for control, given in controls.items():
-            text = (
-                json.dumps(given, ensure_ascii=False)
-                if given
-                else "everything it searches by default"
-            )
-            lines[f"{control}: {text}"].append(name)
+        for control, ranges in controls.items():
+            text = "everything it searches by default"
+            if ranges:
+                text = json.dumps(ranges, ensure_ascii=False)
+            names_of_line[f"{control}: {text}"].append(name)
         if claim_settings.get("environment"):
-            lines[f"environment: {claim_settings['environment']}"].append(name)
-    return [f"{line} ({', '.join(names)})" for line, names in lines.items()]
+            line = f"environment: {claim_settings['environment']}"
+            names_of_line[line].append(name)
+    return [f"{line} ({', '.join(names)})" for line, names in names_of_line.items()]

@@ -1,6 +1,4 @@
-"""The settings that a run recorded: its own, those of its suite's claims, and those of
-the runs that it read.
-"""
+"""The settings that a run recorded: its own, of its claims, and of the runs that it read."""
 
 from __future__ import annotations
 
@@ -23,27 +21,26 @@ from advsearch.extend import (
     workbench,
 )
 
-CLAIM = "claim"  # the kind of settings that a suite noted for each of its claims
+# the kind of settings that a suite noted for each of its claims
+CLAIM = "claim"
 NOT_SETTINGS = ("schema", "command", "base", *settings.PLACE)
-ATTACKS = ("attack", "adversarial_of", "around")  # settings that name an attack's run
+# settings that name an attack's run
+ATTACKS = ("attack", "adversarial_of", "around")
 DEFAULT_TASK = "classification"
-LONGEST = 2000  # characters of a value that are written
+# characters after which a value is cut
+LONGEST = 2000
 
 
 @dataclass
 class RecordedSettings:
-    """Settings as a file or a note has them, and where they are from: empty for the
-    run's own.
-    """
+    """Settings of a file or a note, and their source: empty for the run's own."""
 
     source: str
     values: Mapping[str, Any]
 
     @property
     def is_of_scene(self) -> bool:
-        """Whether they describe pictures of a scene, and not only which runs are
-        read.
-        """
+        """Whether they describe pictures of a scene, not only which runs are read."""
         return bool(self.values.get("object"))
 
     @property
@@ -54,28 +51,30 @@ class RecordedSettings:
         )
 
     def as_text(self) -> dict[str, str]:
-        """Return every setting that was used, by its name with the source before it."""
-        before = f"{self.source}: " if self.source else ""
-        return {
-            f"{before}{name}": self.task if name == "task" else _short(value)
-            for name, value in self.values.items()
-            if name not in NOT_SETTINGS and self._is_used(name, value)
-        }
+        """Return every setting that was used as text, by its name after the source."""
+        prefix = f"{self.source}: " if self.source else ""
+        texts = dict[str, str]()
+        for name, value in self.values.items():
+            if name not in NOT_SETTINGS and self._is_used(name, value):
+                texts[f"{prefix}{name}"] = (
+                    self.task if name == "task" else _shorten(value)
+                )
+        return texts
 
     def _is_used(self, name: str, value: object) -> bool:
-        """Whether a setting says anything. What is default says nothing where the
-        command renders nothing, as it names no object, and where it would clash with
-        the other settings if it were given, as `fps` without a path.
+        """Return whether a setting has an effect.
+
+        A default has none if the command renders nothing, since it names no object, or if
+        it would clash with other settings, as `fps` without a path.
         """
         defaults = self._defaults
-        is_default = name not in defaults or value == defaults[name]
-        if is_default and (
-            name in self._idle or ("object" in defaults and not self.is_of_scene)
-        ):
+        if name in defaults and value != defaults[name]:
+            return True
+        renders_nothing = "object" in defaults and not self.is_of_scene
+        if name in self._clashing or renders_nothing:
             return False
-        return not is_default or not (
-            value is None or value is False or value in ("", {}, [], ())
-        )
+        is_empty = value is None or value is False or value in ("", {}, [], ())
+        return not is_empty
 
     @cached_property
     def _kind(self) -> type[Config] | None:
@@ -88,6 +87,7 @@ class RecordedSettings:
 
     @cached_property
     def _defaults(self) -> dict[str, Any]:
+        """The default of each setting of the command."""
         known = settings.settings(self._kind) if self._kind else ()
         return {
             setting.name: None if setting.required else setting.default
@@ -95,16 +95,16 @@ class RecordedSettings:
         }
 
     @cached_property
-    def _idle(self) -> set[str]:
-        """The settings that would say nothing if they were given."""
+    def _clashing(self) -> set[str]:
+        """The settings that could not be given, since they clash with others."""
         with suppress(errors.AdvsearchError):
             if self._kind is not None:
-                given = {
+                values = {
                     name: value
                     for name, value in self.values.items()
                     if name not in NOT_SETTINGS
                 }
-                config = self._kind(**given)
+                config = self._kind(**values)
                 return {
                     clash.setting.rstrip("_")
                     for clash in self._kind.clashes
@@ -114,67 +114,63 @@ class RecordedSettings:
 
 
 def task_text(named: Any, objective: object) -> str:
-    """Return a task in words, with all its options, such as thresholds, also those that
-    are default; an objective of its own says what counts as success.
+    """Return a task in words with all of its options, also default ones.
+
+    Args:
+        named: name of the task, or a mapping with its name and options.
+        objective: an objective that defines success, or None.
     """
     options = ", ".join(
-        f"{option} {wording.number_text(given)}"
-        for option, given in _task_options(named, objective).items()
+        f"{option} {wording.number_text(value)}"
+        for option, value in _task_options(named, objective).items()
     )
-    called = str(named.get("name") if isinstance(named, Mapping) else named)
-    return f"{called} ({options})" if options else _short(named)
+    if not options:
+        return _shorten(named)
+    name = str(named.get("name") if isinstance(named, Mapping) else named)
+    return f"{name} ({options})"
 
 
-def _short(value: object) -> str:
-    text = (
-        value
-        if isinstance(value, str)
-        else json.dumps(value, ensure_ascii=False, default=str)
-    )
-    return (
-        text
-        if len(text) <= LONGEST
-        else (f"{text[:LONGEST]}... ({len(text)} characters)")
-    )
+def _shorten(value: object) -> str:
+    """Return a value as text, cut if it is long."""
+    text = value
+    if not isinstance(text, str):
+        text = json.dumps(value, ensure_ascii=False, default=str)
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[:LONGEST]}... ({len(text)} characters)"
 
 
 def _task_options(named: Any, objective: object) -> dict[str, Any]:
+    """Return the options of a task by name, those of its parts after their names."""
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
     options = dict[str, Any]()
     with suppress(errors.AdvsearchError):
         task = workbench.make_task(named)
-        task = task.seeking(objective) if isinstance(objective, str) else task
-        parts = (
-            {f"{part.name}.": part for part in task.parts}
-            if isinstance(task, workbench.Together)
-            else {"": task}
-        )
-        for before, part in parts.items():
+        if isinstance(objective, str):
+            task = task.seeking(objective)
+        parts = {"": task}
+        if isinstance(task, workbench.Together):
+            parts = {f"{part.name}.": part for part in task.parts}
+        for prefix, part in parts.items():
             for option in fields(part):
                 value = getattr(part, option.name)
-                if option.metadata != workbench.FROM_RUN and value not in (
-                    None,
-                    "",
-                    (),
-                    False,
-                ):
-                    options[f"{before}{option.name}"] = value
+                is_empty = value in (None, "", (), False)
+                if option.metadata != workbench.FROM_RUN and not is_empty:
+                    options[f"{prefix}{option.name}"] = value
     return options
 
 
 def own_settings(folder: Path) -> Mapping[str, Any]:
-    """Return what the `run.yaml` of a run says; nothing where it cannot be read."""
+    """Return the settings in the `run.yaml` of a run, empty if it cannot be read."""
     with suppress(errors.AdvsearchError):
         return settings.read_yaml(folder / directory.CONFIG)
     return {}
 
 
 def sweeps_read(result: results.Result) -> list[Path]:
-    """Return the folders of the sweeps whose rows a result was made from, as far as
-    they are there.
-    """
-    return _found(
+    """Return the directories of the sweeps whose rows a result was made from, if they exist."""
+    return _find_runs(
         [
             *getattr(result, "sweeps", ()),
             *(side.run for side in getattr(result, "sides", ())),
@@ -183,13 +179,12 @@ def sweeps_read(result: results.Result) -> list[Path]:
 
 
 def attacks_read(values: Mapping[str, Any]) -> list[Path]:
-    """Return the folders of the attacks that settings name, whose adversarial scenes
-    were rendered again.
-    """
-    return _found([values.get(name) for name in ATTACKS])
+    """Return the directories of the attacks that settings name, if they exist."""
+    return _find_runs([values.get(name) for name in ATTACKS])
 
 
-def _found(names: Iterable[object]) -> list[Path]:
+def _find_runs(names: Iterable[object]) -> list[Path]:
+    """Return the directories of runs that exist, each name once."""
     folders = list[Path]()
     for name in dict.fromkeys(name for name in names if isinstance(name, str) and name):
         with suppress(errors.AdvsearchError, OSError, ValueError):
@@ -200,8 +195,9 @@ def _found(names: Iterable[object]) -> list[Path]:
 def recorded_settings(
     folder: Path, result: results.Result, read: Sequence[Path]
 ) -> list[RecordedSettings]:
-    """Return the settings of a run: its own, of a suite those of each claim and
-    counterexample that was tried, and those of the runs that it read.
+    """Return the settings of a run, of its claims, and of the runs that it read.
+
+    Claims are those of a suite that were tested, with its counterexamples.
     """
     recorded = [RecordedSettings("", own_settings(folder))]
     for kind, settings_by_name in (noted_settings(folder, result) or {}).items():
@@ -218,8 +214,9 @@ def recorded_settings(
 def noted_settings(
     folder: Path, result: results.Result
 ) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
-    """Return what a run noted of settings beside its own, by kind and name; None for an
-    experiment that notes none.
+    """Return settings that a run noted besides its own, by kind and name.
+
+    None if its experiment notes none.
     """
     hook = workbench.get_experiment(result.command).noted_settings
     if hook is None:
@@ -231,27 +228,29 @@ def noted_settings(
 
 
 def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "") -> str:
-    """Return what settings of scenes say under a name, each different text once;
-    `otherwise` where one says nothing.
+    """Return the values of a setting of scenes as text, each different one once.
+
+    `otherwise` stands for settings without a value.
     """
     texts = [
-        _short(one.values.get(name) or otherwise) for one in recorded if one.is_of_scene
+        _shorten(each.values.get(name) or otherwise)
+        for each in recorded
+        if each.is_of_scene
     ]
     return "; ".join(dict.fromkeys(filter(None, texts)))
 
 
 def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
-    """Return versions and digests of files, of a run, of the runs that it consists of
-    and of those that it read; of several that differ, all.
+    """Return versions and digests of files that a run was made with, by name.
+
+    They include those of its parts and of the runs that it read; different ones are
+    all listed.
     """
-    found = dict[str, dict[str, None]]()
-    parts = [
-        part
-        for part in sorted((folder / directory.PARTS).glob("*"))
-        if directory.is_run(part)
-    ]
+    texts_of_name = dict[str, dict[str, None]]()
+    candidates = sorted((folder / directory.PARTS).glob("*"))
+    parts = [part for part in candidates if directory.is_run(part)]
     for run in [folder, *parts, *read]:
         with suppress(errors.AdvsearchError):
             for name, text in RunDirectory.read_made_with(run).items():
-                found.setdefault(name, {})[str(text)] = None
-    return {name: ", then ".join(texts) for name, texts in found.items()}
+                texts_of_name.setdefault(name, {})[str(text)] = None
+    return {name: ", then ".join(texts) for name, texts in texts_of_name.items()}

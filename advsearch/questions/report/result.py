@@ -1,6 +1,4 @@
-"""What `report --evidence` writes: claims of runs with what a reader needs to judge
-them, as a page and Markdown.
-"""
+"""What `report --evidence` writes: claims of runs with their context, as a page and text."""
 
 from __future__ import annotations
 
@@ -100,6 +98,7 @@ class Evidence(results.Result):
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
+    """Yield title, heads and rows of the tables of a run."""
     for title, first, verb, conditions in (
         ("Right", "condition", "right", run.conditions),
         ("Photographs that agree", "photographs of", "agree", run.photographs),
@@ -118,48 +117,38 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
 
 
 def markdown(evidence: Evidence) -> str:
-    def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-        return [
-            *(
-                f"| {' | '.join(map(_plain, row))} |"
-                for row in (heads, ["---"] * len(heads), *rows)
-            ),
-            "",
-        ]
-
-    lines = [
-        "# Evidence",
-        "",
-        *(f"> {text}" for text in evidence.warnings),
-        *[""] * bool(evidence.warnings),
-    ]
+    """Return evidence as Markdown."""
+    lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings)]
+    if evidence.warnings:
+        lines.append("")
     for run in evidence.runs:
-        lines += [f"## {_plain(run.run)}", ""]
-        lines += [
-            *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims),
-            "",
-        ]
-        for _, heads, rows in tables_of(run):
-            lines += table(heads, rows)
-        lines += [f"![{name}]({name})" for name in run.pictures] + [""] * bool(
-            run.pictures
-        )
-        for title, facts in sections(run).items():
-            lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
-        if run.command_line:
-            lines += [
-                "To repeat it:",
-                "",
-                "```sh",
-                run.command_line.replace("```", "` ` `"),
-                "```",
-                "",
-            ]
+        lines += _run_markdown(run)
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
     return "\n".join([*lines, _signed(evidence)]) + "\n"
 
 
+def _run_markdown(run: EvidenceRun) -> list[str]:
+    """Return the lines of a run: claims, tables, pictures, and sections."""
+    lines = [f"## {_plain(run.run)}", ""]
+    lines += [f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims]
+    lines.append("")
+    for _, heads, rows in tables_of(run):
+        for cells in (heads, ["---"] * len(heads), *rows):
+            lines.append(f"| {' | '.join(map(_plain, cells))} |")
+        lines.append("")
+    if run.pictures:
+        lines += [f"![{name}]({name})" for name in run.pictures]
+        lines.append("")
+    for title, facts in sections(run).items():
+        lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
+    if run.command_line:
+        command = run.command_line.replace("```", "` ` `")
+        lines += ["To repeat it:", "", "```sh", command, "```", ""]
+    return lines
+
+
 def _signed(evidence: Evidence) -> str:
+    """State who wrote the evidence, when, and with which version."""
     by = f" by {_plain(evidence.by)}" if evidence.by else ""
     return (
         f"Written{by}, {evidence.written or 'at a time that is not noted'}, with "
@@ -168,27 +157,33 @@ def _signed(evidence: Evidence) -> str:
 
 
 def sections(run: EvidenceRun) -> dict[str, list[str]]:
-    def named(facts: Mapping[str, str]) -> list[str]:
+    """Return the lines of the sections of a run by title, without empty ones."""
+
+    def list_facts(facts: Mapping[str, str]) -> list[str]:
         return [f"{name}: {text}" for name, text in facts.items()]
 
-    headed = {
+    versions = list_facts(run.made_with)
+    if run.begun:
+        versions.insert(0, f"begun: {run.begun}")
+    lines_of_title = {
         "Criterion": run.criterion,
         "Triggering conditions": run.triggering,
         "Exposure": run.exposure,
-        "Operational design domain": named(run.domain),
+        "Operational design domain": list_facts(run.domain),
         "Not shown": run.not_shown,
-        "On what": named(run.about),
+        "On what": list_facts(run.about),
         "What varied": run.searched,
-        "Measured how": named({"ended as": run.ending, **run.measured}),
-        "Settings": named(run.settings),
+        "Measured how": list_facts({"ended as": run.ending, **run.measured}),
+        "Settings": list_facts(run.settings),
         "Excluded, and to be known": run.excluded,
-        "Budget": named(run.cost),
-        "Made with": [f"begun: {run.begun}"] * bool(run.begun) + named(run.made_with),
+        "Budget": list_facts(run.cost),
+        "Made with": versions,
     }
-    return {title: lines for title, lines in headed.items() if lines}
+    return {title: lines for title, lines in lines_of_title.items() if lines}
 
 
 def _plain(text: str) -> str:
+    """Escape Markdown, and join lines."""
     return re.sub(r"([\\<>*_\[\]`|])", r"\\\1", " ".join(text.split()))
 
 
@@ -198,20 +193,23 @@ CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 def evidence_page(
     evidence: Evidence, pictures: Mapping[str, bytes] | None = None
 ) -> str:
+    """Return evidence as a page, with pictures (PNG) by name."""
     claims = [claim for run in evidence.runs for claim in run.claims]
-    carried = sum(claim.kind != "nothing claimed" for claim in claims)
-    said = (
-        f"What {wording.count(len(evidence.runs), 'run')} "
-        f"show{'s' * (len(evidence.runs) == 1)}, and no more than that."
-    )
+    n_carried = sum(claim.kind != "nothing claimed" for claim in claims)
+    n_runs = len(evidence.runs)
+    show = "shows" if n_runs == 1 else "show"
+    summary = f"What {wording.count(n_runs, 'run')} {show}, and no more than that."
+    rules = [markup.element("li", text.replace("`", "")) for text in evidence.rules]
     main = markup.element(
-        "main", *(_run_html(run, pictures or {}) for run in evidence.runs), markup.element("h2", "How to read this"),
-        markup.element("ul", *(markup.element("li", text.replace("`", "")) for text in evidence.rules)),
+        "main",
+        *(_run_html(run, pictures or {}) for run in evidence.runs),
+        markup.element("h2", "How to read this"),
+        markup.element("ul", *rules),
         markup.element("p", _signed(evidence), class_="soft"),
-    )  # fmt: skip
+    )
     header = markup.heading(
-        f"evidence; {carried} of {len(claims)} statements carry a claim",
-        said,
+        f"evidence; {n_carried} of {len(claims)} statements carry a claim",
+        summary,
         evidence.warnings,
     )
     return markup.document(
@@ -220,6 +218,7 @@ def evidence_page(
 
 
 def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
+    """Return a run: claims, pictures, tables and sections."""
     rows = []
     for claim in run.claims:
         extent = claim.extent

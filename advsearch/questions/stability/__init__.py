@@ -19,9 +19,7 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
     view=shown,
 )
 def stability(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Try stiff and extreme scenes, and say whether each of them holds
-    (docs/stability.md).
-    """
+    """Run stiff and extreme scenes, and report whether each holds (docs/stability.md)."""
     from advsearch.questions.stability.scenes import run_cases  # imports torch
 
     return run_cases(context)

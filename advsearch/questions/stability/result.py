@@ -1,6 +1,4 @@
-"""What `stability` needs to know, its result, and what a case is; the cases are in the
-files beside this one.
-"""
+"""Settings and result of `stability`, and the registry of cases."""
 
 from __future__ import annotations
 
@@ -29,9 +27,7 @@ from advsearch.extend import (
 
 
 class StabilityConfig(Config):
-    """Everything that decides what `stability` does: which cases it tries, for how
-    long, and where that is kept.
-    """
+    """Settings of `stability`: which cases it runs, for how long, and where results go."""
 
     command: ClassVar[str] = "stability"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
@@ -56,11 +52,15 @@ class StabilityConfig(Config):
         repeats=True,
     )
     seconds: float | None = setting(
-        None, "check",
+        None,
+        "check",
         "time after which no measurement is begun any more; `advsearch resume` goes on "
         "for as long again",
-        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
-    )  # fmt: skip
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
@@ -69,10 +69,12 @@ class StabilityConfig(Config):
 
     @property
     def cases(self) -> tuple[str, ...]:
+        """The names in `case`; empty for all."""
         return () if self.case is None else settings.split_names(self.case)
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """The names in `group`; empty for all."""
         return () if self.group is None else settings.split_names(self.group)
 
 
@@ -81,9 +83,7 @@ FELL_SHORT = "fell short"
 
 
 class Check(results.Fields):
-    """One number that decides, and the range that it has to be in, both ends included;
-    null where there is no end.
-    """
+    """A number that decides, and its allowed range, with inclusive bounds or null."""
 
     what: str
     value: results.JsonFloat
@@ -92,39 +92,38 @@ class Check(results.Fields):
     ok: bool
 
     def __str__(self) -> str:
-        ends = [
-            f"{sign} {end:.4g}"
-            for sign, end in (("at least", self.least), ("at most", self.most))
-            if end is not None
-        ]
-        wanted = (
-            f"exactly {self.most:.4g}"
-            if len(ends) == 2 and self.least == self.most
-            else " and ".join(ends)
-        )
-        return f"{self.what}: {self.value:.4g}" + (
-            f" (expected {wanted})" if wanted else ""
-        )
+        """Describe the number and what was expected: ``mean: 0.2 (expected at least 1)``."""
+        bounds = []
+        if self.least is not None:
+            bounds.append(f"at least {self.least:.4g}")
+        if self.most is not None:
+            bounds.append(f"at most {self.most:.4g}")
+        expected = " and ".join(bounds)
+        if len(bounds) == 2 and self.least == self.most:
+            expected = f"exactly {self.most:.4g}"
+        text = f"{self.what}: {self.value:.4g}"
+        return f"{text} (expected {expected})" if expected else text
 
 
 def check(
     what: str, value: float, least: float | None = None, most: float | None = None
 ) -> Check:
-    """Return the check of a number; NaN is in no range."""
-    ok = (
-        value == value
-        and (least is None or least <= value)
-        and (most is None or value <= most)
-    )
+    """Check that a number is in a range; NaN is in no range."""
+    ok = not math.isnan(value)
+    if least is not None:
+        ok = ok and least <= value
+    if most is not None:
+        ok = ok and value <= most
     return Check(what=what, value=value, least=least, most=most, ok=ok)
 
 
 def holds(what: str, truth: bool) -> Check:
+    """Check a condition, as a number that has to be 1."""
     return check(what, float(truth), 1.0, 1.0)
 
 
 class CaseRow(results.Fields):
-    """One case of the suite and what it showed."""
+    """The result of a case."""
 
     case: str = Field(description="its name")
     group: str = Field(description="its group")
@@ -148,7 +147,7 @@ class CaseRow(results.Fields):
 
 
 class StabilityResult(views.InNotebook, results.Result):
-    """Extreme cases, and whether each of them holds."""
+    """The results of extreme cases: whether each holds."""
 
     command: ClassVar[str] = "stability"
 
@@ -180,26 +179,24 @@ COLUMNS: Mapping[str, views.Column] = {
 
 
 def shown(result: StabilityResult) -> ShownResult:
-    short = [row for row in result.rows if row.status != OK]
-    numbers = [
-        [f"{row.case}: {name}", f"{value:.3g}"]
-        for row in result.rows
-        for name, value in row.measured.items()
-        if name.startswith("condition number")
+    """Lay out a result: cases, condition numbers, and those that fell short."""
+    failed = [row for row in result.rows if row.status != OK]
+    condition_numbers = []
+    for row in result.rows:
+        for name, value in row.measured.items():
+            if name.startswith("condition number"):
+                condition_numbers.append([f"{row.case}: {name}", f"{value:.3g}"])
+    n_rows = len(result.rows)
+    seconds = math.fsum(row.seconds for row in result.rows)
+    failures = [
+        f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in failed
     ]
     return ShownResult(
-        f"{len(result.rows) - len(short)} of {len(result.rows)} cases hold, in "
-        f"{math.fsum(row.seconds for row in result.rows):.0f} seconds.",
+        f"{n_rows - len(failed)} of {n_rows} cases hold, in {seconds:.0f} seconds.",
         [
             ResultPart.table(result.rows, COLUMNS, title="Cases"),
-            ResultPart("Condition numbers", rows=numbers),
-            ResultPart(
-                "Short",
-                [
-                    f"{row.case} fell short: {row.decides}; expected: {row.holds}"
-                    for row in short
-                ],
-            ),
+            ResultPart("Condition numbers", rows=condition_numbers),
+            ResultPart("Short", failures),
             ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
@@ -207,10 +204,14 @@ def shown(result: StabilityResult) -> ShownResult:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case found: the numbers that decide, and whether every picture and
-    gradient was finite, and none had to be made so; the error of a gradient (or of what
-    the case is about), None where there is none; how the case's search ended, "refused"
-    where the input was, or empty; and further numbers that are worth printing.
+    """What a case measured.
+
+    Attributes:
+        checks: the numbers that decide.
+        finite: whether every picture and gradient was finite, and none had to be made so.
+        relative_error: error of a gradient, or of what the case is about; None without one.
+        ending: status of the case's search, "refused" if its input was rejected, or empty.
+        measured: further numbers to report.
     """
 
     checks: Sequence[Check]
@@ -220,14 +221,22 @@ class Outcome:
     measured: Mapping[str, float] = field(default_factory=dict)
 
     def also(self, *more: Check, **known: Any) -> Outcome:
+        """Return the outcome with more checks, and changed fields."""
         return replace(self, checks=[*self.checks, *more], **known)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One extreme: its unique name, the group that it belongs to, and what must hold,
-    in a sentence. A `slow` one takes more than about a second on two quiet cores, so
-    that the tests run it seldom.
+    """An extreme scene or setting, and what must hold.
+
+    A `slow` one takes more than about a second on two idle cores; tests run it rarely.
+
+    Attributes:
+        name: unique name.
+        group: group of cases.
+        holds: what must hold, in a sentence.
+        slow: whether it takes long.
+        find: runs the case.
     """
 
     name: str
@@ -237,50 +246,50 @@ class Case:
     find: Callable[[], Outcome]
 
     def run(self) -> CaseRow:
-        """Run it. An exception is a finding like any other: the case falls short, and
-        the exception says why.
-        """
-        begun = time.perf_counter()
+        """Run the case. An exception means that it falls short, and is the reason."""
+        start = time.perf_counter()
         try:
             outcome = self.find()
         except InputError as error:
-            outcome = Outcome(
-                [check(f"refused: {error}", 1.0, 0.0, 0.0)], ending="refused"
-            )
+            failure = check(f"refused: {error}", 1.0, 0.0, 0.0)
+            outcome = Outcome([failure], ending="refused")
         except Exception as error:
-            what = f"raised {type(error).__name__}: {error}"
-            outcome = Outcome(
-                [check(what, 1.0, 0.0, 0.0)], finite=False, ending="raised"
-            )
-        failed = [number for number in outcome.checks if not number.ok]
-        decides = "".join(map(str, failed[:1] or outcome.checks[-1:]))
-        more = {
+            failure = check(f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0)
+            outcome = Outcome([failure], finite=False, ending="raised")
+        failed = [each for each in outcome.checks if not each.ok]
+        if failed:
+            decides = str(failed[0])
+        elif not outcome.finite:
+            decides = "NaN or infinite values"
+        else:
+            decides = "".join(map(str, outcome.checks[-1:]))
+        fields = {
             "case": self.name,
             "status": OK if outcome.finite and not failed else FELL_SHORT,
-            "decides": decides
-            if failed or outcome.finite
-            else "NaN or infinite values",
-            "seconds": time.perf_counter() - begun,
+            "decides": decides,
+            "seconds": time.perf_counter() - start,
         }
-        return CaseRow.of({**vars(self), **vars(outcome), **more})
+        return CaseRow.of({**vars(self), **vars(outcome), **fields})
 
 
-CASES: list[Case] = []  # every case, in the order in which they run
+# every case, in the order in which they run
+CASES: list[Case] = []
 
 
 def case(
     group: str, name: str, *, slow: bool = False
 ) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
-    """Make a function a case; the first sentence of its docstring says what must
-    hold.
+    """Register a function as a case.
+
+    The first sentence of its docstring, which users see, states what must hold.
     """
 
-    def added(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
+    def register(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
         sentence = " ".join((find.__doc__ or "").partition("\n\n")[0].split())
         CASES.append(Case(name, group, sentence, slow, find))
         return find
 
-    return added
+    return register
 
 
 def cases(
@@ -288,8 +297,15 @@ def cases(
     find: Callable[..., Outcome],
     table: Iterable[tuple[str, str, dict[str, Any]]],
 ) -> None:
-    for name, holds, data in table:
+    """Register a case for each row of a table.
+
+    Args:
+        group: group of the cases.
+        find: function that runs a case.
+        table: name, what must hold, and arguments of the function; `slow` is no
+            argument but whether the case is slow.
+    """
+    for name, sentence, data in table:
         arguments = {key: value for key, value in data.items() if key != "slow"}
-        CASES.append(
-            Case(name, group, holds, bool(data.get("slow")), partial(find, **arguments))
-        )
+        is_slow = bool(data.get("slow"))
+        CASES.append(Case(name, group, sentence, is_slow, partial(find, **arguments)))

@@ -1,6 +1,4 @@
-"""Small scenes for cases of the stability suite: a picture, its gradient beside
-differences, and a short search.
-"""
+"""Small scenes for cases: a picture, its gradient compared with differences, a search."""
 
 from __future__ import annotations
 
@@ -25,32 +23,40 @@ from advsearch.extend import (
     results,
     workbench,
 )
-from advsearch.questions.stability.result import Outcome, check, holds
+from advsearch.questions.stability.result import Check, Outcome, check, holds
 
-SIZE = 24  # side of the images in pixels
-SPP = 8  # samples a pixel of a picture and of a working gradient
-REFERENCE_SPP = 64  # samples a pixel of a reference render
+# width and height of images, pixels
+SIZE = 24
+# samples per pixel of a picture and of the gradients of a search
+SPP = 8
+# samples per pixel of a reference
+REFERENCE_SPP = 64
 # relative error that the mean of a gradient may have beyond what its noise explains
 ERROR = 0.1
-# the noise of a comparison, as a share of the derivative, from which it decides nothing
+# noise of a comparison, as a fraction of the derivative, above which it decides nothing
 DOUBT = 0.4
-SHARPNESS = 20.0  # logits per unit of the linear loss that the searched model returns
-# mean difference of two pictures that should be one: an 8-bit level is 4e-3
+# logits of the searched model per unit of the linear loss
+SHARPNESS = 20.0
+# mean difference of two pictures that should be equal: an 8-bit level is 4e-3
 SAME_PICTURE = 2e-3
 ControlSettings = Mapping[str, Mapping[str, object]]
 Thing = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
-"""What a scene shows; a function makes it when the case runs."""
+"""The object of a scene; a function is called when the case runs."""
 
 
 def make_renderer(
-    controls: ControlSettings, thing: Thing = "mug", *,
-    environment: str | Path | assets.EnvironmentAsset | None = None, settings: Mapping[str, float] | None = None,
-    plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}), denoise: str = "none",
-) -> gradients.Renderer:  # fmt: skip
-    """Return `render(u, seed, spp)` of a small image: as `Scene.renderer`, with further
-    shapes in Mitsuba's words.
+    controls: ControlSettings,
+    thing: Thing = "mug",
+    *,
+    environment: str | Path | assets.EnvironmentAsset | None = None,
+    settings: Mapping[str, float] | None = None,
+    plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}),
+    denoise: str = "none",
+) -> gradients.Renderer:
+    """Return `render(u, seed, spp)` of a small image, as `Scene.renderer` does.
 
-    Its differences are taken over a pixel: the losses of these cases are smooth.
+    `plugins` are further shapes as Mitsuba's dictionaries. Differences are taken per
+    pixel, since the losses of the cases are smooth.
     """
     shape = thing() if callable(thing) else thing
     scene = workbench.load_scene(
@@ -71,21 +77,17 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky brighter on one side and above, (16, 32, 3), so that turning it
-    changes something.
-    """
+    """Return a sky (16, 32, 3) brighter on one side and above, so that rotation shows."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
-    light = 0.4 * (
-        1.0
-        + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
-        + 0.8 * np.cos(rows * (np.pi / 16.0))
-    )
-    return assets.EnvironmentAsset(
-        "plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32)
-    )
+    azimuthal = 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
+    vertical = 0.8 * np.cos(rows * (np.pi / 16.0))
+    light = 0.4 * (1.0 + azimuthal + vertical)
+    radiance = np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32)
+    return assets.EnvironmentAsset("plain", radiance)
 
 
 def make_grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
+    """Return a gray environment map, with one texel of another value."""
     radiance: assets.Floats = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
@@ -110,7 +112,7 @@ def make_mesh(
 
 
 def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
-    """Return an object with a checked texture around a display-referred grey."""
+    """Return an object with a checkered texture around a display-referred gray."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
     base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
     texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
@@ -127,9 +129,7 @@ def make_checkered_mug() -> assets.ObjectAsset:
 
 
 def make_dark_mug() -> assets.ObjectAsset:
-    """Return the mug in black: what moves in the picture is its outline and nothing
-    else, so little noise.
-    """
+    """Return the mug in black: only its outline changes in the picture, with little noise."""
     return paint_mug(np.full((4, 4), 0.02))
 
 
@@ -137,21 +137,42 @@ Bounds = tuple[float | None, float | None]
 
 
 def check_scene(
-    controls: ControlSettings, thing: Thing = "mug", *, u: Sequence[float] | Mapping[int, float] | None = None,
-    spp: int = SPP, compare: bool = True, seeds: tuple[int, int] = (3, 12), repeats: int = 24, evaluations: int = 3,
-    mean: Bounds | None = None, gradient: Bounds | None = None, ending: str = "",
-    beside: Mapping[str, object] | None = None, apart: Bounds = (None, SAME_PICTURE), **scene: object,
-) -> Outcome:  # fmt: skip
-    """Render a scene, differentiate it, compare the gradient with differences, which
-    costs most of the time, and search from there.
+    controls: ControlSettings,
+    thing: Thing = "mug",
+    *,
+    u: Sequence[float] | Mapping[int, float] | None = None,
+    spp: int = SPP,
+    compare: bool = True,
+    seeds: tuple[int, int] = (3, 12),
+    repeats: int = 24,
+    evaluations: int = 3,
+    mean: Bounds | None = None,
+    gradient: Bounds | None = None,
+    ending: str = "",
+    beside: Mapping[str, object] | None = None,
+    apart: Bounds = (None, SAME_PICTURE),
+    **scene: object,
+) -> Outcome:
+    """Render a scene, differentiate it, and search from there.
+
+    The gradient is compared with differences, which takes most of the time.
 
     Args:
-        u: the configuration, or numbers of it in place of those of the start.
-        mean, gradient, ending: what the image's mean, the largest entry of the gradient
-            and the search's ending have to be.
-        beside: the arguments of `make_renderer` for another scene, and `apart` the mean
-            difference that its image may have.
-        scene: further arguments of `make_renderer`.
+        controls: settings of the controls.
+        thing: the object.
+        u: the configuration (d,), or some of its values by index; the others are those
+            of the start.
+        spp: samples per pixel.
+        compare: whether to compare the gradient with differences.
+        seeds: minimum and maximum number of seeds of the differences.
+        repeats: gradients that are compared.
+        evaluations: of the search.
+        mean: bounds of the image's mean.
+        gradient: bounds of the largest absolute entry of the gradient.
+        ending: expected status of the search.
+        beside: arguments of `make_renderer` for another scene.
+        apart: bounds of the mean difference from its image.
+        **scene: further arguments of `make_renderer`.
     """
     renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
     start = renderer.start.clone()
@@ -160,44 +181,20 @@ def check_scene(
     loss = gradients.smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, 0, spp)
     _, slope = renderer.gradient(loss, start, 0, spp)
-    rows = (
-        compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
-        if compare
-        else []
-    )
-    result = search_scene(renderer, loss, start, spp, evaluations)
-    checks = [
-        holds(
-            "the picture is in [0, 1]",
-            float(image.min()) >= 0.0 and float(image.max()) <= 1.0,
-        ),
-        check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
-        check(
-            "objectives that were NaN or infinite",
-            float(result.non_finite_objectives),
-            0.0,
-            0.0,
-        ),
-    ]
     relative_error = None
-    if rows:
-        worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
-        unsure = max(rows, key=lambda row: row.doubt or 0.0)
-        checks.append(
-            check(
-                f"noise of the comparison, {unsure.name}",
-                unsure.doubt or 0.0,
-                most=DOUBT,
-            )
-        )
-        checks.append(
-            check(
-                f"gradient error beyond the noise, {worst.name}",
-                worst.excess,
-                most=ERROR,
-            )
-        )
-        relative_error = worst.bias
+    gradient_checks = list[Check]()
+    if compare:
+        rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
+        gradient_checks, relative_error = _check_gradient(rows)
+    result = search_scene(renderer, loss, start, spp, evaluations)
+    in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
+    n_objectives = float(result.non_finite_objectives)
+    checks = [
+        holds("the picture is in [0, 1]", in_range),
+        check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
+        check("objectives that were NaN or infinite", n_objectives, 0.0, 0.0),
+        *gradient_checks,
+    ]
     measured = {
         "mean": float(image.mean()),
         "largest gradient": float(slope.abs().max()),
@@ -218,12 +215,26 @@ def check_scene(
         checks.append(
             check("mean difference from the picture beside it", difference, *apart)
         )
-    is_finite = (
-        bool(torch.isfinite(image).all())
-        and bool(torch.isfinite(slope).all())
-        and renderer.non_finite == 0
-    )
+    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
+    is_finite = is_finite and renderer.non_finite == 0
     return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
+
+
+def _check_gradient(
+    rows: Sequence[results.Measured],
+) -> tuple[list[Check], float | None]:
+    """Check the largest noise and the largest error; return the latter's bias too."""
+    if not rows:
+        return [], None
+    worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
+    noisiest = max(rows, key=lambda row: row.doubt or 0.0)
+    noise_name = f"noise of the comparison, {noisiest.name}"
+    error_name = f"gradient error beyond the noise, {worst.name}"
+    checks = [
+        check(noise_name, noisiest.doubt or 0.0, most=DOUBT),
+        check(error_name, worst.excess, most=ERROR),
+    ]
+    return checks, worst.bias
 
 
 def search_scene(
@@ -233,8 +244,10 @@ def search_scene(
     spp: int,
     evaluations: int,
 ) -> workbench.SearchResult:
-    """Search from a configuration with the margin of a linear model of two classes: its
-    logits are 0, and so many times the rise of the loss over the start, less 1.
+    """Search from a configuration with the margin of a linear model of two classes.
+
+    Its logits are 0, and `SHARPNESS` times the increase of the loss over the start,
+    minus 1.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
@@ -267,9 +280,7 @@ def compare_gradient(
     seeds: tuple[int, int] = (3, 12),
     repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's own gradient with common-random-number differences, of a
-    linear loss of the raw image.
-    """
+    """Compare the plan's gradient of a linear loss with common-random-number differences."""
     formation = renderer.formation
     bench = gradients.Bench(
         renderer, gradients.smooth_loss(formation.resolution), u, seed=1, spp=spp
@@ -295,10 +306,11 @@ def measure_inward_slope(
     seeds: int,
     spp: int,
 ) -> tuple[float, float]:
-    """Return the derivative of the smooth linear loss of the raw image as numbers go
-    inwards from the start that raise it so, where `factor` is 1: by a gradient (d,),
-    and by one-sided differences of second order, since there is no other side at a
-    bound.
+    """Return the derivative of the smooth linear loss along a direction inwards.
+
+    The direction moves values from the start into the range that increase the loss, if
+    `factor` is 1. The derivative is computed by a gradient (d,), and by one-sided
+    differences of second order, since a bound has no other side.
     """
     linear = renderer.like(transfer="linear")
     u = renderer.start
@@ -307,18 +319,18 @@ def measure_inward_slope(
     direction = torch.where(u > 0.5, -1.0, 1.0) * (gradient * (0.5 - u) > 0.0) * factor
     slopes = []
     for seed in range(seeds):
-        here, near, far = (
+        at_0, at_1, at_2 = (
             float(loss(render_image(linear, u + count * step * direction, seed, spp)))
             for count in range(3)
         )
-        slopes.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
+        slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
 
 
 def evaluate(
     renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query
 ) -> policies.Evaluation:
-    """Evaluate a configuration by a loss of the image; over 0 is a success."""
+    """Evaluate a configuration by a loss of the image; above 0 is a success."""
     spp *= query.samples
     non_finite_before = renderer.non_finite
     renders_before = renderer.renders
@@ -341,10 +353,16 @@ def evaluate(
 
 
 def run_search(
-    renderer: gradients.Renderer, loss: gradients.Loss, steps: int, *, spp: int = SPP, start: Tensor | None = None,
-    policy: Policy[Any] | None = None, **options: Any,
-) -> workbench.SearchResult:  # fmt: skip
-    """Search for an image of a loss over 0; `options` as of `attacks.search`."""
+    renderer: gradients.Renderer,
+    loss: gradients.Loss,
+    steps: int,
+    *,
+    spp: int = SPP,
+    start: Tensor | None = None,
+    policy: Policy[Any] | None = None,
+    **options: Any,
+) -> workbench.SearchResult:
+    """Search for an image with a loss above 0; `options` are those of `attacks.search`."""
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")
     options = {"candidates": 0, **options}
@@ -361,7 +379,7 @@ def run_search(
 def make_domain(
     renderer: gradients.Renderer, start: Tensor | None = None
 ) -> policies.Domain:
-    """Return where a search may look, from a configuration or the renderer's start."""
+    """Return the domain of a search from a configuration, by default the renderer's start."""
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start
     return workbench.domain_of(

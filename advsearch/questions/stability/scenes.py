@@ -1,4 +1,4 @@
-"""Cases of scenes: light, surfaces, meshes, places and views that break naive code."""
+"""Cases of scenes: light, surfaces, meshes, positions and views that break naive code."""
 
 from __future__ import annotations
 
@@ -81,31 +81,61 @@ LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z"
 BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
 TURNED = {"environment": {"rotation": [0.0, 360.0]}}
 
-cases("radiometric", check_scene, [
-    ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and "
-                          "gradients are right.",
-     {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True}),
-    ("hdri-texel-100000-denoised", "It is finite after the denoiser too, and the "
-                                   "rotation has a gradient.",
-     {"controls": TURNED, "environment": FLASH, "denoise": "oidn", "u": [0.31], "compare": False,
-      "gradient": (1e-12, None), "slow": True}),
-    ("black-environment", "The picture is black, the gradient zero, and the search "
-                          "ends as stalled.",
-     {"controls": TEXTURE, "environment": DARKNESS, "compare": False, "evaluations": PLATEAU_STEPS,
-      "mean": (0.0, 0.0), "gradient": (0.0, 0.0), "ending": "stalled"}),
-    ("lamp-in-the-dark", "A lamp lights a scene that has no other light.",
-     {"controls": LAMP, "environment": DARKNESS, "u": [0.5], "mean": (0.01, None)}),
-    ("camera-exposure-up", RIGHT, exposure_case("camera", 9.0, 10.0)),
-    ("camera-exposure-down", RIGHT, exposure_case("camera", -10.0, -9.0)),
-    ("environment-exposure-up", RIGHT, exposure_case("environment", 9.0, 10.0)),
-    ("environment-exposure-down", RIGHT, exposure_case("environment", -10.0, -9.0)),
-])  # fmt: skip
+cases(
+    "radiometric",
+    check_scene,
+    [
+        (
+            "hdri-texel-100000",
+            "One texel of 100,000 leaves everything finite, and gradients are right.",
+            {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True},
+        ),
+        (
+            "hdri-texel-100000-denoised",
+            "It is finite after the denoiser too, and the rotation has a gradient.",
+            {
+                "controls": TURNED,
+                "environment": FLASH,
+                "denoise": "oidn",
+                "u": [0.31],
+                "compare": False,
+                "gradient": (1e-12, None),
+                "slow": True,
+            },
+        ),
+        (
+            "black-environment",
+            "The picture is black, the gradient zero, and the search ends as stalled.",
+            {
+                "controls": TEXTURE,
+                "environment": DARKNESS,
+                "compare": False,
+                "evaluations": PLATEAU_STEPS,
+                "mean": (0.0, 0.0),
+                "gradient": (0.0, 0.0),
+                "ending": "stalled",
+            },
+        ),
+        (
+            "lamp-in-the-dark",
+            "A lamp lights a scene that has no other light.",
+            {
+                "controls": LAMP,
+                "environment": DARKNESS,
+                "u": [0.5],
+                "mean": (0.01, None),
+            },
+        ),
+        ("camera-exposure-up", RIGHT, exposure_case("camera", 9.0, 10.0)),
+        ("camera-exposure-down", RIGHT, exposure_case("camera", -10.0, -9.0)),
+        ("environment-exposure-up", RIGHT, exposure_case("environment", 9.0, 10.0)),
+        ("environment-exposure-down", RIGHT, exposure_case("environment", -10.0, -9.0)),
+    ],
+)
 
 
 def refuse_texel(value: float, as_file: bool) -> Outcome:
-    """A texel that is no light, in a file or in an array, has to be refused in a
-    sentence.
-    """
+    """Require that a texel that is no light, in a file or an array, is rejected."""
     radiance = make_grey_map(0.3).radiance.copy()
     radiance[4, 10] = value
     try:
@@ -121,9 +151,9 @@ def refuse_texel(value: float, as_file: bool) -> Outcome:
             )
             render_image(renderer, renderer.start, 0, 1)
     except InputError as error:
-        counted = "texels" in str(error) and "\n" not in str(error)
+        is_clear = "texels" in str(error) and "\n" not in str(error)
         return Outcome(
-            [holds("refused in a sentence that counts the texels", counted)],
+            [holds("refused in a sentence that counts the texels", is_clear)],
             ending="refused",
         )
     return Outcome([holds("refused", False)], ending="rendered all the same")
@@ -131,30 +161,32 @@ def refuse_texel(value: float, as_file: bool) -> Outcome:
 
 REFUSED = "The map is refused before anything is rendered."
 for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan)):
-    for place in ("file", "array"):
-        given = {"value": value, "as_file": place == "file"}
-        cases("radiometric", refuse_texel, [(f"{word}-texel-{place}", REFUSED, given)])
+    for source in ("file", "array"):
+        arguments = {"value": value, "as_file": source == "file"}
+        table = [(f"{word}-texel-{source}", REFUSED, arguments)]
+        cases("radiometric", refuse_texel, table)
 
 
 def leave_plateau(low: float, high: float) -> Outcome:
-    """Start where the picture is white and nothing has a gradient; the way out is an
-    exposure further down.
+    """Search from a white picture without any gradient.
+
+    The way out is a lower exposure.
 
     Args:
-        low, high: stops that are searched. Up to about 4 something in the picture is
+        low, high: range of the exposure, stops. Up to about 4 something in the picture is
             not white.
     """
     renderer = make_renderer({"camera": {"exposure": [low, high]}})
     start = torch.ones_like(renderer.start)
     checks = []
     endings = []
-    flat = 0
+    n_flat = 0
     loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
         result = run_search(
             renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy
         )
-        flat += sum(record.gradient_norm == 0.0 for record in result.history)
+        n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(
             holds(
                 f"{policy.name} finds a picture that is not white",
@@ -166,29 +198,34 @@ def leave_plateau(low: float, high: float) -> Outcome:
         renderer, loss, 2, workbench.Query(start, 0, gradient=True)
     ).gradient
     assert slope is not None
-    at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
-    measured = {"evaluations without a gradient": float(flat)}
-    return Outcome([at_first, *checks], ending=", ".join(endings), measured=measured)
+    start_check = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
+    counts = {"evaluations without a gradient": float(n_flat)}
+    return Outcome([start_check, *checks], ending=", ".join(endings), measured=counts)
 
 
-AWAY = (
+LEAVES_PLATEAU = (
     "From a white picture without a gradient every policy gets away within "
     f"{PLATEAU_STEPS} evaluations"
 )
-cases("radiometric", leave_plateau, [
-    ("saturated-plateau", f"{AWAY}.", {"low": -10.0, "high": 10.0}),
-    ("saturated-plateau-narrow-way-out", f"{AWAY}; the way out is a tenth of the range.", {"low": 1.0, "high": 10.0}),
-])  # fmt: skip
+cases(
+    "radiometric",
+    leave_plateau,
+    [
+        ("saturated-plateau", f"{LEAVES_PLATEAU}.", {"low": -10.0, "high": 10.0}),
+        (
+            "saturated-plateau-narrow-way-out",
+            f"{LEAVES_PLATEAU}; the way out is a tenth of the range.",
+            {"low": 1.0, "high": 10.0},
+        ),
+    ],
+)
 
 
 # ---- surfaces
-# -------------------------------------------------------------------------------------------------------
 
 
 def make_glass_ball() -> dict[str, dict[str, object]]:
-    """Return a ball of clear glass before the mug, by name, in Mitsuba's words; nothing
-    of it varies.
-    """
+    """Return a ball of clear glass before the mug, as Mitsuba's dictionary by name."""
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
     material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
@@ -208,19 +245,33 @@ def material_case(
     }
 
 
-cases("materials", check_scene, [
-    ("roughness-0", "Finite, and the gradient by the roughness is right, at the "
-                    "polished end.",
-     material_case(("roughness",), slow=False, roughness=0.0)),
-    ("roughness-1", "Finite, and the gradient by the roughness is right, at the matt "
-                    "end.",
-     material_case(("roughness",), roughness=1.0, metallic=1.0)),
-    ("metallic-1", "Finite, and the gradient has the right sign and size at a metallic "
-                   "of exactly 1.",
-     material_case(("metallic",), metallic=1.0)),
-    ("perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.",
-     material_case(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
-])  # fmt: skip
+cases(
+    "materials",
+    check_scene,
+    [
+        (
+            "roughness-0",
+            "Finite, and the gradient by the roughness is right, at the polished end.",
+            material_case(("roughness",), slow=False, roughness=0.0),
+        ),
+        (
+            "roughness-1",
+            "Finite, and the gradient by the roughness is right, at the matt end.",
+            material_case(("roughness",), roughness=1.0, metallic=1.0),
+        ),
+        (
+            "metallic-1",
+            "Finite, and the gradient has the right sign and size at a metallic "
+            "of exactly 1.",
+            material_case(("metallic",), metallic=1.0),
+        ),
+        (
+            "perfect-mirror",
+            "A metal of roughness 0 is finite, and both gradients are right.",
+            material_case(("roughness", "metallic"), roughness=0.0, metallic=1.0),
+        ),
+    ],
+)
 
 
 @case("materials", "clear-glass", slow=True)
@@ -248,8 +299,8 @@ def texels_at_the_ends() -> Outcome:
     slope = torch.stack(
         [raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]
     ).mean(dim=0)
-    gradient, wanted = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
-    error = abs(gradient / wanted - 1.0)
+    gradient, expected = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
+    error = abs(gradient / expected - 1.0)
     best = run_search(renderer, loss, 3).best_u
     return check_scene(controls, make_checkered_mug, compare=False).also(
         check(
@@ -272,50 +323,86 @@ def texels_at_the_ends() -> Outcome:
 
 
 # ---- light that is thrown
-# --------------------------------------------------------------------------------------------
 
-SIDE = 8  # texels along the picture of a projector
-WHOLE = [1.0] * (3 * SIDE**2)
-ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
+# width and height of a projector's picture, texels
+SIDE = 8
+WHITE_PICTURE = [1.0] * (3 * SIDE**2)
+CENTER_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
 
 
 def projector_case(
-    u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float
+    u: Sequence[float] | Mapping[int, float] = WHITE_PICTURE, **projector: float
 ) -> dict[str, object]:
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
 
-cases("light", check_scene, [
-    ("projector-black", "A black picture changes nothing, and texels have a gradient.",
-     {**projector_case({}), "beside": {"controls": {"lens": {}}}, "apart": (None, 0.02)}),
-    ("projector-full", FINITE, projector_case()),
-    ("projector-one-texel", FINITE, projector_case(ONE_TEXEL)),
-    ("projector-grazing", FINITE, projector_case(elevation=0.5)),
-    ("projector-behind-the-object", FINITE, projector_case(azimuth=220.0)),
-    ("projector-inside-the-object", FINITE, projector_case(distance=0.01, fov=30.0)),
-    ("projector-into-a-mirror", FINITE,
-     {**projector_case(), "settings": {"material.metallic": 1.0, "material.roughness": 0.0}}),
-    ("projector-0-lumens", "Without light the gradient is zero.",
-     {**projector_case(lumens=0.0), "gradient": (0.0, 0.0)}),
-    ("projector-1e6-lumens", "The picture is white for the most part, and all is "
-                             "finite.",
-     {**projector_case(lumens=1e6), "gradient": (None, None), "mean": (0.7, None)}),
-    ("spot-smallest", "Picture and gradient of a laser's spot are finite.",
-     {"controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}}, "u": [0.0, 1.0], "compare": False,
-      "gradient": (1e-12, None)}),
-])  # fmt: skip
+cases(
+    "light",
+    check_scene,
+    [
+        (
+            "projector-black",
+            "A black picture changes nothing, and texels have a gradient.",
+            {
+                **projector_case({}),
+                "beside": {"controls": {"lens": {}}},
+                "apart": (None, 0.02),
+            },
+        ),
+        ("projector-full", FINITE, projector_case()),
+        ("projector-one-texel", FINITE, projector_case(CENTER_TEXEL)),
+        ("projector-grazing", FINITE, projector_case(elevation=0.5)),
+        ("projector-behind-the-object", FINITE, projector_case(azimuth=220.0)),
+        (
+            "projector-inside-the-object",
+            FINITE,
+            projector_case(distance=0.01, fov=30.0),
+        ),
+        (
+            "projector-into-a-mirror",
+            FINITE,
+            {
+                **projector_case(),
+                "settings": {"material.metallic": 1.0, "material.roughness": 0.0},
+            },
+        ),
+        (
+            "projector-0-lumens",
+            "Without light the gradient is zero.",
+            {**projector_case(lumens=0.0), "gradient": (0.0, 0.0)},
+        ),
+        (
+            "projector-1e6-lumens",
+            "The picture is white for the most part, and all is finite.",
+            {
+                **projector_case(lumens=1e6),
+                "gradient": (None, None),
+                "mean": (0.7, None),
+            },
+        ),
+        (
+            "spot-smallest",
+            "Picture and gradient of a laser's spot are finite.",
+            {
+                "controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}},
+                "u": [0.0, 1.0],
+                "compare": False,
+                "gradient": (1e-12, None),
+            },
+        ),
+    ],
+)
 
 
 @case("light", "projector-through-glass")
 def project_through_glass() -> Outcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    along = projector_case(azimuth=describe_mug().number("camera.azimuth"))
-    return check_scene(**along, plugins=make_glass_ball())  # type: ignore[arg-type]
+    arguments = projector_case(azimuth=describe_mug().number("camera.azimuth"))
+    return check_scene(**arguments, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 
 # ---- meshes, places and views
-# ---------------------------------------------------------------------------------------
 
 # a square that faces +x
 QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
@@ -341,28 +428,21 @@ BARE = {"ground.size": 0.0}
 def mesh_case(
     thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None
 ) -> dict[str, object]:
-    like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
+    other = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
     return {
         "controls": PAINTED,
         "thing": thing,
         "settings": FRONT,
         "slow": True,
-        **like,
+        **other,
     }
 
 
 def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
-    """A box as a file gives it, in some unit and at some distance from the file's
-    origin.
-    """
-    points = (
-        np.array(
-            [[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]
-        )
-        * scale
-        + shift
-    )
-    corners = [
+    """Import a box from a file in some unit, at some distance from its origin."""
+    corners = [[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]
+    points = np.array(corners) * scale + shift
+    quads = [
         [0, 4, 6, 2],
         [1, 3, 7, 5],
         [0, 1, 5, 4],
@@ -371,8 +451,9 @@ def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
         [4, 5, 7, 6],
     ]
     lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
-    faces = [part for a, b, c, d in corners for part in ((a, b, c), (a, c, d))]
-    lines += ["f " + " ".join(str(1 + corner) for corner in face) for face in faces]
+    for a, b, c, d in quads:
+        for face in ((a, b, c), (a, c, d)):
+            lines.append("f " + " ".join(str(1 + corner) for corner in face))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "box.obj"
         path.write_text("\n".join(lines) + "\n")
@@ -393,58 +474,127 @@ def outline_case(controls: ControlSettings) -> dict[str, object]:
     return {"controls": controls, "thing": make_dark_mug, "settings": BARE, "u": [0.5]}
 
 
-AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
-cases("geometry", check_scene, [
-    ("degenerate-triangles", "Faces without area change neither the picture nor the "
-                             "gradient.",
-     mesh_case(DEGENERATE, SQUARE)),
-    ("sliver-triangles", "A triangle a million times as long as wide leaves everything "
-                         "finite and right.",
-     mesh_case(SLIVER)),
-    ("coincident-faces", "Two faces in one place look like one.", mesh_case(TWICE, SQUARE)),
-    ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
-    ("scale-0.01", FINITE, {"controls": {"pose": {"scale": [0.01, 0.02]}}, "u": [0.0], "compare": False}),
-    ("scale-100", FINITE, {"controls": {"pose": {"scale": [50.0, 100.0]}}, "u": [1.0], "compare": False}),
-    ("file-in-units-of-0.01", "A file in other units gives the same picture.", file_case(0.01)),
-    ("file-in-units-of-100", "A file in other units gives the same picture.", file_case(100.0)),
-    ("file-10000-sizes-off", "A mesh that its file puts 10,000 sizes from the origin "
-                             "gives the same picture.",
-     file_case(shift=1e4)),
-    ("translation-10000", "The picture is that of the scene without the object, and "
-                          "the gradient is zero.",
-     {"controls": {"pose": {"y": [9e3, 1e4]}}, "u": [1.0], "gradient": (None, 1e-6), "beside": AWAY_FROM_IT}),
-    ("grazing-view", "Looking along the ground, the gradient by the elevation is right.",
-     outline_case({"camera": {"elevation": [-10.0, 10.0]}})),
-    ("near-plane", "With the camera inside the object, picture and gradient are finite.",
-     {"controls": {"camera": {"distance": [0.05, 0.2]}}, "u": [0.5], "compare": False}),
-    ("object-fills-the-frame", "Finite where nothing but the object is seen.",
-     {"controls": {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, "u": [0.5], "compare": False}),
-    ("object-leaves-the-frame", "Half outside, the gradient by the shift is right.",
-     outline_case({"pose": {"x": [0.0, 2.0]}})),
-])  # fmt: skip
+EMPTY_VIEW = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
+cases(
+    "geometry",
+    check_scene,
+    [
+        (
+            "degenerate-triangles",
+            "Faces without area change neither the picture nor the gradient.",
+            mesh_case(DEGENERATE, SQUARE),
+        ),
+        (
+            "sliver-triangles",
+            "A triangle a million times as long as wide leaves everything "
+            "finite and right.",
+            mesh_case(SLIVER),
+        ),
+        (
+            "coincident-faces",
+            "Two faces in one place look like one.",
+            mesh_case(TWICE, SQUARE),
+        ),
+        ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
+        (
+            "scale-0.01",
+            FINITE,
+            {
+                "controls": {"pose": {"scale": [0.01, 0.02]}},
+                "u": [0.0],
+                "compare": False,
+            },
+        ),
+        (
+            "scale-100",
+            FINITE,
+            {
+                "controls": {"pose": {"scale": [50.0, 100.0]}},
+                "u": [1.0],
+                "compare": False,
+            },
+        ),
+        (
+            "file-in-units-of-0.01",
+            "A file in other units gives the same picture.",
+            file_case(0.01),
+        ),
+        (
+            "file-in-units-of-100",
+            "A file in other units gives the same picture.",
+            file_case(100.0),
+        ),
+        (
+            "file-10000-sizes-off",
+            "A mesh that its file puts 10,000 sizes from the origin "
+            "gives the same picture.",
+            file_case(shift=1e4),
+        ),
+        (
+            "translation-10000",
+            "The picture is that of the scene without the object, and "
+            "the gradient is zero.",
+            {
+                "controls": {"pose": {"y": [9e3, 1e4]}},
+                "u": [1.0],
+                "gradient": (None, 1e-6),
+                "beside": EMPTY_VIEW,
+            },
+        ),
+        (
+            "grazing-view",
+            "Looking along the ground, the gradient by the elevation is right.",
+            outline_case({"camera": {"elevation": [-10.0, 10.0]}}),
+        ),
+        (
+            "near-plane",
+            "With the camera inside the object, picture and gradient are finite.",
+            {
+                "controls": {"camera": {"distance": [0.05, 0.2]}},
+                "u": [0.5],
+                "compare": False,
+            },
+        ),
+        (
+            "object-fills-the-frame",
+            "Finite where nothing but the object is seen.",
+            {
+                "controls": {"camera": {"distance": [0.5, 0.8], "fov": 10.0}},
+                "u": [0.5],
+                "compare": False,
+            },
+        ),
+        (
+            "object-leaves-the-frame",
+            "Half outside, the gradient by the shift is right.",
+            outline_case({"pose": {"x": [0.0, 2.0]}}),
+        ),
+    ],
+)
 
 
 @case("geometry", "million-triangles", slow=True)
 def million() -> Outcome:
     """Finite, right, and like the coarse mesh of the same shape."""
-    fine, rough = (
+    fine_mesh, coarse_mesh = (
         assets.normalised(workbench.sphere(*counts))
         for counts in ((501, 1000), (64, 128))
     )
     coarse, renderer = (
-        make_renderer(SHIFT, make_checkered_object(made)) for made in (rough, fine)
+        make_renderer(SHIFT, make_checkered_object(made))
+        for made in (coarse_mesh, fine_mesh)
     )
     _, slope = renderer.gradient(
         gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP
     )
-    apart = mean_difference(
+    difference = mean_difference(
         render_image(renderer, renderer.start, 0, 64),
         render_image(coarse, coarse.start, 0, 64),
     )
-    return check_scene(TEXTURE, make_checkered_object(fine), evaluations=2).also(
-        check("triangles", float(len(fine.faces)), least=1e6),
+    return check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2).also(
+        check("triangles", float(len(fine_mesh.faces)), least=1e6),
         holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
-        check("mean difference from a sphere of 16,000", apart, most=SAME_PICTURE),
+        check("mean difference from a sphere of 16,000", difference, most=SAME_PICTURE),
     )
 
 
@@ -485,25 +635,25 @@ def gimbal() -> Outcome:
 
 
 def full_turn(controls: ControlSettings) -> Outcome:
-    """0 and 360 degrees are one place: one picture, one gradient, and a step across the
-    seam goes on.
-    """
+    """Check that 0 and 360 degrees are the same, in picture, gradient and steps."""
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
     one = torch.ones_like(renderer.start)
     loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
-    apart = mean_difference(render_image(renderer, zero), render_image(renderer, one))
-    wrapped = float(make_domain(renderer).project(one + 0.01).max())
+    difference = mean_difference(
+        render_image(renderer, zero), render_image(renderer, one)
+    )
+    wrapped_u = float(make_domain(renderer).project(one + 0.01).max())
     size = float(slopes[0].abs().max())
     return check_scene(controls, u=[0.0], compare=False).also(
-        check("mean difference of the pictures", apart, most=SAME_PICTURE),
+        check("mean difference of the pictures", difference, most=SAME_PICTURE),
         check(
             "difference of the gradients",
             float((slopes[0] - slopes[1]).abs().max()) / size,
             most=0.05,
         ),
-        check("where a step of 0.01 past the end goes", wrapped, 0.0099, 0.0101),
+        check("where a step of 0.01 past the end goes", wrapped_u, 0.0099, 0.0101),
     )
 
 
@@ -526,15 +676,12 @@ for control, name in (
 
 
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds
-# ------------------------------------------
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite one after the other, until they are done, the time is up
-    or there is an interrupt.
+    """Run cases of the suite in order, until all are done, the time is over, or an interrupt.
 
-    A case that is done is stored at once: a run that was stopped goes on with the case
-    that it was at.
+    The result of a case is stored at once: a resumed run continues with the next.
     """
     cases = chosen(context.config.cases, context.config.groups)
     measurements = context.open_measurements(context.config.seconds)
@@ -562,33 +709,34 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
 
 
 def sentences() -> dict[str, str]:
+    """Return group and what must hold of each case by name."""
     return {case.name: f"{case.group}: {case.holds}" for case in CASES}
 
 
 def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
-    """Return the cases of these names and groups; all where neither is given, an
-    UnknownNameError where one is unknown.
+    """Select the cases of names and groups, all if neither is given.
+
+    Raises:
+        UnknownNameError: if a name or a group does not exist.
     """
-    for kind, wanted in (("name", names), ("group", groups)):
-        known = dict.fromkeys(getattr(each, kind) for each in CASES)
-        for name in wanted:
+    for kind, attribute, requested in (
+        ("case", "name", names),
+        ("group", "group", groups),
+    ):
+        known = dict.fromkeys(getattr(each, attribute) for each in CASES)
+        for name in requested:
             if name not in known:
-                raise errors.UnknownNameError(
-                    "case" if kind == "name" else kind, name, known
-                )
-    return [
-        case
-        for case in CASES
-        if not (names or groups) or case.name in names or case.group in groups
-    ]
+                raise errors.UnknownNameError(kind, name, known)
+    if not names and not groups:
+        return list(CASES)
+    return [each for each in CASES if each.name in names or each.group in groups]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Cases of controls whose scales differ by a million, and of noise.
+# ---- Controls whose scales differ by a million, and noise
 #
-# A search works in the unit box, so a control's unit cannot reach it. What can is how
-# strongly the objective depends on each number there: its curvatures, whose ratio (the
-# condition number) is printed.
+# A search works in the unit box, so that units of controls do not matter. What matters
+# is how strongly the objective depends on each value there: its curvatures, whose ratio
+# (the condition number) is printed.
 
 RATIO = 1e6
 
@@ -599,29 +747,39 @@ def hessian(
     directions: Tensor,
     steps: Sequence[float],
 ) -> Tensor:
-    """Estimate the second derivatives (k, k), float64, of an objective at u (d,) along
-    directions (k, d), by differences of k half-widths.
+    """Estimate second derivatives (k, k), float64, of an objective by differences.
+
+    Args:
+        value: the objective.
+        u: the configuration (d,).
+        directions: directions (k, d).
+        steps: half-width of the differences along each direction.
     """
     moves = [
         step * direction for step, direction in zip(steps, directions, strict=True)
     ]
-    here = value(u)
+    center = value(u)
     second = torch.zeros(len(moves), len(moves), dtype=torch.float64)
     for i, move in enumerate(moves):
-        second[i, i] = (value(u + move) - 2.0 * here + value(u - move)) / steps[i] ** 2
+        curvature = value(u + move) - 2.0 * center + value(u - move)
+        second[i, i] = curvature / steps[i] ** 2
         for j, other in enumerate(moves[:i]):
             crossed = value(u + move + other) - value(u + move - other)
             crossed += value(u - move - other) - value(u - move + other)
-            second[i, j] = second[j, i] = crossed / (4.0 * steps[i] * steps[j])
+            second[i, j] = crossed / (4.0 * steps[i] * steps[j])
+            second[j, i] = second[i, j]
     return second
 
 
 def condition_number(second: Tensor) -> float:
-    """Return the largest over the smallest absolute eigenvalue of a symmetric matrix
-    (k, k); infinite if that is 0.
+    """Return the ratio of the largest to the smallest absolute eigenvalue.
+
+    The matrix (k, k) is symmetric. It is infinite if the smallest is 0.
     """
     sizes = torch.linalg.eigvalsh(second.double()).abs()
-    return float(sizes.max() / sizes.min()) if float(sizes.min()) > 0.0 else math.inf
+    if not float(sizes.min()) > 0.0:
+        return math.inf
+    return float(sizes.max() / sizes.min())
 
 
 @case("stiff", "badly-scaled-range")
@@ -632,14 +790,14 @@ def wide_range() -> Outcome:
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
         renderer = make_renderer(controls)
         loss = gradients.smooth_loss(renderer.formation.resolution)
-        each = [
+        derivatives = [
             float(renderer.gradient(loss, renderer.start, seed, 32)[1][0])
             for seed in range(6)
         ]
-        slopes.append(statistics.fmean(each) / width)
+        slopes.append(statistics.fmean(derivatives) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
-    off = check("error of the derivative per object size", error, most=0.2)
-    return check_scene(wide, compare=False).also(off, relative_error=error)
+    error_check = check("error of the derivative per object size", error, most=0.2)
+    return check_scene(wide, compare=False).also(error_check, relative_error=error)
 
 
 @case("stiff", "light-rotation-texel", slow=True)
@@ -654,48 +812,63 @@ def light_rotation_texel() -> Outcome:
     }
     renderer = make_renderer(controls)
     u = renderer.start.clone()
+    u[0] = 0.5
+    u[1] = 0.1
+    second = _estimate_three_curvatures(renderer, u)
+    # from the unit box to watts, degrees and sRGB
+    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
+    path, _ = _record_path(renderer, u, 1.0)
+    scaled_path, ending = _record_path(renderer, u, RATIO)
+    distances = (path - path[0]).abs().amax(dim=0)
+    path_difference = float((path - scaled_path).abs().max())
+    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
+        check("how far the power moved", float(distances[0]), least=0.05),
+        check("how far the rotation moved", float(distances[1]), least=0.05),
+        check("how far the texels moved", float(distances[2:].max()), least=0.05),
+        check(
+            "distance from the path of the objective x 1e6", path_difference, most=1e-3
+        ),
+        ending=ending,
+        measured={
+            "condition number in u": condition_number(second),
+            "condition number in watts, degrees and sRGB": condition_number(
+                units @ second @ units
+            ),
+        },
+    )
+
+
+def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
+    """Return second derivatives (3, 3) by power, rotation, and all texels at once."""
     loss = gradients.smooth_loss(renderer.formation.resolution)
-    u[0], u[1] = 0.5, 0.1
     directions = torch.zeros(3, len(u))
-    directions[0, 0] = directions[1, 1] = 1.0
+    directions[0, 0] = 1.0
+    directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    second = hessian(
+    return hessian(
         lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))),
         u,
         directions,
         steps,
     )
-    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    paths: list[list[Tensor]] = []
-    for scale in (1.0, RATIO):
-        paths.append([])
-        note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
-        scaled = partial(lambda scale, image: scale * loss(image), scale)
-        result = run_search(renderer, scaled, 18, spp=8, start=u, on_step=note)
-    path, again = map(torch.stack, paths)
-    moved = (path - path[0]).abs().amax(dim=0)
-    names = {
-        "condition number in u": second,
-        "condition number in watts, degrees and sRGB": units @ second @ units,
-    }
-    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
-        *(
-            check(f"how far {what} moved", float(distance), least=0.05)
-            for what, distance in (
-                ("the power", moved[0]),
-                ("the rotation", moved[1]),
-                ("the texels", moved[2:].max()),
-            )
-        ),
-        check(
-            "distance from the path of the objective x 1e6",
-            float((path - again).abs().max()),
-            most=1e-3,
-        ),
-        ending=result.ending.value,
-        measured={name: condition_number(matrix) for name, matrix in names.items()},
+
+
+def _record_path(
+    renderer: gradients.Renderer, u: Tensor, scale: float
+) -> tuple[Tensor, str]:
+    """Search with a scaled objective; return the path (steps, d) and the status."""
+    loss = gradients.smooth_loss(renderer.formation.resolution)
+    path: list[Tensor] = []
+    result = run_search(
+        renderer,
+        lambda image: scale * loss(image),
+        18,
+        spp=8,
+        start=u,
+        on_step=lambda record, at, evaluation: path.append(at),
     )
+    return torch.stack(path), result.ending.value
 
 
 MIXED = {
@@ -703,12 +876,27 @@ MIXED = {
     "environment": {"exposure": [-1.0, 1.0]},
     "pose": {"y": [-0.3, 0.3]},
 }
-cases("noise", check_scene, [
-    ("one-sample-a-pixel", "Finite; the mean of 48 gradients is right.",
-     {"controls": MIXED, "spp": 1, "repeats": 48, "slow": True}),
-    ("one-sample-a-pixel-denoised", "Finite after the denoiser too.",
-     {"controls": {"texture": {"resolution": 8}}, "spp": 1, "denoise": "oidn", "compare": False}),
-])  # fmt: skip
+cases(
+    "noise",
+    check_scene,
+    [
+        (
+            "one-sample-a-pixel",
+            "Finite; the mean of 48 gradients is right.",
+            {"controls": MIXED, "spp": 1, "repeats": 48, "slow": True},
+        ),
+        (
+            "one-sample-a-pixel-denoised",
+            "Finite after the denoiser too.",
+            {
+                "controls": {"texture": {"resolution": 8}},
+                "spp": 1,
+                "denoise": "oidn",
+                "compare": False,
+            },
+        ),
+    ],
+)
 
 
 @case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
@@ -726,11 +914,11 @@ def heavy_render(count: int = 24) -> Outcome:
     slopes = torch.stack(
         [renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]
     ).double()
-    away = (slopes - slopes.median()).abs()
+    distance = (slopes - slopes.median()).abs()
     return check_scene(controls, compare=False, spp=4).also(
         check(
             "farthest over the median distance",
-            float(away.max() / away.median()),
+            float(distance.max() / distance.median()),
             most=12.0,
         ),
         holds("the plan takes secant", renderer.plan.groups[0].estimator == "secant"),

@@ -1,6 +1,4 @@
-"""Test claims about a model, each found held, failed or undecided: a gate at every
-change.
-"""
+"""Test claims about a model, each found held, failed or undecided: a gate at every change."""
 
 from __future__ import annotations
 
@@ -21,9 +19,7 @@ from advsearch.questions.test.result import SuiteResult
 from advsearch.questions.test.settings import SuiteConfig, suite_of
 
 FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.markdown}
-"""Settings that name a file for other programs, and what writes its text from the
-result.
-"""
+"""Settings that name a file for other programs, and the functions that format it."""
 
 
 @experiment(
@@ -43,8 +39,9 @@ result.
 def test(
     context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = None
 ) -> SuiteResult:
-    """Try the claims of a suite, counterexamples first, and write the files for other
-    programs (docs/testing.md).
+    """Test the claims of a suite, counterexamples first (docs/testing.md).
+
+    Files for other programs are written at the end.
 
     Args:
         suite: a YAML file.

@@ -1,4 +1,4 @@
-"""`test`: the claims of a suite one after the other, counterexamples first."""
+"""`test`: test the claims of a suite in order, counterexamples first."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import secrets
 import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,93 +50,91 @@ from advsearch.questions.test.settings import (
 
 @dataclass(frozen=True)
 class PlannedClaim:
-    """A claim or a counterexample, and what it is tried with."""
+    """A claim or a counterexample, and the settings that it is tested with.
+
+    `refusal` is why a counterexample cannot be tested on the model; `config` then has
+    the settings of its own model.
+    """
 
     name: str
     kind: str
     config: SceneConfig
     example: Counterexample | None = None
-    # why a counterexample cannot be tried on the model; its own model's settings stand
-    # in `config`
     refusal: str = ""
 
 
 def try_suite(
     context: RunContext[SuiteConfig], suite: Suite | None = None
 ) -> SuiteResult:
-    """Try the claims of a suite; what is decided is not tried again.
+    """Test the claims of a suite; what a resumed run decided is not tested again.
 
     Args:
         context: of the experiment; its settings name the suite.
-        suite: in place of the one that the settings name.
+        suite: instead of the one that the settings name.
 
     Raises:
-        InputError: the suite names something that is not there, contradicts itself, or
-            could not be judged; nothing is rendered then.
+        InputError: if the suite names something that does not exist, contradicts
+            itself, or could not be tested; nothing is rendered then.
     """
-    begun = time.perf_counter()
+    start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
-    described = _read_noted_suite(context.resumed) or suite or _read_suite(config)
-    added = (
-        None if config.add is None else counterexamples.add(config.suite, config.add)
-    )
+    loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
+    added = None
+    if config.add is not None:
+        added = counterexamples.add(config.suite, config.add)
     try:
-        planned = _planned(described, config, added)
-        for claim in planned if described is not suite else ():
-            claim.config.check_powers(f"claims.{claim.name}.settings")
-        remarks = _check(planned, described)
+        planned = _plan_claims(loaded_suite, config, added)
+        if loaded_suite is not suite:
+            for claim in planned:
+                claim.config.check_powers(f"claims.{claim.name}.settings")
+        remarks = _check_claims(planned, loaded_suite)
     except InputError as error:
         if added is not None:
             counterexamples.remove(added)
         raise InputError(f"{config.suite}: {error}") from None
-    _note_settings(context, described, planned)
+    _note_settings(context, loaded_suite, planned)
     for remark in remarks:
         context.progress.message(remark)
-    trial = Trial(context, described, begun, remarks)
+    trial = Trial(context, loaded_suite, start, remarks)
     suite_run = _SuiteRun(trial, planned, counterexamples.read_expected(config.suite))
-    context.ending = suite_run.carry_out()
+    context.ending = suite_run.run_claims()
     if added is not None and suite_run.results[0].answer != FAILED:
         counterexamples.remove(added)
         raise InputError(
             f"add: the adversarial scene of {config.add} is not kept: "
             f"{suite_run.results[0].reason}"
         )
-    return suite_run.result(context.ending, added)
+    return suite_run.make_result(context.ending, added)
 
 
 def _read_noted_suite(resumed: Path | None) -> Suite | None:
-    """Return the suite that a run began with; None for a new run, and for one that was
-    stopped before it noted any.
+    """Read the suite that a resumed run began with.
+
+    Return None for a new run, and for one that was stopped before it noted any.
     """
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
         noted = store.noted(SUITE_NOTE)
-    return (
-        None
-        if noted is None
-        else settings.suite_of(noted, f"{resumed}: the suite that it began with")
-    )
+    if noted is None:
+        return None
+    return settings.suite_of(noted, f"{resumed}: the suite that it began with")
 
 
 def _read_suite(config: SuiteConfig) -> Suite:
-    """Return the suite that settings name, with the seed that they state, or a fresh
-    one.
-    """
-    described = settings.read_suite(config.suite)
-    seed = described.seed if config.seed is None else config.seed
-    return described.model_copy(
-        update={"seed": secrets.randbelow(2**31) if config.fresh else seed}
-    )
+    """Read the suite that settings name, with their seed, or a new random one."""
+    suite = settings.read_suite(config.suite)
+    seed = suite.seed if config.seed is None else config.seed
+    if config.fresh:
+        seed = secrets.randbelow(2**31)
+    return suite.model_copy(update={"seed": seed})
 
 
 def _note_settings(
     context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]
 ) -> None:
-    """Make the run, and note what its claims are judged with, so that it goes on as it
-    began.
-    """
+    """Note the settings that claims are tested with, so that a resumed run repeats them."""
     run = context.run
     run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {
@@ -156,31 +154,30 @@ def _note_settings(
 
 @dataclass
 class _SuiteRun:
-    """A suite on its way."""
+    """The state of a suite that is being tested: what is planned, and results so far."""
 
     trial: Trial
     planned: Sequence[PlannedClaim]
     expected: Mapping[str, str]
     results: list[ClaimResult] = field(default_factory=list)
 
-    def carry_out(self) -> str:
-        """Try every claim, and return how that ended."""
+    def run_claims(self) -> str:
+        """Test every claim, and return the status of the run."""
         trial = self.trial
         with trial.context.until_interrupted():
             for number, claim in enumerate(self.planned, start=1):
-                self._add(claim, self._tried(claim))
-                trial.progress.message(
-                    f"{claim.name}: {self.results[-1].answer}: "
-                    f"{self.results[-1].reason}"
-                )
+                self._add_result(claim, self._test_claim(claim))
+                last = self.results[-1]
+                trial.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
                 if number < len(self.planned):
-                    # what a kill leaves
-                    trial.run.write_summary(self.result(results.INTERRUPTED, None))
+                    # for a run that is killed
+                    trial.run.write_summary(self.make_result(results.INTERRUPTED, None))
         if trial.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
-                self._add(claim, self._not_tried(claim, STOPPED, Cause.INTERRUPTED))
+                untested = self._make_untested(claim, STOPPED, Cause.INTERRUPTED)
+                self._add_result(claim, untested)
             return results.INTERRUPTED
-        causes = {tried.cause for tried in self.results}
+        causes = {tested.cause for tested in self.results}
         if Cause.COUNTEREXAMPLE_FAILED in causes:
             trial.warnings.append(
                 "A counterexample failed, so that no claim was "
@@ -188,45 +185,46 @@ class _SuiteRun:
             )
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
-    def _tried(self, claim: PlannedClaim) -> ClaimResult:
+    def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
+        """Test a claim, or return why it is not tested, or its noted result."""
         key = f"claim {claim.name}"
         trial = self.trial
-        if (stored := trial.run.store.noted(key)) is not None:
-            return ClaimResult.of(stored)
-        failed = any(
+        noted = trial.run.store.noted(key)
+        if noted is not None:
+            return ClaimResult.of(noted)
+        counterexample_failed = any(
             known.kind == "counterexample" and not known.accepted
             for known in self.results
         )
-        if failed and claim.example is None and not trial.config.all:
-            return self._not_tried(claim, NOT_TRIED, Cause.COUNTEREXAMPLE_FAILED)
+        if counterexample_failed and claim.example is None and not trial.config.all:
+            return self._make_untested(claim, NOT_TRIED, Cause.COUNTEREXAMPLE_FAILED)
         if trial.late:
-            return self._not_tried(
+            return self._make_untested(
                 claim, f"{TIME_OVER} before it began", Cause.OUT_OF_TIME
             )
         if claim.refusal:
-            return self._not_tried(claim, claim.refusal)
-        asked = self._not_tried(claim, "")
-        begun = time.perf_counter()
+            return self._make_untested(claim, claim.refusal)
+        pending = self._make_untested(claim, "")
+        start = time.perf_counter()
         if claim.example is None:
-            tried = trial.claim(asked, trial.suite.claims[claim.name], claim.config)
+            tested = trial.claim(pending, trial.suite.claims[claim.name], claim.config)
         else:
             assert isinstance(claim.config, AttackConfig)
-            tried = trial.counterexample(asked, claim.example, claim.config)
-        if tried.cause is Cause.INTERRUPTED:
+            tested = trial.counterexample(pending, claim.example, claim.config)
+        if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt
-        tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
-        if tried.cause is not Cause.OUT_OF_TIME:
-            trial.run.store.set_note(key, json.dumps(tried.to_dict()))
-        return tried
+        tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
+        if tested.cause is not Cause.OUT_OF_TIME:
+            trial.run.store.set_note(key, json.dumps(tested.to_dict()))
+        return tested
 
-    def _not_tried(
+    def _make_untested(
         self, claim: PlannedClaim, reason: str, cause: Cause | None = None
     ) -> ClaimResult:
-        text = (
-            statement(self.trial.suite.claims[claim.name], claim.config)
-            if claim.example is None
-            else ""
-        )
+        """Make the result of a claim that is not tested, or not yet."""
+        text = ""
+        if claim.example is None:
+            text = statement(self.trial.suite.claims[claim.name], claim.config)
         return ClaimResult(
             name=claim.name,
             kind=claim.kind,
@@ -236,115 +234,144 @@ class _SuiteRun:
             cause=cause,
         )
 
-    def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
+    def _add_result(self, claim: PlannedClaim, tested: ClaimResult) -> None:
+        """Add the result of a claim, with what is expected and the command to repeat it."""
         repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(
-            tried.model_copy(update={"expected": expected, "repeat": repeat})
+            tested.model_copy(update={"expected": expected, "repeat": repeat})
         )
 
     def _repeat_command(self, *changes: str) -> str | None:
-        """Return the command that tries the claims again with the same seed, and
-        changes nothing but its own run.
+        """Return the command that tests the claims again with the same seed.
+
+        It changes nothing but its own run. None if no command can.
         """
         config = self.trial.config
         command = config.command_line(self.trial.run.path)
         if command is None:
             return None
-        defaults = {
-            power.name: power.default
-            for power in config.powers
-            if power.name not in ("run", "overwrite")
-        }
-        without = [
-            f"{name}={json.dumps(default)}" for name, default in defaults.items()
-        ]
-        seed = ["fresh=false", f"seed={self.trial.suite.seed}"] if config.fresh else []
-        return f"{command} {shlex.join([*changes, *seed, *without])}".rstrip()
+        arguments = list(changes)
+        if config.fresh:
+            arguments += ["fresh=false", f"seed={self.trial.suite.seed}"]
+        for power in config.powers:
+            if power.name not in ("run", "overwrite"):
+                arguments.append(f"{power.name}={json.dumps(power.default)}")
+        return f"{command} {shlex.join(arguments)}".rstrip()
 
-    def result(self, ending: str, added: Counterexample | None) -> SuiteResult:
-        config = self.trial.config
-        suite = self.trial.suite
+    def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
+        """Make the result of the claims so far; `update` stores what is expected."""
+        trial = self.trial
+        config = trial.config
         configs = [claim.config for claim in self.planned]
+        controls = [name for config in configs for name in config.controls]
         changes = list[str]()
-        ahead = self.planned[len(self.results) :]
-        claims = [
-            *self.results,
-            *(self._not_tried(claim, NOT_YET, Cause.NOT_REACHED) for claim in ahead),
-        ]
+        claims = list(self.results)
+        for claim in self.planned[len(self.results) :]:
+            claims.append(self._make_untested(claim, NOT_YET, Cause.NOT_REACHED))
         if config.update and ending == "done":
-            now = {
-                tried.name: tried.answer
-                for tried in claims
-                if tried.cause is not Cause.COUNTEREXAMPLE_FAILED
+            answers = {
+                claim.name: claim.answer
+                for claim in claims
+                if claim.cause is not Cause.COUNTEREXAMPLE_FAILED
             }
-            changes = counterexamples.write_expected(config.suite, now)
+            changes = counterexamples.write_expected(config.suite, answers)
             claims = [
-                tried.model_copy(
-                    update={"expected": now.get(tried.name, tried.expected)}
+                claim.model_copy(
+                    update={"expected": answers.get(claim.name, claim.expected)}
                 )
-                for tried in claims
+                for claim in claims
             ]
         return SuiteResult(
-            run=str(self.trial.run.path), suite=config.suite, title=suite.title,
-            object=",".join(dict.fromkeys(config.object for config in configs)),
-            model=",".join(dict.fromkeys(config.model for config in configs)),
-            environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
-            controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-            answer=verdict(claims), confidence=suite.confidence, claims=claims, ending=ending,
-            added=None if added is None else str(added.path), changes=changes,
-            warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": self.trial.passed}, seed=suite.seed,
-            command_line=self._repeat_command(), python_only=config.python_only,
-        )  # fmt: skip
+            run=str(trial.run.path),
+            suite=config.suite,
+            title=trial.suite.title,
+            object=_join_distinct(config.object for config in configs),
+            model=_join_distinct(config.model for config in configs),
+            environment=_join_distinct(config.lit_by for config in configs),
+            controls=list(dict.fromkeys(controls)),
+            answer=verdict(claims),
+            confidence=trial.suite.confidence,
+            claims=claims,
+            ending=ending,
+            added=None if added is None else str(added.path),
+            changes=changes,
+            warnings=list(dict.fromkeys(trial.warnings)),
+            seconds={"total": trial.passed},
+            seed=trial.suite.seed,
+            command_line=self._repeat_command(),
+            python_only=config.python_only,
+        )
 
 
-def _planned(
+def _join_distinct(names: Iterable[str]) -> str:
+    """Join names with commas, each once."""
+    return ",".join(dict.fromkeys(names))
+
+
+def _plan_claims(
     suite: Suite, config: SuiteConfig, added: Counterexample | None
 ) -> list[PlannedClaim]:
+    """Plan what is tested: counterexamples, then claims; a new counterexample alone.
+
+    Raises:
+        InputError: if names clash, or `only` selects nothing or names no claim.
+    """
     changes = {
         "model": config.model,
         "threads": config.threads,
         "deterministic": config.deterministic or None,
     }
-    examples = (
-        counterexamples.counterexamples(config.suite) if added is None else [added]
-    )
-    planned = [_planned_example(example, suite, changes) for example in examples]
-    if twice := [example.name for example in planned if example.name in suite.claims]:
-        raise InputError(
-            f"claims.{twice[0]}: a counterexample is called so, too; call "
-            "the claim something else"
-        )
+    if added is None:
+        examples = counterexamples.counterexamples(config.suite)
+    else:
+        examples = [added]
+    planned = [_plan_example(example, suite, changes) for example in examples]
+    for claim in planned:
+        if claim.name in suite.claims:
+            raise InputError(
+                f"claims.{claim.name}: a counterexample is called so, too; call "
+                "the claim something else"
+            )
     if added is not None:
         return planned
-    for name, claim in suite.claims.items():
+    for name, suite_claim in suite.claims.items():
         claim_config = suite.config_of(name, **changes).with_python_parts_of(config)
-        planned.append(PlannedClaim(name, claim.claim, claim_config))
+        planned.append(PlannedClaim(name, suite_claim.claim, claim_config))
+    return _select_claims(planned, config)
+
+
+def _select_claims(
+    planned: Sequence[PlannedClaim], config: SuiteConfig
+) -> list[PlannedClaim]:
+    """Select the claims that `only` names, by default all.
+
+    Raises:
+        InputError: if it names no claim, or none is left.
+    """
     known = [*(claim.name for claim in planned), COUNTEREXAMPLES]
     for name in config.chosen:
         if name not in known:
             raise errors.UnknownNameError("claim in `only`", name, known)
-    every = not config.chosen
-    chosen = [
-        claim
-        for claim in planned
-        if every
-        or claim.name in config.chosen
-        or (claim.example is not None and COUNTEREXAMPLES in config.chosen)
-    ]
-    if not chosen:
+    selected = []
+    for claim in planned:
+        is_example = claim.example is not None and COUNTEREXAMPLES in config.chosen
+        if not config.chosen or claim.name in config.chosen or is_example:
+            selected.append(claim)
+    if not selected:
         raise InputError(
             f"only: expected {COUNTEREXAMPLES} in "
             f"{counterexamples.folder_of(config.suite)}, got none, so that nothing "
             "would be tested; keep the adversarial scene of a run with `add`, or leave "
             "`only` out"
         )
-    return chosen
+    return selected
 
 
-def _planned_example(
+def _plan_example(
     example: Counterexample, suite: Suite, changes: Mapping[str, object]
 ) -> PlannedClaim:
+    """Plan the test of a counterexample, which may not suit the model."""
     refusal = ""
     try:
         config = example.config_for(suite, changes)
@@ -354,52 +381,67 @@ def _planned_example(
     return PlannedClaim(example.name, "counterexample", config, example, refusal)
 
 
-def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
-    """Load everything that claims name, and refuse what could not be judged or decided;
-    a wrong name would end minutes of rendering. Return what has to be said before.
+def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
+    """Load everything that claims name, and return remarks.
+
+    A wrong name would otherwise end minutes of rendering. Files of counterexamples are
+    loaded at once when they are tested.
+
+    Raises:
+        InputError: if a claim could not be tested or decided.
     """
-    known = list[AttackConfig]()
-    own = [(each, suite.claims[each.name]) for each in planned if each.example is None]
-    # what is beside the suite is loaded when it is tried, at once
-    remarks = [
-        check_pictures(each.name, claim, suite.confidence) for each, claim in own
+    checked = list[AttackConfig]()
+    remarks = list[str]()
+    claims = [
+        (planned_claim, suite.claims[planned_claim.name])
+        for planned_claim in planned
+        if planned_claim.example is None
     ]
-    for each, claim in own:
-        config = (
-            each.config
-            if isinstance(each.config, AttackConfig)
-            else AttackConfig.of(each.config)
-        )
-        for setting, wrong, why in (
-            ("object", len(config.objects) > 1, "one object; make a claim of each"),
-            ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
-            ("model", config.is_study, "one model; make a claim of each"),
-            (
-                "smallest",
-                config.smallest,
-                "a budget, which the claim is about; leave it out",
-            ),
-            (
-                "minimise",
-                config.minimise,
-                "a search that makes the model wrong; leave it out",
-            ),
-            ("target", config.target is not None, "any wrong prediction; leave it out"),
-        ):
-            if wrong and isinstance(claim, NotBrokenClaim):
-                raise InputError(
-                    f"claims.{each.name}.settings: {setting}: expected {why}"
-                )
-        than = (
-            [config.model_copy(update={"model": claim.than})]
-            if isinstance(claim, NoWorseClaim)
-            else []
-        )
-        for wanted in (config, *than):
-            if wanted not in known:
-                try:
-                    workbench.check_from_config(wanted)
-                except InputError as error:
-                    raise InputError(f"claims.{each.name}: {error}") from None
-                known.append(wanted)
-    return [remark for remark in remarks if remark]
+    for planned_claim, claim in claims:
+        remark = check_pictures(planned_claim.name, claim, suite.confidence)
+        if remark:
+            remarks.append(remark)
+    for planned_claim, claim in claims:
+        config = planned_claim.config
+        if not isinstance(config, AttackConfig):
+            config = AttackConfig.of(config)
+        needed = [config]
+        if isinstance(claim, NotBrokenClaim):
+            _check_search(planned_claim.name, config)
+        elif isinstance(claim, NoWorseClaim):
+            needed.append(config.model_copy(update={"model": claim.than}))
+        for needed_config in needed:
+            if needed_config in checked:
+                continue
+            try:
+                workbench.check_from_config(needed_config)
+            except InputError as error:
+                raise InputError(f"claims.{planned_claim.name}: {error}") from None
+            checked.append(needed_config)
+    return remarks
+
+
+def _check_search(name: str, config: AttackConfig) -> None:
+    """Check that the settings of a claim are those of a single search for an error.
+
+    Raises:
+        InputError: for the first setting that is of something else.
+    """
+    for setting, is_wrong, expected in (
+        ("object", len(config.objects) > 1, "one object; make a claim of each"),
+        ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
+        ("model", config.is_study, "one model; make a claim of each"),
+        (
+            "smallest",
+            config.smallest,
+            "a budget, which the claim is about; leave it out",
+        ),
+        (
+            "minimise",
+            config.minimise,
+            "a search that makes the model wrong; leave it out",
+        ),
+        ("target", config.target is not None, "any wrong prediction; leave it out"),
+    ):
+        if is_wrong:
+            raise InputError(f"claims.{name}.settings: {setting}: expected {expected}")

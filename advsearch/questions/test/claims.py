@@ -1,12 +1,11 @@
-"""How each kind of claim is tried: drawn pictures, a search, or the trials of a
-counterexample.
-"""
+"""Test each kind of claim: by sampled pictures, a search, or trials of a counterexample."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice, repeat
@@ -57,20 +56,29 @@ from advsearch.questions.test.settings import (
     ShareClaim,
 )
 
-MANY = 4  # values of a configuration that are said in words, at most
-# of a configuration with more numbers, a picture's row does not hold the values
+# maximum number of values of a configuration in a sentence
+MANY = 4
+# the values of a configuration with more dimensions are not stored with its picture
 MOST_KEPT = 64
 ChangePicture = Callable[["workbench.Query", Tensor], Tensor]
-"""Goes from a query and its picture to the picture that the other side is shown."""
-AHEAD = 2  # pictures that are asked for at once, for each worker
+"""Maps a query and its picture to the picture that the other side predicts."""
+# pictures that are requested at once, for each worker
+AHEAD = 2
+Evaluated = tuple["workbench.Query", policies.Evaluation, policies.Evaluation | None]
+"""A query, its evaluation, and that of the other side if there is one."""
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 
 
 @dataclass
 class Trial:
-    """What claims are tried with, since `begun` by the clock; `warnings` gets what a
-    reader has to know.
+    """Tests the claims of a suite.
+
+    Attributes:
+        context: context of the run.
+        suite: the suite.
+        begun: when it began, by `time.perf_counter`.
+        warnings: gets what a reader has to know.
     """
 
     context: RunContext[suites.SuiteConfig]
@@ -92,245 +100,273 @@ class Trial:
 
     @property
     def passed(self) -> float:
+        """The seconds since it began."""
         return time.perf_counter() - self.begun
 
     @property
     def seconds(self) -> float:
+        """The seconds after which nothing more begins; infinite without a limit."""
         return self.config.seconds or self.suite.seconds or math.inf
 
     @property
     def late(self) -> bool:
+        """Whether the time is over."""
         return self.passed >= self.seconds
 
     def claim(
-        self, asked: ClaimResult, claim: AnyClaim, config: SceneConfig
+        self, pending: ClaimResult, claim: AnyClaim, config: SceneConfig
     ) -> ClaimResult:
+        """Test a claim, and return its result.
+
+        Args:
+            pending: the result without a verdict.
+            claim: what is claimed.
+            config: settings of its pictures, or of its search.
+        """
         if isinstance(claim, ShareClaim | NoWorseClaim):
-            return self._by_pictures(asked, claim, config)
+            return self._test_by_pictures(pending, claim, config)
         assert isinstance(config, AttackConfig)
-        seconds = min(
-            max(0.001, self.seconds - self.passed), config.seconds or math.inf
-        )
-        shared = {"workers": self.config.workers, "cluster": self.config.cluster}
-        limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
-        own = config.model_copy(update=limited).with_only_here(config.only_here)
-        summary = self.context.run_part(asked.name, own)
+        return self._test_by_search(pending, config)
+
+    def _test_by_search(
+        self, pending: ClaimResult, config: AttackConfig
+    ) -> ClaimResult:
+        """Test by a search, which runs as a part of this run, that nothing breaks a model."""
+        remaining = max(0.001, self.seconds - self.passed)
+        seconds = min(remaining, config.seconds or math.inf)
+        changes = {
+            "workers": self.config.workers,
+            "cluster": self.config.cluster,
+            "seconds": seconds if math.isfinite(seconds) else None,
+        }
+        search = config.model_copy(update=changes).with_only_here(config.only_here)
+        summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
-        planned = own.model_copy(update={"steps": own.steps or summary.steps})
+        planned = search.model_copy(update={"steps": search.steps or summary.steps})
         verdict, reason, cause = words.search_verdict(summary, planned)
-        shown = "clean" if summary.ending == "already wrong" else "adversarial"
-        part = self.run.locate_part(self.run.path, asked.name)
-        picture = part / "images" / f"{shown}.png"
-        outcome: dict[str, Any] = {
-            "answer": verdict,
-            "reason": reason,
-            "cause": cause,
-            "part": asked.name,
-        }
-        outcome["pictures"] = sum(
+        image_name = "clean" if summary.ending == "already wrong" else "adversarial"
+        part = self.run.locate_part(self.run.path, pending.name)
+        image = part / "images" / f"{image_name}.png"
+        picture = None
+        if verdict == FAILED and image.is_file():
+            picture = image.relative_to(self.run.path).as_posix()
+        n_pictures = sum(
             count for name, count in summary.renders.items() if name != "products"
         )
-        is_kept = verdict == FAILED and picture.is_file()
-        outcome["picture"] = (
-            picture.relative_to(self.run.path).as_posix() if is_kept else None
+        return pending.model_copy(
+            update={
+                "answer": verdict,
+                "reason": reason,
+                "cause": cause,
+                "part": pending.name,
+                "pictures": n_pictures,
+                "picture": picture,
+            }
         )
-        return asked.model_copy(update=outcome)
 
-    def _by_pictures(
-        self, asked: ClaimResult, claim: ShareClaim | NoWorseClaim, config: SceneConfig
+    def _test_by_pictures(
+        self,
+        pending: ClaimResult,
+        claim: ShareClaim | NoWorseClaim,
+        config: SceneConfig,
     ) -> ClaimResult:
-        """Draw pictures until they decide: of the model alone, beside another model, or
-        beside what it says of the same pictures changed.
+        """Sample pictures until they decide a claim.
+
+        It is about the predictions of a model alone, or compared with those of another
+        model or about changed pictures.
         """
-        problem = self._problem(config)
-        kind = f"claim {asked.name}"
-        spp = spp_of(config)
+        problem = self._load_problem(config)
+        sequence = statistics.sequential.ConfidenceSequence(
+            self.suite.confidence, sides=1
+        )
+        values = list[float]()
+        wrong_payloads = list[Any]()
+        n_hidden = 0
+        verdict = UNDECIDED
+        worst: tuple[float, workbench.Query, str] | None = None
+        with self._open_evaluations(pending.name, claim, config, problem) as evaluated:
+            for query, evaluation, other in evaluated:
+                value, badness, text = score_picture(claim, evaluation, other)
+                if value is None:
+                    n_hidden += 1
+                    continue
+                if not evaluation.said.right:
+                    wrong_payloads.append(evaluation.said.payload)
+                sequence.add(value)
+                values.append(value)
+                if value == 0.0 and (worst is None or badness > worst[0]):
+                    worst = badness, query, text
+                verdict = _decide(sequence, threshold_mean(claim))
+                if verdict != UNDECIDED:
+                    break
+
+        example = ""
+        picture = None
+        if worst is not None:
+            _, query, text = worst
+            example = f"{text}: {self._describe(problem, query)}"
+            picture = self._save_picture(pending.name, problem, query)
+        is_late = verdict == UNDECIDED and self.late
+        reason = _picture_reason(
+            claim, verdict, values, sequence.interval, example, wrong_payloads, problem
+        )
+        if n_hidden:
+            reason += f"; the object is not to be seen in {n_hidden} more, which are not counted"
+        if is_late:
+            reason += f"; {TIME_OVER}"
+        return pending.model_copy(
+            update={
+                "answer": verdict,
+                "reason": reason,
+                "cause": Cause.OUT_OF_TIME if is_late else None,
+                "interval": _to_claim_scale(claim, *sequence.interval),
+                "pictures": len(values),
+                "spp": samples_per_pixel(config),
+                "rate": _to_claim_scale(claim, sequence.mean)[0] if values else None,
+                "picture": picture,
+            }
+        )
+
+    @contextmanager
+    def _open_evaluations(
+        self,
+        name: str,
+        claim: ShareClaim | NoWorseClaim,
+        config: SceneConfig,
+        problem: Problem,
+    ) -> Iterator[Iterator[Evaluated]]:
+        """Open the workers that evaluate sampled pictures, of one or of two models."""
         shared = AttackConfig.of(
             config, workers=self.config.workers, cluster=self.config.cluster
         )
         worker = ATTACK_WORKER
         other = problem
-        several = isinstance(claim, NoWorseClaim)
-        # to the other side; without, a picture of its own
-        shown: ChangePicture | None = None
+        # without, the other side gets a rendering of its own
+        change: ChangePicture | None = None
+        has_two_models = isinstance(claim, NoWorseClaim)
         if isinstance(claim, NoWorseClaim):
             worker = CLAIM_WORKER
-            other = self._problem(config.model_copy(update={"model": claim.than}))
+            other = self._load_problem(config.model_copy(update={"model": claim.than}))
             shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
             if other.renderer.formation == problem.renderer.formation:
-                shown = _same_picture
-        elif isinstance(
-            claim, ChangeClaim
-        ):  # judged by what was true before it was changed
-            shown = self._changed(claim, config, problem)
-        sequence = statistics.sequential.ConfidenceSequence(
-            self.suite.confidence, sides=1
-        )
-        least = least_mean(claim)
-        values = list[float]()
-        hidden = 0
-        verdict = UNDECIDED
-        worst: tuple[float, workbench.Query, str] | None = None
-        wrong_payloads: list[Any] = []
+                change = _same_picture
+        elif isinstance(claim, ChangeClaim):
+            # evaluated by what is true of the picture before the change
+            change = self._make_change(claim, config, problem)
         self.progress.stage(
-            asked.name,
+            name,
             claim.pictures,
             hint="fewer pictures in the suite shorten it",
             at_most=True,
         )
+        queries = sample_queries(
+            problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
+        )
         with workbench.executor_for(shared, worker, self.progress) as executor:
-            journal = workbench.Journal(
-                self.run, workbench.Shared(problem, executor, "0" if several else "")
-            )
-            beside = None
+            problem_name = "0" if has_two_models else ""
+            evaluator = workbench.Shared(problem, executor, problem_name)
+            journal = workbench.Journal(self.run, evaluator)
+            other_journal = None
             if not isinstance(claim, RightClaim):
-                shared_by_workers = (
-                    workbench.Shared(other, executor, "1")
-                    if several
-                    else workbench.Shared(other)
-                )
-                beside = workbench.Journal(self.run, shared_by_workers)
-            for query, own, its in self._pairs(
-                journal, drawn(problem, kind, claim.pictures, spp), beside, shown
-            ):
-                value, badness, text = valued(claim, own, its)
-                if value is None:
-                    hidden += 1
-                    continue
-                if not own.said.right:
-                    wrong_payloads.append(own.said.payload)
-                sequence.add(value)
-                values.append(value)
-                if value == 0.0 and (worst is None or badness > worst[0]):
-                    worst = badness, query, text
-                verdict = (
-                    HELD
-                    if sequence.is_over(least)
-                    else FAILED
-                    if sequence.is_under(least)
-                    else UNDECIDED
-                )
-                if verdict != UNDECIDED:
-                    break
-        example = ""
-        interval = sequence.interval
-        mean = sequence.mean
-        if worst is not None:
-            example = f"{worst[2]}: {self._described(problem, worst[1])}"
-        if isinstance(claim, NoWorseClaim):  # a mean of 1/2 is no difference
-            interval = (2.0 * interval[0] - 1.0, 2.0 * interval[1] - 1.0)
-            mean = 2.0 * mean - 1.0
-            counts = (len(values), values.count(1.0), values.count(0.0))
-            reason = words.difference_reason(verdict, counts, interval, claim.than)
-        else:
-            what = "right" if isinstance(claim, RightClaim) else "as claimed"
-            outcomes = ""
-            if isinstance(claim, RightClaim):
-                outcomes = wording.outcomes_text(
-                    workbench.count_outcomes(wrong_payloads), problem.task.name
-                )
-            reason = words.share_reason(
-                what,
-                verdict,
-                values.count(1.0),
-                len(values),
-                interval,
-                example,
-                outcomes,
-            )
-        reason += (
-            (f"; the object is not to be seen in {hidden} more, which are not counted")
-            if hidden
-            else ""
-        )
-        cause = Cause.OUT_OF_TIME if verdict == UNDECIDED and self.late else None
-        reason += f"; {TIME_OVER}" if cause is Cause.OUT_OF_TIME else ""
-        outcome: dict[str, Any] = {
-            "answer": verdict,
-            "reason": reason,
-            "cause": cause,
-            "interval": interval,
-        }
-        outcome |= {"pictures": len(values), "spp": spp}
-        outcome["rate"] = mean if values else None
-        outcome["picture"] = (
-            self._picture(asked.name, problem, worst[1]) if worst else None
-        )
-        return asked.model_copy(update=outcome)
+                other_evaluator = workbench.Shared(other)
+                if has_two_models:
+                    other_evaluator = workbench.Shared(other, executor, "1")
+                other_journal = workbench.Journal(self.run, other_evaluator)
+            yield self._evaluate_pairs(journal, queries, other_journal, change)
 
-    def _changed(
+    def _make_change(
         self, claim: ChangeClaim, config: SceneConfig, problem: Problem
     ) -> ChangePicture:
-        """Return what shows a model the changed picture of a query."""
+        """Return the function that changes the picture of a query as claimed."""
         if claim.when != workbench.AWAY:
             return lambda query, picture: workbench.changed(
                 picture, claim.when, problem.model.cameras
             )
-        other = self._problem(config)
+        other = self._load_problem(config)
         other.renderer.scene.assembly.away = True
         return lambda query, picture: other.picture(query.u, query.seed, query.spp)
 
-    def _pairs(
-        self, journal: workbench.Journal, queries: Iterator[workbench.Query], beside: workbench.Journal | None = None,
-        shown: ChangePicture | None = None,
-    ) -> Iterator[tuple[workbench.Query, policies.Evaluation, policies.Evaluation | None]]:  # fmt: skip
-        """Yield queries, as many at once as there are workers for, until the time is
-        over; with what is said of each, and what the other side says of what is `shown`
-        to it of this picture; without, of a picture of its own.
+    def _evaluate_pairs(
+        self,
+        journal: workbench.Journal,
+        queries: Iterator[workbench.Query],
+        other_journal: workbench.Journal | None = None,
+        change: ChangePicture | None = None,
+    ) -> Iterator[Evaluated]:
+        """Yield queries with their evaluations, until the time is over.
+
+        As many are evaluated at once as there are workers for.
+
+        Args:
+            journal: evaluates the queries.
+            queries: what to evaluate.
+            other_journal: evaluates the other side, if there is one.
+            change: makes the other side's picture of the first one; without it, the other
+                side renders its own.
         """
         pictures: dict[int, Tensor | None] = {}
 
-        def here(queries: Sequence[workbench.Query]) -> Iterator[policies.Evaluation]:
+        def evaluate(
+            queries: Sequence[workbench.Query],
+        ) -> Iterator[policies.Evaluation]:
             evaluations = journal.traced(
-                [replace(query, keep=shown is not None) for query in queries]
+                [replace(query, keep=change is not None) for query in queries]
             )
             for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
                 yield evaluation
 
-        def there(queries: Sequence[workbench.Query]) -> Iterable[policies.Evaluation]:
-            assert beside is not None
-            if shown is None:
-                yield from beside.traced(queries)
+        def evaluate_other(
+            queries: Sequence[workbench.Query],
+        ) -> Iterable[policies.Evaluation]:
+            assert other_journal is not None
+            if change is None:
+                yield from other_journal.traced(queries)
                 return
             problem = journal.traced.problem
-            other = beside.traced.problem
+            other = other_journal.traced.problem
             for query in queries:
-                # what was asked before is read back, without its picture
+                # an evaluation that was read back has no picture
                 picture = pictures.get(query.number)
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                yield policies.Evaluation.of(
-                    other.judge(shown(query, picture), other.whole(query.u))
-                )
+                judgement = other.judge(change(query, picture), other.whole(query.u))
+                yield policies.Evaluation.of(judgement)
 
-        at_once = (
-            1 if journal.traced.executor is None else AHEAD * (self.config.workers or 8)
-        )
-        while batch := list(islice(queries, at_once)):
+        batch_size = 1
+        if journal.traced.executor is not None:
+            batch_size = AHEAD * (self.config.workers or 8)
+        while batch := list(islice(queries, batch_size)):
             pictures.clear()
-            mine: Iterable[policies.Evaluation] = journal.evaluate_all(batch, here)
-            its: Iterable[policies.Evaluation | None] = repeat(None)
-            if beside is not None:
-                mine = list(mine)
-                its = beside.evaluate_all(
-                    [replace(query, kind=f"{query.kind} beside") for query in batch],
-                    there,
-                )
-            for query, own, other in zip(batch, mine, its, strict=False):
+            evaluations = journal.evaluate_all(batch, evaluate)
+            others: Iterable[policies.Evaluation | None] = repeat(None)
+            if other_journal is not None:
+                # all pictures are there before they are changed
+                evaluations = iter(list(evaluations))
+                other_queries = [
+                    replace(query, kind=f"{query.kind} beside") for query in batch
+                ]
+                others = other_journal.evaluate_all(other_queries, evaluate_other)
+            for query, evaluation, other in zip(
+                batch, evaluations, others, strict=False
+            ):
                 self.progress.advance(1, **journal.traced.told)
-                yield query, own, other
+                yield query, evaluation, other
             if self.late:
                 return
 
     def counterexample(
-        self, asked: ClaimResult, example: Counterexample, config: AttackConfig
+        self, pending: ClaimResult, example: Counterexample, config: AttackConfig
     ) -> ClaimResult:
-        """Try a counterexample: the model should be right on it. Trials by which it is
-        added are no trials of it.
+        """Test a counterexample: the model should be right on it.
+
+        Args:
+            pending: the result without a verdict.
+            example: the counterexample.
+            config: settings that it is tested with.
         """
-        asked = asked.model_copy(
+        pending = pending.model_copy(
             update={
                 "statement": f"{config.model} is right where it said {example.said}"
             }
@@ -339,122 +375,126 @@ class Trial:
             parts = workbench.parts_of(config)
             problem = workbench.problem_on(parts, differentiated=False)
         except InputError as error:
-            return asked.model_copy(
-                update={"reason": words.cannot_be_judged(str(error))}
-            )
-        if file := example.changed_file(config):
+            reason = words.cannot_be_judged(str(error))
+            return pending.model_copy(update={"reason": reason})
+        file = example.changed_file(config)
+        if file:
             reason = (
                 f"the file {file} is another one now; put it back, or remove the "
                 "counterexample"
             )
-            return asked.model_copy(update={"reason": reason})
+            return pending.model_copy(update={"reason": reason})
         if scene_digest(parts.scene.description) != example.scene:
             reason = (
                 "its scene is another one now; remove it, or add the adversarial "
                 "scene of a new run"
             )
-            return asked.model_copy(update={"reason": reason})
-        start = problem.domain.start
-        u = problem.domain.project(example.configuration(start))
-        over = is_over(config)
-        count = TRIALS[over]
-        kind = (
-            f"{'added ' if self.config.add is not None else ''}counterexample "
-            f"{example.name}"
-        )
+            return pending.model_copy(update={"reason": reason})
+        return self._test_by_trials(pending, example, problem, over=is_over(config))
+
+    def _test_by_trials(
+        self,
+        pending: ClaimResult,
+        example: Counterexample,
+        problem: Problem,
+        *,
+        over: bool,
+    ) -> ClaimResult:
+        """Test a counterexample by fresh renders; with `over`, under many conditions."""
+        u = problem.domain.project(example.configuration(problem.domain.start))
+        # trials by which it is added are not repeated as trials of the suite
+        prefix = "added " if self.config.add is not None else ""
+        kind = f"{prefix}counterexample {example.name}"
         journal = workbench.Journal(self.run, workbench.Shared(problem))
         outcomes = list[bool | None]()
-        wrong_payloads: list[Any] = []
+        wrong_payloads = list[Any]()
         label = ""
         picture: str | None = None
-        self.progress.stage(example.name, 4 * count if over else count, at_most=True)
-        for query, trial, clean in self._trials_of(
+        max_trials = 4 * TRIALS[over] if over else TRIALS[over]
+        self.progress.stage(example.name, max_trials, at_most=True)
+        for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, over=over
         ):
-            outcomes.append(outcome_of(trial, clean))
-            right = outcomes.count(True)
-            wrong = outcomes.count(False)
-            if outcomes[-1] is False:
+            outcome = outcome_of(trial, clean)
+            outcomes.append(outcome)
+            if outcome is False:
                 wrong_payloads.append(trial.payload)
-            if outcomes[-1] is False and not label:
-                label = trial.prediction.label
-                picture = self._picture(example.name, problem, query)
-            # of one scene, it depends on the noise then
-            if right + wrong == count or (right and wrong and not over):
+                if not label:
+                    label = trial.prediction.label
+                    picture = self._save_picture(example.name, problem, query)
+            if _has_enough_trials(outcomes, over=over):
                 break
-        right = outcomes.count(True)
-        wrong = outcomes.count(False)
-        verdict = decide_trials(right, wrong, over=over)
-        interval = (
-            statistics.intervals.clopper_pearson(right, right + wrong)
-            if right + wrong
-            else None
-        )
-        counts = (right, wrong, outcomes.count(None))
-        became = wording.outcomes_text(
-            workbench.count_outcomes(wrong_payloads), problem.task.name
-        )
-        reason = words.tried_reason(
-            verdict, counts, label, interval, over=over, outcomes=became
-        )
-        outcome: dict[str, Any] = {"pictures": len(outcomes), "spp": example.spp}
-        if self.late and right + wrong < count and not (right and wrong and not over):
-            verdict = UNDECIDED
-            reason = f"{reason}; {TIME_OVER}" if outcomes else TIME_OVER
-            outcome["cause"] = Cause.OUT_OF_TIME
-        outcome |= {"answer": verdict, "reason": reason}
-        outcome |= {
-            "picture": picture,
-            "rate": right / (right + wrong) if right + wrong else None,
-        }
-        return asked.model_copy(update={**outcome, "interval": interval})
 
-    def _trials_of(
+        update = _trials_result(outcomes, label, wrong_payloads, problem, over=over)
+        if self.late and not _has_enough_trials(outcomes, over=over):
+            update["answer"] = UNDECIDED
+            update["reason"] = (
+                f"{update['reason']}; {TIME_OVER}" if outcomes else TIME_OVER
+            )
+            update["cause"] = Cause.OUT_OF_TIME
+        update["picture"] = picture
+        update["spp"] = example.spp
+        return pending.model_copy(update=update)
+
+    def _run_trials(
         self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
     ) -> Iterator[tuple[workbench.Query, tasks.Judgement, tasks.Judgement | None]]:
-        """Yield trials of one configuration (d,), and of the clean scene in the same
-        conditions where these vary.
+        """Yield trials of a configuration (d,), with `over` also of the clean scene.
+
+        The clean scene is evaluated under the same conditions.
         """
         problem = journal.problem
         queries = list[workbench.Query]()
-        for number in range(2 * TRIALS[over]):
-            query = workbench.Query(
-                u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp
-            )
+        for index in range(2 * TRIALS[over]):
+            seed = seeds.stream(self.suite.seed, kind, index)
+            query = workbench.Query(u, seed, kind, index, spp=spp)
             queries.append(query)
             if over:
-                queries.append(
-                    replace(query, u=problem.domain.start, kind=f"{kind}, clean")
+                clean_query = replace(
+                    query, u=problem.domain.start, kind=f"{kind}, clean"
                 )
-        evaluated = self._pairs(journal, iter(queries))
+                queries.append(clean_query)
+        evaluated = self._evaluate_pairs(journal, iter(queries))
         for query, trial, _ in evaluated:
-            clean = next(evaluated, None) if over else None
-            if over and clean is None:
+            if not over:
+                yield query, trial.said, None
+                continue
+            clean = next(evaluated, None)
+            if clean is None:
                 return
-            yield query, trial.said, None if clean is None else clean[1].said
+            yield query, trial.said, clean[1].said
 
-    def _problem(self, config: SceneConfig) -> Problem:
+    def _load_problem(self, config: SceneConfig) -> Problem:
+        """Load scene, model and task; what there is to remark becomes a warning."""
         parts = workbench.parts_of(AttackConfig.of(config))
-        # without those of the task, which stand in the reason
+        # without the remarks of the task, which the reason has
         remarks = [*parts.loaded[1]]
         problem = workbench.problem_on(parts, differentiated=False)
         self.warnings += [*problem.space.notes(parts.scene.description), *remarks]
         return problem
 
-    def _picture(self, name: str, problem: Problem, query: workbench.Query) -> str:
+    def _save_picture(self, name: str, problem: Problem, query: workbench.Query) -> str:
+        """Save the picture of a query, and return its path inside the run."""
         picture = problem.picture(query.u, query.seed, query.spp, drawn=query.drawn)
         return self.run.save_image(name, picture).relative_to(self.run.path).as_posix()
 
-    def _described(self, problem: Problem, query: workbench.Query) -> str:
+    def _describe(self, problem: Problem, query: workbench.Query) -> str:
+        """Describe the first values of a configuration: ``pose.yaw 12.5 deg, ...``."""
         values = list(problem.describe(query.u, query.seed).items())
-        shown = []
+        texts = []
         for name, value in values[:MANY]:
             unit = "" if value["unit"] in ("1", "name") else f" {value['unit']}"
-            shown.append(f"{name} {wording.number_text(value['value'])}{unit}")
-        return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
+            texts.append(f"{name} {wording.number_text(value['value'])}{unit}")
+        if len(values) > MANY:
+            texts.append("...")
+        return ", ".join(texts)
 
 
 def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
+    """Return what a worker process calls for a claim about two models.
+
+    A model is loaded at its first use; requests name it by its index.
+    """
     models = settings.split_names(str(values["model"]))
 
     def load_problem(name: str) -> Problem:
@@ -464,44 +504,47 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
     return workbench.worker_call(cache(load_problem))
 
 
-def drawn(
+def sample_queries(
     problem: Problem, kind: str, count: int, spp: int
 ) -> Iterator[workbench.Query]:
-    """Draw configurations evenly from the whole space and budget, one after the other,
-    each with a seed of its own.
+    """Yield configurations sampled uniformly from the full space and budget.
+
+    Each has its own seed.
     """
-    for number in range(count):
+    for index in range(count):
         generator = torch.Generator().manual_seed(
-            seeds.stream(problem.seed, f"{kind} draw", number)
+            seeds.stream(problem.seed, f"{kind} draw", index)
         )
         (u,) = problem.domain.sample(generator)
-        seed = seeds.stream(problem.seed, kind, number)
+        seed = seeds.stream(problem.seed, kind, index)
         values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
         yield workbench.Query(
-            u, seed, kind, number, spp=spp, values=values, sought=False
+            u, seed, kind, index, spp=spp, values=values, sought=False
         )
 
 
-def least_mean(claim: ShareClaim | NoWorseClaim) -> float:
-    """Return what the mean of the draws, from 0 to 1, has to be over; of two models 1/2
-    is that both are as good.
+def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
+    """Return what the mean of the scores, from 0 to 1, has to exceed.
+
+    Of two models, a mean of 1/2 is that both are equally good.
     """
-    return (
-        claim.at_least if isinstance(claim, ShareClaim) else 0.5 - claim.points / 200.0
-    )
+    if isinstance(claim, ShareClaim):
+        return claim.at_least
+    return 0.5 - claim.points / 200.0
 
 
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
-    """Return what has to be said of a claim's number of pictures before any is made;
-    nothing where it is enough. An InputError where no predictions of so many pictures
-    could decide it, or only one way.
+    """Check a claim's number of pictures; return a remark, or "" if it is enough.
+
+    Raises:
+        InputError: if no predictions of so many pictures could decide it both ways.
     """
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
-    least = least_mean(claim)
+    threshold = threshold_mean(claim)
     needed = max(
         statistics.sequential.draws_needed(mean, confidence=confidence)
-        for mean in (least, 1.0 - least)
+        for mean in (threshold, 1.0 - threshold)
     )
     if claim.pictures < needed:
         raise InputError(
@@ -512,50 +555,162 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         )
     if not isinstance(claim, NoWorseClaim):
         return ""
-    alike = statistics.sequential.draws_needed(least, confidence=confidence, value=0.5)
-    if claim.pictures >= alike:
+    needed_if_equal = statistics.sequential.draws_needed(
+        threshold, confidence=confidence, value=0.5
+    )
+    if claim.pictures >= needed_if_equal:
         return ""
     return (
-        f"{name}: two models that predict alike are shown to be so by {alike} "
-        f"pictures, and it takes {claim.pictures}."
+        f"{name}: two models that predict alike are shown to be so by "
+        f"{needed_if_equal} pictures, and it takes {claim.pictures}."
     )
 
 
-def valued(
+def score_picture(
     claim: ShareClaim | NoWorseClaim,
-    own: policies.Evaluation,
-    its: policies.Evaluation | None,
+    evaluation: policies.Evaluation,
+    other: policies.Evaluation | None,
 ) -> tuple[float | None, float, str]:
-    """Return what a picture says for a claim, from 0 to 1, or None where the object is
-    not to be seen; how bad an example it is of what is against it, and which.
+    """Score a picture for a claim.
+
+    Args:
+        claim: what is claimed.
+        evaluation: evaluation of the model under test.
+        other: evaluation of the other side, if there is one.
+
+    Returns:
+        The score from 0 to 1, None if the object is out of view; how bad an example
+        against the claim it is; and a description of that.
     """
-    before = own.said.prediction
-    hidden_from_other = (
-        isinstance(claim, NoWorseClaim)
-        and its is not None
-        and its.said.prediction.is_out_of_view
-    )
+    before = evaluation.said.prediction
     # pictures of two sizes need not show the same
-    if before.is_out_of_view or hidden_from_other:
+    is_hidden_from_other = (
+        isinstance(claim, NoWorseClaim)
+        and other is not None
+        and other.said.prediction.is_out_of_view
+    )
+    if before.is_out_of_view or is_hidden_from_other:
         return None, 0.0, ""
-    if its is None:
-        badness = own.said.score if math.isfinite(own.said.score) else -math.inf
-        return (
-            float(own.said.right),
-            badness,
-            (f"most wrong where it says {before.label}"),
-        )
+    if other is None:
+        score = evaluation.said.score
+        badness = score if math.isfinite(score) else -math.inf
+        text = f"most wrong where it says {before.label}"
+        return float(evaluation.said.right), badness, text
     if isinstance(claim, ChangeClaim):
-        after = its.said.prediction
+        after = other.said.prediction
         text = f"{before.label} before and {after.label} after"
         return float(workbench.as_claimed(claim.claim, before, after)), 0.0, text
-    return (own.said.right - its.said.right + 1) / 2, 0.0, ""
+    return (evaluation.said.right - other.said.right + 1) / 2, 0.0, ""
+
+
+def _decide(
+    sequence: statistics.sequential.ConfidenceSequence, threshold: float
+) -> str:
+    """Return the verdict of a confidence sequence of the mean."""
+    if sequence.is_over(threshold):
+        return HELD
+    return FAILED if sequence.is_under(threshold) else UNDECIDED
+
+
+def _to_claim_scale(
+    claim: ShareClaim | NoWorseClaim, *means: float
+) -> tuple[float, ...]:
+    """Convert means of scores to fractions, or to differences of two models."""
+    if isinstance(claim, NoWorseClaim):  # a mean of 1/2 is no difference
+        return tuple(2.0 * mean - 1.0 for mean in means)
+    return means
+
+
+def _picture_reason(
+    claim: ShareClaim | NoWorseClaim,
+    verdict: str,
+    values: Sequence[float],
+    interval: tuple[float, float],
+    example: str,
+    wrong_payloads: Sequence[Any],
+    problem: Problem,
+) -> str:
+    """Describe why sampled pictures decide a claim, or don't.
+
+    Args:
+        claim: what is claimed.
+        verdict: HELD, FAILED or UNDECIDED.
+        values: scores of the pictures.
+        interval: interval of their mean.
+        example: the worst example against the claim.
+        wrong_payloads: payloads of the wrong predictions.
+        problem: the problem of the model under test.
+    """
+    if isinstance(claim, NoWorseClaim):
+        lower, upper = _to_claim_scale(claim, *interval)
+        counts = (len(values), values.count(1.0), values.count(0.0))
+        return words.difference_reason(verdict, counts, (lower, upper), claim.than)
+    what = "as claimed"
+    outcomes = ""
+    if isinstance(claim, RightClaim):
+        what = "right"
+        outcomes = wording.outcomes_text(
+            workbench.count_outcomes(wrong_payloads), problem.task.name
+        )
+    return words.share_reason(
+        what, verdict, values.count(1.0), len(values), interval, example, outcomes
+    )
+
+
+def _has_enough_trials(outcomes: Sequence[bool | None], *, over: bool) -> bool:
+    """Return whether further trials of a counterexample change nothing.
+
+    One scene that is right and wrong depends on the noise already.
+    """
+    n_right = outcomes.count(True)
+    n_wrong = outcomes.count(False)
+    depends_on_noise = n_right > 0 and n_wrong > 0 and not over
+    return depends_on_noise or n_right + n_wrong == TRIALS[over]
+
+
+def _trials_result(
+    outcomes: Sequence[bool | None],
+    label: str,
+    wrong_payloads: Sequence[Any],
+    problem: Problem,
+    *,
+    over: bool,
+) -> dict[str, Any]:
+    """Return what trials decide: fields of a `ClaimResult`."""
+    n_right = outcomes.count(True)
+    n_wrong = outcomes.count(False)
+    total = n_right + n_wrong
+    verdict = decide_trials(n_right, n_wrong, over=over)
+    interval = None
+    rate = None
+    if total:
+        interval = statistics.intervals.clopper_pearson(n_right, total)
+        rate = n_right / total
+    reason = words.tried_reason(
+        verdict,
+        (n_right, n_wrong, outcomes.count(None)),
+        label,
+        interval,
+        over=over,
+        outcomes=wording.outcomes_text(
+            workbench.count_outcomes(wrong_payloads), problem.task.name
+        ),
+    )
+    return {
+        "answer": verdict,
+        "reason": reason,
+        "pictures": len(outcomes),
+        "rate": rate,
+        "interval": interval,
+    }
 
 
 def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:
+    """Return the picture without a change, for another model."""
     return picture.clone()
 
 
-def spp_of(config: SceneConfig) -> int:
+def samples_per_pixel(config: SceneConfig) -> int:
+    """Return the samples per pixel of a claim's pictures."""
     assert isinstance(config, suites.DrawnConfig)
     return workbench.ladder_of(config.verify_spp, config.pixel_sampler)[0]

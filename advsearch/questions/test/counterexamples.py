@@ -1,5 +1,6 @@
-"""Adversarial scenes of runs that became tests: each a small file and a picture in a
-folder beside the suite.
+"""Counterexamples: adversarial scenes of runs as files that a suite tests again.
+
+Each is a small file and a picture in a directory next to the suite.
 """
 
 from __future__ import annotations
@@ -48,25 +49,34 @@ Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 FEW = 4096
 FINE = 1.0 / 32767.0
 COARSE = 1.0 / 255.0
-"""A block of up to so many numbers is kept in steps of `FINE`; a larger one, such as
-the texels of a texture, in one of `FORMS`, at best in steps of `COARSE`.
+"""Limits of quantization.
+
+A block of up to `FEW` values is stored in steps of `FINE`. A larger one, such as the
+texels of a texture, has one of `FORMS`, at best in steps of `COARSE`.
 """
 
 FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
-"""How the numbers of a large block are kept, the smallest first: whether each is only a
-step up, down or none, and the side of the squares of texels that have one.
+"""How the values of a large block are stored, the smallest form first.
+
+A form is whether a value is only its sign (a step up, down or none), and the side of
+the squares of texels that share a value.
 """
 
-PICTURE = ".jpg"  # how the name of the picture ends
-THUMBNAIL_SIDE = 128  # longest side of the picture, pixels
-LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
-MEMORY = 1 << 27  # bytes that unpacking one may take
-# fresh renders that try one, and one that has to hold under many conditions
+# suffix of the picture
+PICTURE = ".jpg"
+# longest side of the picture, pixels
+THUMBNAIL_SIDE = 128
+# maximum bytes of a file, and maximum values of a configuration
+LARGEST = 1 << 24
+# maximum bytes of memory to decompress a block
+MEMORY = 1 << 27
+# fresh renders that test a scene, and one under many conditions
 TRIALS = {False: 6, True: 20}
 
 OF_MODEL = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
-"""Settings that say which network is tested. They go together: all are the suite's
-where it names a model.
+"""Settings of the network under test.
+
+They go together: if the suite names a model, all are the suite's.
 """
 
 OF_SUITE = (
@@ -78,7 +88,7 @@ OF_SUITE = (
     "seconds",
     "log",
 )
-"""Settings that say how and where is worked."""
+"""Settings of how and where a run computes."""
 
 OF_SEARCH = (
     *(
@@ -94,18 +104,20 @@ OF_SEARCH = (
     ),
     *("aov", "printable", "spp", "verify_spp"),
 )
-"""Settings that say how the adversarial scene was searched for. The samples of its
-verification are kept apart.
+"""Settings of the search for the adversarial scene.
+
+The samples of its verification are stored separately.
 """
 
 NOT_DECIDING = frozenset({*OF_SUITE, *OF_SEARCH, "ask"})
-"""The only settings of a run that are not kept with its adversarial scene. Every other
-one may decide a verdict, so that a new setting is kept until somebody lists it here.
+"""The only settings of a run that are not stored with its adversarial scene.
+
+Every other one may decide a verdict; a new setting is stored unless it is listed here.
 """
 
 
 class _Block(BaseModel):
-    """How far some numbers are from the clean scene's, in steps; see `FORMS`."""
+    """Quantized offsets of some values from the clean scene; see `FORMS`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     numbers: int = Field(ge=1, le=LARGEST)
@@ -116,63 +128,84 @@ class _Block(BaseModel):
 
     @classmethod
     def of(cls, moved: Floats, signs: bool, square: int) -> _Block:
-        """Keep numbers (n,); squares are those of a texture (side, side, 3), and of
-        nothing else.
+        """Quantize and compress offsets (n,).
+
+        Args:
+            moved: the offsets.
+            signs: whether to store only signs; ignored for few values.
+            square: side of the squares of texels that share a value; ignored unless they
+                tile a texture (side, side, 3).
         """
-        few = len(moved) <= FEW
+        is_small = len(moved) <= FEW
         side = isqrt(len(moved) // 3)
-        step = FINE if few else float(np.abs(moved).max()) if signs else COARSE
-        square = (
-            square
-            if not few and 3 * side * side == len(moved) and side % square == 0
-            else 1
-        )
+        is_texture = not is_small and 3 * side * side == len(moved)
+        if not is_texture or side % square != 0:
+            square = 1
+        step = COARSE
+        if is_small:
+            step = FINE
+        elif signs:
+            step = float(np.abs(moved).max())
         if square > 1:
             squares = moved.reshape(side // square, square, side // square, square, 3)
             moved = squares.mean(axis=(1, 3)).ravel()
         steps = np.round(moved / (step or 1.0)).astype("<i2")
         data = steps.tobytes()
-        if signs and not few:  # three numbers from -1 to 1 in each byte
-            threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3) @ (9, 3, 1) + 13
-            data = threes.astype(np.uint8).tobytes()
-        packed = base64.b85encode(lzma.compress(data, lzma.FORMAT_ALONE)).decode(
-            "ascii"
-        )
-        numbers = len(moved) * square**2
+        if signs and not is_small:
+            data = _pack_signs(steps)
+        compressed = lzma.compress(data, lzma.FORMAT_ALONE)
         return cls(
-            numbers=numbers,
+            numbers=len(moved) * square**2,
             step=step or 1.0,
-            signs=not few and signs,
+            signs=not is_small and signs,
             square=square,
-            offsets=packed,
+            offsets=base64.b85encode(compressed).decode("ascii"),
         )
 
     def moved(self) -> Floats:
-        """Return the numbers, (n,) float32; a ValueError or an LZMAError where they are
-        damaged.
+        """Return the offsets, (n,) float32.
+
+        Raises:
+            ValueError, LZMAError: if they are corrupt.
         """
-        size = self.numbers // self.square**2
-        side = isqrt(self.numbers // 3)
-        unpack = lzma.LZMADecompressor(memlimit=MEMORY)
-        data = unpack.decompress(base64.b85decode(self.offsets), 2 * size + 1)
-        if len(data) != (-(-size // 3) if self.signs else 2 * size):
-            raise ValueError(f"expected {size} numbers, got others")
-        steps = np.frombuffer(data, np.uint8 if self.signs else "<i2")
+        n_steps = self.numbers // self.square**2
+        n_bytes = -(-n_steps // 3) if self.signs else 2 * n_steps
+        decompressor = lzma.LZMADecompressor(memlimit=MEMORY)
+        # more than what is expected shows that it is another block
+        max_bytes = 2 * n_steps + 1
+        data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
+        if len(data) != n_bytes:
+            raise ValueError(f"expected {n_steps} numbers, got others")
         if self.signs:
-            threes = np.stack([steps // 9, steps // 3 % 3, steps % 3], axis=1).astype(
-                np.int16
-            )
-            steps = (threes - 1).ravel()[:size]
+            steps = _unpack_signs(data, n_steps)
+        else:
+            steps = np.frombuffer(data, "<i2")
         if self.square > 1:
+            side = isqrt(self.numbers // 3)
             squares = steps.reshape(side // self.square, side // self.square, 3)
-            steps = (
-                squares.repeat(self.square, axis=0).repeat(self.square, axis=1).ravel()
-            )
+            texels = squares.repeat(self.square, axis=0).repeat(self.square, axis=1)
+            steps = texels.ravel()
         moved: Floats = steps.astype(np.float32) * np.float32(self.step)
         return moved
 
 
+def _pack_signs(steps: np.ndarray[Any, Any]) -> bytes:
+    """Pack three values from -1 to 1 into each byte, as digits of base 3."""
+    threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3)
+    packed = threes @ (9, 3, 1) + 13
+    return bytes(packed.astype(np.uint8).tobytes())
+
+
+def _unpack_signs(data: bytes, n_steps: int) -> np.ndarray[Any, Any]:
+    """Unpack values (n,) from -1 to 1 that `_pack_signs` has packed."""
+    packed = np.frombuffer(data, np.uint8)
+    digits = np.stack([packed // 9, packed // 3 % 3, packed % 3], axis=1)
+    return (digits.astype(np.int16) - 1).ravel()[:n_steps]
+
+
 class _File(BaseModel):
+    """The content of a counterexample's file."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
     schema_: int = Field(alias="schema", ge=1, le=1)
     run: str
@@ -186,10 +219,17 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Counterexample:
-    """The adversarial scene of a run: its file, beside which its picture is; what it
-    was found with; what the model `said` of it; SHA-256 of the files that its settings
-    name, by name; digest of the scene; samples a pixel that it was verified with; and
-    how far each number (d,) float32 is `moved` from the clean scene's.
+    """The adversarial scene of a run, as a file with a picture next to it.
+
+    Attributes:
+        name: name of the file.
+        path: the file.
+        config: settings that it was found with.
+        said: the wrong prediction.
+        files: SHA-256 of the files that its settings name, by name.
+        scene: digest of the scene.
+        spp: samples per pixel that it was verified with.
+        moved: offset (d,) float32 of each value from the clean scene's.
     """
 
     name: str
@@ -202,34 +242,35 @@ class Counterexample:
     moved: Floats
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return what tries it: its own settings, but for the network under test and
-        how the suite works. Raises InputError where its settings do not fit to that
-        network.
+        """Return the settings that test it: its own, with the suite's network and machine.
+
+        Raises:
+            InputError: if its settings do not suit that network.
         """
         changed = {name: value for name, value in changes.items() if value is not None}
-        network = {
-            name: value
-            for name, value in {**suite.settings, **changed}.items()
-            if name in OF_MODEL
-        }
+        merged = {**suite.settings, **changed}
+        network = {name: value for name, value in merged.items() if name in OF_MODEL}
+        replaced = (*OF_SUITE, *OF_MODEL)
         if "model" not in network:
             network = {}
-        replaced = (*OF_SUITE, *OF_MODEL) if network else OF_SUITE
-        declared = settings.settings(AttackConfig)
+            replaced = OF_SUITE
         defaults = {
             setting.name: setting.default
-            for setting in declared
+            for setting in settings.settings(AttackConfig)
             if setting.name in replaced
         }
         return AttackConfig(**{**self.config.plain(), **defaults, **network, **changed})
 
     def changed_file(self, config: AttackConfig) -> str | None:
-        """Return the name of a file that its settings name and that is another one now;
-        None where all are the same.
-        """
+        """Return the name of a file in its settings that has changed, None if none has."""
         return directory.summary.changed_file(self.files, deciding_settings(config))
 
     def configuration(self, start: Tensor) -> Tensor:
+        """Return the configuration (d,) in [0, 1], from that of the clean scene.
+
+        Raises:
+            InputError: if the scene has another number of values by now.
+        """
         if start.numel() != len(self.moved):
             raise InputError(
                 f"{self.path}: has {len(self.moved)} numbers, and its scene has "
@@ -240,29 +281,26 @@ class Counterexample:
 
 
 def folder_of(suite: str) -> Path:
+    """Return the directory of a suite's counterexamples."""
     return Path(suite).with_suffix(".counterexamples")
 
 
 def scene_digest(described: SceneDescription) -> str:
+    """Return the SHA-256 of a scene's geometry, texture, light and values."""
     digest = hashlib.sha256()
     mesh = described.object.mesh
     light = described.environment
-    for array in (
-        mesh.vertices,
-        mesh.faces,
-        mesh.uvs,
-        described.object.base_color,
-        light.radiance if light else None,
-    ):
-        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    radiance = light.radiance if light else None
+    base_color = described.object.base_color
+    for array in (mesh.vertices, mesh.faces, mesh.uvs, base_color, radiance):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(json.dumps(sorted(described.given_values.items())).encode())
     return digest.hexdigest()
 
 
 def deciding_settings(config: AttackConfig) -> dict[str, Any]:
-    """Return the settings that decide a verdict, but for the network, as JSON
-    values.
-    """
+    """Return the settings that decide a verdict, without the network, as JSON values."""
     left_out = NOT_DECIDING | {*OF_MODEL}
     return {
         name: value for name, value in config.plain().items() if name not in left_out
@@ -270,27 +308,27 @@ def deciding_settings(config: AttackConfig) -> dict[str, Any]:
 
 
 def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with the files below the current folder relative to it, so that a
-    suite can be moved.
+    """Return settings with files relative to the working directory, if they are in it.
+
+    So a suite can be moved with its files.
     """
-    here = os.getcwd()
+    working_directory = os.getcwd()
     relative = dict(values)
     for name in settings.FILES:
         path = relative.get(name)
-        if (
-            isinstance(path, str)
-            and os.path.isabs(path)
-            and Path(path).is_relative_to(here)
-        ):
-            relative[name] = os.path.relpath(path, here)
+        if not isinstance(path, str) or not os.path.isabs(path):
+            continue
+        if Path(path).is_relative_to(working_directory):
+            relative[name] = os.path.relpath(path, working_directory)
     return relative
 
 
 def outcome_of(
     trial: tasks.Judgement, clean: tasks.Judgement | None = None
 ) -> bool | None:
-    """Return whether the model is right in a trial, or None where the trial does not
-    count: nothing of the object is in the picture, or the model is wrong on the clean
+    """Return whether the model is right in a trial, None if the trial does not count.
+
+    It does not count if the object is out of view, or the model is wrong on the clean
     scene under the same conditions.
     """
     if trial.prediction.is_out_of_view or (clean is not None and not clean.right):
@@ -302,54 +340,53 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
     """Return the verdict of the trials that count.
 
     One scene is held if all are right, and failed if all are wrong. Over conditions a
-    run is found by 90 % of them, so it is held if the model is right in so many, and
-    failed if it is wrong in more than half with 95 % confidence.
+    run counts as found at a rate of 90 %, so the scene is held if the model is right in
+    as many, and failed if it is wrong in more than half with 95 % confidence.
     """
     total = right + wrong
     if not over:
         if total < TRIALS[over] or (right and wrong):
             return UNDECIDED
         return HELD if right else FAILED
-    if (
-        total
-        and statistics.intervals.clopper_pearson(wrong, total)[0]
-        >= workbench.LEAST_RATE
-    ):
-        return FAILED
-    enough = total >= workbench.OVER_CONDITIONS.fewest
-    return (
-        HELD
-        if enough and right >= workbench.OVER_CONDITIONS.share(total)
-        else UNDECIDED
-    )
+    if total:
+        lower, _ = statistics.intervals.clopper_pearson(wrong, total)
+        if lower >= workbench.LEAST_RATE:
+            return FAILED
+    rule = workbench.OVER_CONDITIONS
+    if total >= rule.fewest and right >= rule.share(total):
+        return HELD
+    return UNDECIDED
 
 
 def _is_wrong_on(
     example: Counterexample, problem: Problem, trials: int, *, over: bool
 ) -> bool:
-    """Whether the run's own model fails on what is kept, by trials with fresh seeds."""
+    """Return whether the run's own model fails on the stored scene, with fresh seeds."""
     start = problem.domain.start
     u = problem.domain.project(example.configuration(start))
     outcomes = list[bool | None]()
-    for number in range(trials):
-        seed = seeds.stream(problem.seed, "kept", number)
-        judged = [
-            problem.judge(
-                problem.picture(at, seed, example.spp), problem.whole(at, seed)
-            )
-            for at in ([u, start] if over else [u])
-        ]
-        outcomes.append(outcome_of(*judged))
+    for index in range(trials):
+        seed = seeds.stream(problem.seed, "kept", index)
+        judgements = []
+        for configuration in [u, start] if over else [u]:
+            picture = problem.picture(configuration, seed, example.spp)
+            full = problem.whole(configuration, seed)
+            judgements.append(problem.judge(picture, full))
+        outcomes.append(outcome_of(*judgements))
         if outcomes[-1] and not over:
             return False
-    return (
-        decide_trials(outcomes.count(True), outcomes.count(False), over=over) == FAILED
-    )
+    n_right = outcomes.count(True)
+    n_wrong = outcomes.count(False)
+    return decide_trials(n_right, n_wrong, over=over) == FAILED
 
 
 def add(suite: str, run: str) -> Counterexample:
-    """Keep the adversarial scene of a run as a counterexample of a suite; an InputError
-    where the run found nothing, or its scene is none.
+    """Store the adversarial scene of a run as a counterexample of a suite.
+
+    It has the smallest form in which the run's own model still fails on it.
+
+    Raises:
+        InputError: if the run found nothing, or its scene is no counterexample.
     """
     path = directory.find_run(run)
     summary = workbench.attack_of(path)
@@ -365,63 +402,84 @@ def add(suite: str, run: str) -> Counterexample:
         )
     parts = workbench.parts_in(path)
     problem, _ = workbench.problem_of_parts(parts)
-    moved = (workbench.kept_configuration(path, problem) - problem.domain.start).numpy()
-    folder = folder_of(suite)
-    study = path.parent.parent
-    is_part = path == RunDirectory.locate_part(study, path.name)
-    name = _make_name(study.name, path.name) if is_part else _make_name(path.name)
+    configuration = workbench.kept_configuration(path, problem)
+    offsets = (configuration - problem.domain.start).numpy()
     config = parts.config.to_repeat()
-    kept = {
+    stored_settings = {
         name: value
         for name, value in config.plain().items()
         if name not in NOT_DECIDING
     }
+    deciding = relative_to_here(deciding_settings(config))
     values: dict[str, Any] = {
         "schema": 1,
         "run": path.name,
         "said": next(iter(summary.verified.labels), ""),
-    }
-    values["settings"] = relative_to_here(kept)
-    values["files"] = directory.summary.file_digests(
-        relative_to_here(deciding_settings(config))
-    )
-    values |= {
+        "settings": relative_to_here(stored_settings),
+        "files": directory.summary.file_digests(deciding),
         "scene": scene_digest(parts.scene.description),
         "spp": summary.verified.spp,
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    writing.write_bytes(
-        folder / f"{name}{PICTURE}",
-        _make_thumbnail(path / "images" / "adversarial.png"),
-    )
-    blocks = [block.size for block in problem.domain.blocks]
-    forms = FORMS if max(blocks) > FEW else FORMS[-1:]
-    over = is_over(config)
-    # of one scene twice as many as will try it
+    base = folder_of(suite) / _name_counterexample(path)
+    base.parent.mkdir(parents=True, exist_ok=True)
+    thumbnail = _make_thumbnail(path / "images" / "adversarial.png")
+    writing.write_bytes(base.with_name(f"{base.name}{PICTURE}"), thumbnail)
+    return _write_smallest(base, values, offsets, problem, over=is_over(config))
+
+
+def _write_smallest(
+    base: Path,
+    values: Mapping[str, Any],
+    offsets: Floats,
+    problem: Problem,
+    *,
+    over: bool,
+) -> Counterexample:
+    """Write the smallest form of a counterexample on which the model fails.
+
+    Args:
+        base: path of the file without suffix.
+        values: content of the file except for the blocks.
+        offsets: offsets (d,) from the clean scene.
+        problem: the problem of the run.
+        over: whether conditions vary.
+    """
+    block_sizes = [block.size for block in problem.domain.blocks]
+    blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
+    forms = FORMS if max(block_sizes) > FEW else FORMS[-1:]
+    # one scene is tested twice as often as the suite will test it
     trials = TRIALS[over] if over else 2 * TRIALS[over]
     for form in forms:
-        parted = [
-            _Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])
-        ]
-        text = json.dumps(
-            {**values, "blocks": [block.model_dump() for block in parted]}, indent=1
-        )
-        example = _read(writing.write_text(folder / f"{name}.json", text + "\n"))
+        stored = [_Block.of(block, *form).model_dump() for block in blocks]
+        text = json.dumps({**values, "blocks": stored}, indent=1)
+        path = writing.write_text(base.with_name(f"{base.name}.json"), text + "\n")
+        example = _read(path)
         if form == forms[-1] or _is_wrong_on(example, problem, trials, over=over):
             break
     return example
 
 
+def _name_counterexample(run: Path) -> str:
+    """Name the counterexample of a run; that of a part begins with the full run's."""
+    parent = run.parent.parent
+    if run == RunDirectory.locate_part(parent, run.name):
+        return _make_name(parent.name, run.name)
+    return _make_name(run.name)
+
+
 def _make_name(*names: str) -> str:
     """Return a name for a file: ``mug-texture-001`` of the run ``mug-texture-001``."""
     words = [Path(names[0]).stem, *names[1:]]
-    return (
-        re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
-    )
+    name = re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")
+    return name[:80] or "attack"
 
 
 def _make_thumbnail(path: Path) -> bytes:
-    """Return a small JPEG of a PNG picture. Raises FileFormatError: it is damaged."""
+    """Return a small JPEG of a PNG picture.
+
+    Raises:
+        FileFormatError: if the picture is corrupt.
+    """
     buffer = io.BytesIO()
     try:
         with Image.open(path, formats=("PNG",)) as image:
@@ -436,11 +494,13 @@ def _make_thumbnail(path: Path) -> bytes:
 
 
 def remove(example: Counterexample) -> None:
+    """Delete the files of a counterexample."""
     example.path.unlink(missing_ok=True)
     example.path.with_suffix(PICTURE).unlink(missing_ok=True)
 
 
 def counterexamples(suite: str) -> list[Counterexample]:
+    """Read the counterexamples of a suite, sorted by name."""
     folder = folder_of(suite)
     return [
         _read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED
@@ -448,13 +508,15 @@ def counterexamples(suite: str) -> list[Counterexample]:
 
 
 def _read(path: Path) -> Counterexample:
+    """Read a counterexample.
+
+    Raises:
+        FileFormatError: if the file is none, or corrupt.
+    """
     try:
-        kept = _File.model_validate(
-            stored_files.parse_json(
-                stored_files.read_text(path, "a counterexample", LARGEST)
-            )
-        )
-        moved = np.concatenate([block.moved() for block in kept.blocks])
+        text = stored_files.read_text(path, "a counterexample", LARGEST)
+        content = _File.model_validate(stored_files.parse_json(text))
+        offsets = np.concatenate([block.moved() for block in content.blocks])
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
@@ -466,37 +528,46 @@ def _read(path: Path) -> Counterexample:
             f"{path}: expected a counterexample, got {str(error)[:80]}; remove it"
         ) from None
     try:
-        config = AttackConfig(**kept.settings)
+        config = AttackConfig(**content.settings)
     except InputError as error:
         raise errors.FileFormatError(f"{path}: settings: {error}") from None
     return Counterexample(
-        path.stem, path, config, kept.said, kept.files, kept.scene, kept.spp, moved
+        path.stem,
+        path,
+        config,
+        content.said,
+        content.files,
+        content.scene,
+        content.spp,
+        offsets,
     )
 
 
-# what claims said when that was accepted, where they were not held
+# file of the accepted verdicts of claims that are not held
 EXPECTED = "expected.json"
 
 
 def read_expected(suite: str) -> dict[str, str]:
-    """Return what is expected of claims that are not to be held; a FileFormatError
-    where the file is damaged.
+    """Read the expected verdicts of claims that are not expected to be held.
+
+    Raises:
+        FileFormatError: if the file is corrupt.
     """
     path = folder_of(suite) / EXPECTED
     if not path.is_file():
         return {}
     try:
-        values = stored_files.parse_json(
-            stored_files.read_text(path, "what is expected of a suite", LARGEST)
-        )
+        text = stored_files.read_text(path, "what is expected of a suite", LARGEST)
+        values = stored_files.parse_json(text)
     except (OSError, ValueError) as error:
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it"
         ) from None
     verdicts = values.get("expected") if isinstance(values, dict) else None
-    if not isinstance(verdicts, dict) or not set(map(str, verdicts.values())) <= set(
+    is_valid = isinstance(verdicts, dict) and set(map(str, verdicts.values())) <= set(
         VERDICTS
-    ):
+    )
+    if not isinstance(verdicts, dict) or not is_valid:
         raise errors.FileFormatError(
             f"{path}: expected verdicts by claim, got something else; remove it"
         )
@@ -504,25 +575,22 @@ def read_expected(suite: str) -> dict[str, str]:
 
 
 def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
-    """Expect these verdicts from now on, and return what changes, in words."""
+    """Store verdicts as expected, and return a sentence for each change."""
     before = read_expected(suite)
-    folder = folder_of(suite)
-    kept = {
-        name: verdict
-        for name, verdict in sorted({**before, **verdicts}.items())
-        if verdict != HELD
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    writing.write_text(
-        folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n"
-    )
-    changed = {
-        name: (before.get(name, HELD), verdict) for name, verdict in verdicts.items()
-    }
-    return [
-        f"{name}: {was} -> {now}" for name, (was, now) in changed.items() if was != now
-    ]
+    merged = sorted({**before, **verdicts}.items())
+    stored = {name: verdict for name, verdict in merged if verdict != HELD}
+    path = folder_of(suite) / EXPECTED
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"schema": 1, "expected": stored}, indent=1)
+    writing.write_text(path, text + "\n")
+    changes = []
+    for name, verdict in verdicts.items():
+        previous = before.get(name, HELD)
+        if previous != verdict:
+            changes.append(f"{name}: {previous} -> {verdict}")
+    return changes
 
 
 def is_over(config: SceneConfig) -> bool:
+    """Return whether settings vary conditions."""
     return bool(getattr(config, "over", {}))

@@ -1,6 +1,4 @@
-"""What a run of `test` noted of the settings of its claims and counterexamples, for
-`advsearch report`.
-"""
+"""Settings of claims and counterexamples that a run of `test` noted, for `report`."""
 
 from __future__ import annotations
 
@@ -12,20 +10,19 @@ from typing import Any
 from advsearch.extend import Store
 from advsearch.questions.test.result import Cause, SuiteResult
 
-# under which a run's store keeps the suite with its seed, so that it goes on as it
-# began
+# note of a run's store with the suite and its seed, so that a resumed run repeats it
 SUITE_NOTE = "suite"
-# under which it keeps what counterexamples are judged with, by name
+# note with the settings of counterexamples by name
 SETTINGS_NOTE = "counterexamples"
 
 
 def noted_settings(
     run: Path, result: SuiteResult
 ) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """Return the settings of each claim and counterexample that was tried, by "claim"
-    or "counterexample" and name.
+    """Return the settings of each claim and counterexample that was tested.
 
-    "claim" is missing where the suite cannot be read any more.
+    They are by "claim" or "counterexample", and by name. "claim" is missing if the
+    noted suite cannot be read.
     """
     with Store.open_to_read(run) as store:
         suite = store.noted(SUITE_NOTE)
@@ -49,17 +46,14 @@ def noted_settings(
 
 
 def _settings_of_claims(suite: Any) -> dict[str, Mapping[str, Any]]:
-    """Return what each claim of a suite is judged with. Raises KeyError, TypeError,
-    ...: the suite is damaged.
+    """Return the settings that each claim of a suite is tested with.
+
+    Raises:
+        KeyError, TypeError, AttributeError, ValueError: if the suite is corrupt.
     """
     common = {name: suite[name] for name in ("seed", "confidence") if name in suite}
     settings: dict[str, Mapping[str, Any]] = {}
     for name, claim in suite["claims"].items():
-        of_claim = {key: value for key, value in claim.items() if key != "settings"}
-        settings[name] = {
-            **common,
-            **suite["settings"],
-            **of_claim,
-            **claim["settings"],
-        }
+        fields = {key: value for key, value in claim.items() if key != "settings"}
+        settings[name] = {**common, **suite["settings"], **fields, **claim["settings"]}
     return settings

@@ -1,4 +1,4 @@
-"""The result of `test`."""
+"""The result of `test`: verdicts with reasons, and formats for other programs."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ HELD = "held"
 UNDECIDED = "undecided"
 FAILED = "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
-# exit status of the command, by what the suite says as a whole
+# exit status of the command by the verdict of the suite
 STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
 
 
 class Cause(str, Enum):
-    """Why a claim is undecided, where its pictures are not the reason."""
+    """Why a claim is undecided other than by its pictures."""
 
     COUNTEREXAMPLE_FAILED = "counterexample failed"
     INTERRUPTED = "interrupted"
@@ -53,7 +53,7 @@ class Cause(str, Enum):
 
 
 class ClaimResult(results.Fields):
-    """One claim, or one counterexample, and what came out."""
+    """The result of a claim or of a counterexample."""
 
     name: str = Field(description="in the suite; of a counterexample, its file's")
     kind: str = Field(
@@ -96,11 +96,12 @@ class ClaimResult(results.Fields):
 
     @property
     def accepted(self) -> bool:
+        """Whether the verdict is at least as good as expected."""
         return VERDICTS.index(self.answer) <= VERDICTS.index(self.expected)
 
 
 class SuiteResult(views.InNotebook, RunResult):
-    """What the claims of a suite came to."""
+    """The results of the claims of a suite."""
 
     command: ClassVar[str] = "test"
 
@@ -126,20 +127,22 @@ class SuiteResult(views.InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
+        """The number of claims by verdict: ``3 held, 1 failed``."""
         answers = [claim.answer for claim in self.claims]
-        counts = {
-            verdict: answers.count(verdict) for verdict in (HELD, FAILED, UNDECIDED)
-        }
-        return ", ".join(
-            f"{count} {verdict}" for verdict, count in counts.items() if count
-        )
+        texts = []
+        for name in (HELD, FAILED, UNDECIDED):
+            if name in answers:
+                texts.append(f"{answers.count(name)} {name}")
+        return ", ".join(texts)
 
     @property
     def status(self) -> int:
+        """The exit status of the command."""
         return 0 if self.added is not None else STATUS[self.answer]
 
 
 def verdict(claims: list[ClaimResult]) -> str:
+    """Return the worst verdict among claims that are worse than expected, else HELD."""
     return max(
         (claim.answer for claim in claims if not claim.accepted),
         key=VERDICTS.index,
@@ -162,69 +165,66 @@ NOT_YET = "not tried yet"
 
 
 def shown(result: SuiteResult) -> ShownResult:
-    runs = [claim.part for claim in result.claims]
+    """Lay out a result: a table of the claims, then each that is not held."""
     sections = [
         ResultPart(
             "The claims",
             heads=TABLE_HEADS,
             rows=table_rows(result),
             note=NOTE,
-            parts=runs,
+            parts=[claim.part for claim in result.claims],
         )
     ]
     for claim in result.claims:
-        if claim.answer != HELD and claim.cause is not Cause.COUNTEREXAMPLE_FAILED:
+        if claim.answer == HELD or claim.cause is Cause.COUNTEREXAMPLE_FAILED:
+            continue
+        pictures = []
+        if claim.picture:
             caption = f"{claim.statement}: {claim.answer}. {claim.reason}."
-            pictures = (
-                [[views.Picture(claim.picture, caption)]] if claim.picture else []
-            )
-            sections.append(
-                ResultPart(
-                    claim.name, rows=[["repeat", claim.repeat]], pictures=pictures
-                )
-            )
+            pictures.append([views.Picture(claim.picture, caption)])
+        rows = [["repeat", claim.repeat]]
+        sections.append(ResultPart(claim.name, rows=rows, pictures=pictures))
     sections.append(ResultPart("Expected from now on", result.changes))
-    about = [Path(result.suite).name, result.object, result.model]
-    return ShownResult(
-        f"{result.title}. {suite_text(result)}", sections, facts(result), about
-    )
+    subject = [Path(result.suite).name, result.object, result.model]
+    summary = f"{result.title}. {suite_text(result)}"
+    return ShownResult(summary, sections, facts(result), subject)
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
+    """Describe what is claimed in a sentence."""
+    model = wording.short_name(config.model)
     what = f"{wording.short_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
-        spanned = "the frames" if "path" in config.controls else "the pictures"
+        pictures = "the frames" if "path" in config.controls else "the pictures"
         share = (
-            f"at least {wording.percent(claim.at_least)} of {spanned} that the "
+            f"at least {wording.percent(claim.at_least)} of {pictures} that the "
             "ranges span"
         )
-        return f"{wording.short_name(config.model)} is right in {share}: {what}"
+        return f"{model} is right in {share}: {what}"
     if isinstance(claim, ChangeClaim):
-        says = (
-            "says something else" if claim.claim == "must_change" else "says the same"
-        )
+        says = "says the same"
+        if claim.claim == "must_change":
+            says = "says something else"
         changes = {**SweepConfig.blind_changes, **SweepConfig.harmless_changes}
         when = (
             f"{changes[claim.when]}, in at least {wording.percent(claim.at_least)} "
             "of pictures"
         )
-        return f"{wording.short_name(config.model)} {says} when {when}: {what}"
+        return f"{model} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
         points = f"{wording.number_text(claim.points)} points"
-        model = wording.short_name(config.model)
         other = wording.short_name(claim.than)
-        models = f"{model} is right at most {points} less often than {other}"
-        return f"{models} on the same pictures of {what}"
+        return (
+            f"{model} is right at most {points} less often than {other} "
+            f"on the same pictures of {what}"
+        )
     epsilon = getattr(config, "epsilon", None)
-    within = (
-        ""
-        if epsilon is None
-        else f" within {wording.number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
-    )
-    return (
-        f"no search finds a picture that {wording.short_name(config.model)} gets "
-        f"wrong: {what}{within}"
-    )
+    budget = ""
+    if isinstance(epsilon, float):
+        budget = f" within {wording.number_text(epsilon)}"
+    elif epsilon is not None:
+        budget = f" within {epsilon}"
+    return f"no search finds a picture that {model} gets wrong: {what}{budget}"
 
 
 def share_reason(
@@ -236,105 +236,104 @@ def share_reason(
     worst: str,
     outcomes: str = "",
 ) -> str:
-    """Return why a claim about a share is held, failed or undecided, with the interval
-    at all times together. `what` is so in `right` of the pictures; `worst` says where
-    it was not, and is empty where it always was. `outcomes` says what became of the
-    object in the other pictures where a detector is judged.
+    """Describe why a claim about a fraction is held, failed or undecided.
+
+    Args:
+        what: what is claimed of a picture.
+        verdict: HELD, FAILED or UNDECIDED.
+        right: number of pictures of which it holds.
+        pictures: number of all pictures.
+        interval: interval of the fraction that holds at all times jointly.
+        worst: where it did not hold; empty if it always did.
+        outcomes: the outcomes of a detector in the other pictures, or empty.
     """
-    said = (
-        (
-            f"{what} in {right} of {pictures} (interval "
-            f"{wording.interval_text(interval)})"
-        )
-        if pictures
-        else "no picture"
-    )
-    said += f"; {outcomes}" if outcomes else ""
-    more = (
-        f"; not decided after {wording.count(pictures, 'picture')}"
-        if verdict == UNDECIDED
-        else ""
-    )
-    return said + more + (f"; {worst}" if worst else "")
+    reason = "no picture"
+    if pictures:
+        interval_text = wording.interval_text(interval)
+        reason = f"{what} in {right} of {pictures} (interval {interval_text})"
+    if outcomes:
+        reason += f"; {outcomes}"
+    if verdict == UNDECIDED:
+        reason += f"; not decided after {wording.count(pictures, 'picture')}"
+    if worst:
+        reason += f"; {worst}"
+    return reason
 
 
 def difference_reason(
     verdict: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str
 ) -> str:
-    """Return why a claim about two models is held, failed or undecided. The counts are
-    pictures; those in which only the model is right, and those in which only the other
-    one is.
+    """Describe why a claim about two models is held, failed or undecided.
+
+    Args:
+        verdict: HELD, FAILED or UNDECIDED.
+        counts: all pictures, those in which only the model under test is right, and
+            those in which only the other one is.
+        interval: interval of the difference of their fractions.
+        than: the other model.
     """
-    pictures, ours, theirs = counts
+    pictures, only_this, only_other = counts
     if not pictures:
         return "no picture"
-    ends = " to ".join(f"{100.0 * end:+.1f}" for end in interval)
-    said = (
-        f"of {wording.count(pictures, 'picture')} it alone is right in {ours}, "
-        f"{wording.short_name(than)} alone in {theirs} "
-        f"(difference {100.0 * (ours - theirs) / pictures:+.1f} points, interval "
-        f"{ends})"
+    bounds = " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
+    points = 100.0 * (only_this - only_other) / pictures
+    reason = (
+        f"of {wording.count(pictures, 'picture')} it alone is right in {only_this}, "
+        f"{wording.short_name(than)} alone in {only_other} "
+        f"(difference {points:+.1f} points, interval {bounds})"
     )
-    return said + (
-        f"; not decided after {wording.count(pictures, 'picture')}"
-        if verdict == UNDECIDED
-        else ""
-    )
+    if verdict == UNDECIDED:
+        reason += f"; not decided after {wording.count(pictures, 'picture')}"
+    return reason
 
 
 def search_verdict(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> tuple[str, str, Cause | None]:
-    """Return the verdict of a search, its reason, and the cause where the search is not
-    at its end.
-    """
+    """Return the verdict of a search, its reason, and the cause if it is not finished."""
     verified = summary.verified
-    clean = summary.clean.control
     if summary.ending == "already wrong":
-        right = (
-            ""
-            if clean is None
-            else (f": right in {clean.correct} of {clean.trials} trials")
-        )
-        if clean is not None and clean.outcomes:
-            right += f", {wording.outcomes_text(clean.outcomes, summary.task)}"
-        return FAILED, f"wrong on the clean scene already{right}", None
+        return FAILED, _clean_reason(summary), None
     if summary.ending == "found" and verified is not None:
-        called = how_wrong(summary.task, verified)
+        prediction = how_wrong(summary.task, verified)
         interval = wording.interval_text(verified.interval)
         wrong = (
             f"wrong in {verified.successes} of {verified.trials} trials (interval "
             f"{interval})"
         )
-        return FAILED, f"a verified counterexample: {wrong}{called}", None
+        return FAILED, f"a verified counterexample: {wrong}{prediction}", None
     if summary.goes_on:
         return UNDECIDED, STOPPED, Cause.INTERRUPTED
     if verified is not None and verified.successes:
-        noisy = (
+        reason = (
             f"what it found is wrong in {verified.successes} of {verified.trials} "
             "trials, by noise"
         )
-        return UNDECIDED, noisy, None
-    asked = config.steps
-    if config.seconds is not None and asked is not None and summary.steps < asked:
-        return (
-            UNDECIDED,
-            f"{TIME_OVER} after {summary.steps} of {asked} steps",
-            Cause.OUT_OF_TIME,
-        )
-    beside = "" if summary.baseline is None else ", nor by as many random renders"
+        return UNDECIDED, reason, None
+    max_steps = config.steps
+    has_limit = config.seconds is not None
+    if has_limit and max_steps is not None and summary.steps < max_steps:
+        reason = f"{TIME_OVER} after {summary.steps} of {max_steps} steps"
+        return UNDECIDED, reason, Cause.OUT_OF_TIME
+    baseline = "" if summary.baseline is None else ", nor by as many random renders"
     steps = wording.count(summary.steps, "step")
-    return (
-        HELD,
-        f"not broken by {steps} of {summary.policy}{beside}; this is no proof",
-        None,
-    )
+    reason = f"not broken by {steps} of {summary.policy}{baseline}; this is no proof"
+    return HELD, reason, None
+
+
+def _clean_reason(summary: workbench.AttackSummary) -> str:
+    """Describe that the model is wrong on the clean scene."""
+    reason = "wrong on the clean scene already"
+    clean = summary.clean.control
+    if clean is not None:
+        reason += f": right in {clean.correct} of {clean.trials} trials"
+        if clean.outcomes:
+            reason += f", {wording.outcomes_text(clean.outcomes, summary.task)}"
+    return reason
 
 
 def how_wrong(task: str, verified: results.VerifiedRate) -> str:
-    """Return what the model most often says in trials that are successes, as the end of
-    a sentence.
-    """
+    """Return the most frequent wrong prediction, as the end of a sentence."""
     label = next(iter(verified.labels), "")
     if verified.outcomes:
         return f": {wording.outcomes_text(verified.outcomes, task)}"
@@ -342,6 +341,7 @@ def how_wrong(task: str, verified: results.VerifiedRate) -> str:
 
 
 def cannot_be_judged(error: str) -> str:
+    """Describe that a counterexample's settings do not suit the model."""
     return f"its own settings do not fit to this model: {error}"
 
 
@@ -354,21 +354,19 @@ def tried_reason(
     over: bool,
     outcomes: str = "",
 ) -> str:
-    """Return why a counterexample is held, failed or undecided.
+    """Describe why a counterexample is held, failed or undecided.
 
     Args:
         verdict: HELD, FAILED or UNDECIDED.
         counts: trials in which the model is right, in which it is wrong, and which do
             not count.
         label: the first wrong prediction.
-        interval: of the share of right trials; None where no trial counts.
+        interval: of the fraction of right trials; None if no trial counts.
         over: whether conditions vary.
-        outcomes: what became of the object in the wrong trials, where a detector is
-            judged; else empty.
+        outcomes: the outcomes of a detector in the wrong trials, or empty.
     """
     right, wrong, uncounted = counts
-    total = right + wrong
-    what = "conditions in which the clean scene is right" if over else "trials"
+    trials = "conditions in which the clean scene is right" if over else "trials"
     if interval is None:
         if over and uncounted:
             return (
@@ -377,54 +375,56 @@ def tried_reason(
             )
         return "nothing of the object is to be seen" if uncounted else TIME_OVER
     if not wrong:
-        text = (
-            f"right in {right} of {right} {what} (interval "
-            f"{wording.interval_text(interval)})"
-        )
+        interval_text = wording.interval_text(interval)
+        reason = f"right in {right} of {right} {trials} (interval {interval_text})"
     else:
-        low, high = interval
-        ends = wording.interval_text((1.0 - high, 1.0 - low))
-        text = f"wrong in {wrong} of {total} {what} (interval {ends})"
-        text += f": {outcomes}" if outcomes else f", {wording.with_article(label)}"
-    if verdict == UNDECIDED and right and wrong:
-        text += (
-            ": it depends on the conditions" if over else ": it depends on the noise"
+        lower, upper = interval
+        interval_text = wording.interval_text((1.0 - upper, 1.0 - lower))
+        reason = (
+            f"wrong in {wrong} of {right + wrong} {trials} (interval {interval_text})"
         )
-    why = (
-        "the clean scene is wrong, or the object not to be seen"
-        if over
-        else "the object is not to be seen"
-    )
-    return text + (f"; {uncounted} more are not counted, as {why}" if uncounted else "")
+        reason += f": {outcomes}" if outcomes else f", {wording.with_article(label)}"
+    if verdict == UNDECIDED and right and wrong:
+        cause = "conditions" if over else "noise"
+        reason += f": it depends on the {cause}"
+    if uncounted:
+        why = "the object is not to be seen"
+        if over:
+            why = "the clean scene is wrong, or the object not to be seen"
+        reason += f"; {uncounted} more are not counted, as {why}"
+    return reason
 
 
 def table_rows(result: SuiteResult) -> list[list[str]]:
+    """Return the rows of the table of claims."""
     rows = []
     for claim in result.claims:
-        text = claim.answer
+        answer = claim.answer
         if claim.expected != HELD:
-            text += (
-                " (as expected)"
-                if claim.answer == claim.expected
-                else f" (expected: {claim.expected})"
-            )
-        rows.append([claim.name, text, str(claim.pictures or ""), claim.reason])
+            if claim.answer == claim.expected:
+                answer += " (as expected)"
+            else:
+                answer += f" (expected: {claim.expected})"
+        rows.append([claim.name, answer, str(claim.pictures or ""), claim.reason])
     return rows
 
 
 def suite_text(result: SuiteResult) -> str:
+    """Describe the result of a suite in a sentence."""
     if result.added is not None:
         return f"Kept as {result.added}."
-    known = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
-    beside = f", {known} of them as expected" if known else ""
-    said = {
+    n_expected = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
+    expected = f", {n_expected} of them as expected" if n_expected else ""
+    beginnings = {
         results.RUNNING: "Running, so far",
         results.INTERRUPTED: "Stopped, so far",
-    }.get(result.ending, result.answer.capitalize())
-    return f"{said}: {result.brief or 'no claims'}{beside}."
+    }
+    beginning = beginnings.get(result.ending, result.answer.capitalize())
+    return f"{beginning}: {result.brief or 'no claims'}{expected}."
 
 
 def facts(result: SuiteResult) -> dict[str, str]:
+    """Return facts of a run of `test` by name."""
     return {
         "model": result.model,
         "confidence": f"{wording.percent(result.confidence)} for each claim that "
@@ -436,26 +436,24 @@ def facts(result: SuiteResult) -> dict[str, str]:
 
 
 def claims(result: SuiteResult) -> Iterator[views.Claim]:
-    for tried in result.claims:
+    """Yield what the result of each claim says, for `advsearch report`."""
+    for tested in result.claims:
         text = (
-            f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
+            f"{tested.name}: that {tested.statement} is {tested.answer}: "
+            f"{tested.reason}."
         )
-        if tried.answer == UNDECIDED:
-            yield views.Claim(kind="nothing claimed", statement=text, extent=None)
-        elif tried.kind in ("not_broken", "counterexample"):
-            yield views.Claim(
-                kind="found" if tried.answer == FAILED else "not found",
-                statement=text,
-                extent=None,
-            )
+        kind = "measured"
+        if tested.answer == UNDECIDED:
+            kind = "nothing claimed"
+        elif tested.kind in ("not_broken", "counterexample"):
+            kind = "found" if tested.answer == FAILED else "not found"
         else:
-            sure = wording.percent(result.confidence)
+            confidence = wording.percent(result.confidence)
             text += (
-                f" Each end of the interval is a confidence sequence at {sure}, "
-                "in "
-                "place of Clopper-Pearson's."
+                f" Each end of the interval is a confidence sequence at {confidence}, "
+                "in place of Clopper-Pearson's."
             )
-            yield views.Claim(kind="measured", statement=text, extent=None)
+        yield views.Claim(kind=kind, statement=text, extent=None)
 
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
@@ -472,71 +470,74 @@ MEANINGS = {
     "counterexample": "The model is right on the adversarial scene of an earlier "
     "search.",
 }
-"""What a claim of each kind says; the rules of SARIF."""
+"""What a claim of each kind states; the rules of SARIF."""
 
 
 def junit(result: SuiteResult) -> str:
-    """Return JUnit XML: a test case for each claim. What failed is a failure, what is
-    undecided an error, and what is so as expected is skipped.
+    """Return JUnit XML with a test case for each claim.
+
+    Failed claims are failures, undecided ones are errors, and those that are so as
+    expected are skipped.
     """
     answers = [(claim.answer, claim.accepted) for claim in result.claims]
-    counts = {
-        "tests": len(answers),
-        "failures": answers.count((FAILED, False)),
-        "errors": answers.count((UNDECIDED, False)),
-        "skipped": sum(accepted and answer != HELD for answer, accepted in answers),
-    }
-    attributes = {name: str(count) for name, count in counts.items()} | {
-        "time": f"{result.seconds['total']:.3f}"
+    attributes = {
+        "tests": str(len(answers)),
+        "failures": str(answers.count((FAILED, False))),
+        "errors": str(answers.count((UNDECIDED, False))),
+        "skipped": str(
+            sum(accepted and answer != HELD for answer, accepted in answers)
+        ),
+        "time": f"{result.seconds['total']:.3f}",
     }
     root = ElementTree.Element("testsuites", {"name": "advsearch", **attributes})
     suite = ElementTree.SubElement(
-        root, "testsuite", {"name": _xml(result.title), **attributes}
+        root, "testsuite", {"name": _escape_xml(result.title), **attributes}
     )
     properties = ElementTree.SubElement(suite, "properties")
     for name, value in {**facts(result), "run": result.run or ""}.items():
         ElementTree.SubElement(
-            properties, "property", {"name": name, "value": _xml(value)}
+            properties, "property", {"name": name, "value": _escape_xml(value)}
         )
     for claim in result.claims:
-        named = {"name": claim.name, "classname": _xml(f"{result.title}.{claim.kind}")}
-        case = ElementTree.SubElement(
-            suite, "testcase", {**named, "time": f"{claim.seconds:.3f}"}
-        )
-        if claim.answer == HELD:
-            ElementTree.SubElement(case, "system-out").text = _xml(
-                f"{claim.statement}\n{claim.reason}"
-            )
-            continue
-        tag = (
-            "skipped"
-            if claim.accepted
-            else "failure"
-            if claim.answer == FAILED
-            else "error"
-        )
-        said = ElementTree.SubElement(
-            case, tag, {"message": _xml(f"{claim.answer}: {claim.reason}")}
-        )
-        if tag != "skipped":
-            said.set("type", claim.answer)
-        said.text = _xml(
-            "\n".join(
-                filter(None, [claim.statement, _picture(result, claim), claim.repeat])
-            )
-        )
+        _add_test_case(suite, result, claim)
     ElementTree.indent(root)
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        + ElementTree.tostring(root, encoding="unicode")
-        + "\n"
+    xml = ElementTree.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml}\n'
+
+
+def _add_test_case(
+    suite: ElementTree.Element, result: SuiteResult, claim: ClaimResult
+) -> None:
+    """Add the test case of a claim to a test suite of JUnit."""
+    case = ElementTree.SubElement(
+        suite,
+        "testcase",
+        {
+            "name": claim.name,
+            "classname": _escape_xml(f"{result.title}.{claim.kind}"),
+            "time": f"{claim.seconds:.3f}",
+        },
     )
+    if claim.answer == HELD:
+        output = ElementTree.SubElement(case, "system-out")
+        output.text = _escape_xml(f"{claim.statement}\n{claim.reason}")
+        return
+    tag = "failure" if claim.answer == FAILED else "error"
+    if claim.accepted:
+        tag = "skipped"
+    message = _escape_xml(f"{claim.answer}: {claim.reason}")
+    outcome = ElementTree.SubElement(case, tag, {"message": message})
+    if tag != "skipped":
+        outcome.set("type", claim.answer)
+    lines = [claim.statement, _picture_path(result, claim), claim.repeat]
+    outcome.text = _escape_xml("\n".join(filter(None, lines)))
 
 
 def sarif(result: SuiteResult) -> str:
-    """Return SARIF 2.1.0: a rule for each kind of claim, and a result for each claim
-    that is not held, at the suite's file. What is so as expected is `unchanged`, all
-    else `new`.
+    """Return SARIF 2.1.0 with a result for each claim that is not held.
+
+    A rule is a kind of claims; locations are in the suite's file. What is so as
+    expected is `unchanged`, all else `new`.
     """
     kinds = list(dict.fromkeys(claim.kind for claim in result.claims))
     rules = [
@@ -547,46 +548,14 @@ def sarif(result: SuiteResult) -> str:
         }
         for kind in kinds
     ]
-    lines = (
-        Path(result.suite).read_text("utf-8").splitlines()
-        if Path(result.suite).is_file()
-        else []
-    )
-    sarif_results = []
-    for claim in result.claims:
-        if claim.answer == HELD:
-            continue
-        # the line of the suite's file in which the claim begins; the first for what
-        # stands elsewhere
-        begins = re.compile(rf"\s+{re.escape(claim.name)}\s*:")
-        line = next(
-            (
-                number
-                for number, text in enumerate(lines, start=1)
-                if begins.match(text)
-            ),
-            1,
-        )
-        place = {
-            "artifactLocation": {"uri": quote(result.suite)},
-            "region": {"startLine": line},
-        }
-        more = {
-            "picture": _picture(result, claim),
-            "repeat": claim.repeat,
-            "pictures": claim.pictures,
-        }
-        sarif_results.append({
-            "ruleId": claim.kind,
-            "ruleIndex": kinds.index(claim.kind),
-            "level": "error" if claim.answer == FAILED else "warning",
-            "message": {"text": f"{claim.name}: {claim.answer}: {claim.reason}. "
-                                f"Claimed: {claim.statement}."},
-            "locations": [{"physicalLocation": place}],
-            "partialFingerprints": {"claim/v1": claim.name},
-            "baselineState": "unchanged" if claim.accepted else "new",
-            "properties": {name: value for name, value in more.items() if value},
-        })  # fmt: skip
+    suite_lines = list[str]()
+    if Path(result.suite).is_file():
+        suite_lines = Path(result.suite).read_text("utf-8").splitlines()
+    sarif_results = [
+        _sarif_result(result, claim, kinds.index(claim.kind), suite_lines)
+        for claim in result.claims
+        if claim.answer != HELD
+    ]
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
     invocation = {
         "executionSuccessful": not result.goes_on,
@@ -597,51 +566,88 @@ def sarif(result: SuiteResult) -> str:
         "invocations": [invocation],
         "results": sarif_results,
     }
-    return (
-        json.dumps(
-            {"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]},
-            indent=2,
-            ensure_ascii=False,
-        )
-        + "\n"
+    log = {"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}
+    return json.dumps(log, indent=2, ensure_ascii=False) + "\n"
+
+
+def _sarif_result(
+    result: SuiteResult, claim: ClaimResult, rule_index: int, suite_lines: Sequence[str]
+) -> dict[str, object]:
+    """Return the SARIF result of a claim."""
+    message = (
+        f"{claim.name}: {claim.answer}: {claim.reason}. Claimed: {claim.statement}."
     )
+    location = {
+        "artifactLocation": {"uri": quote(result.suite)},
+        "region": {"startLine": _find_line(claim.name, suite_lines)},
+    }
+    properties = {
+        "picture": _picture_path(result, claim),
+        "repeat": claim.repeat,
+        "pictures": claim.pictures,
+    }
+    return {
+        "ruleId": claim.kind,
+        "ruleIndex": rule_index,
+        "level": "error" if claim.answer == FAILED else "warning",
+        "message": {"text": message},
+        "locations": [{"physicalLocation": location}],
+        "partialFingerprints": {"claim/v1": claim.name},
+        "baselineState": "unchanged" if claim.accepted else "new",
+        "properties": {name: value for name, value in properties.items() if value},
+    }
+
+
+def _find_line(name: str, suite_lines: Sequence[str]) -> int:
+    """Return the line of the suite's file in which a claim begins, else the first."""
+    beginning = re.compile(rf"\s+{re.escape(name)}\s*:")
+    for number, line in enumerate(suite_lines, start=1):
+        if beginning.match(line):
+            return number
+    return 1
 
 
 def markdown(result: SuiteResult) -> str:
-    lines = [f"### {_plain(result.title)}", "", _plain(suite_text(result)), ""]
-    lines += [
-        _line(TABLE_HEADS),
-        _line(["---"] * len(TABLE_HEADS)),
-        *map(_line, table_rows(result)),
+    """Return a Markdown table of the claims, and commands to repeat those not held."""
+    fact_texts = [
+        f"{name} {_escape_markdown(value)}" for name, value in facts(result).items()
     ]
-    lines += [
+    lines = [
+        f"### {_escape_markdown(result.title)}",
         "",
-        ", ".join(f"{name} {_plain(value)}" for name, value in facts(result).items()),
+        _escape_markdown(suite_text(result)),
+        "",
+        _format_row(TABLE_HEADS),
+        _format_row(["---"] * len(TABLE_HEADS)),
+        *map(_format_row, table_rows(result)),
+        "",
+        ", ".join(fact_texts),
     ]
-    again = [
+    commands = [
         claim.repeat for claim in result.claims if claim.answer != HELD and claim.repeat
     ]
-    lines += ["", "```sh", *again, "```"] if again else []
+    if commands:
+        lines += ["", "```sh", *commands, "```"]
     return "\n".join(lines) + "\n"
 
 
-def _picture(result: SuiteResult, claim: ClaimResult) -> str:
+def _picture_path(result: SuiteResult, claim: ClaimResult) -> str:
     return f"{result.run}/{claim.picture}" if claim.picture else ""
 
 
-def _xml(text: str) -> str:
+def _escape_xml(text: str) -> str:
+    """Replace characters that XML 1.0 does not allow."""
     return re.sub(
         r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text
     )
 
 
-def _plain(text: str) -> str:
+def _escape_markdown(text: str) -> str:
+    """Escape Markdown, and join lines."""
     return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", " ".join(text.split()))
 
 
-def _line(cells: Sequence[str]) -> str:
-    return (
-        "| "
-        + " | ".join(cell if cell == "---" else _plain(cell) for cell in cells)
-        + " |"
-    )
+def _format_row(cells: Sequence[str]) -> str:
+    """Return a row of a Markdown table."""
+    escaped = [cell if cell == "---" else _escape_markdown(cell) for cell in cells]
+    return f"| {' | '.join(escaped)} |"

@@ -1,6 +1,4 @@
-"""What `test` needs to know: its settings, the suite that a YAML file describes, and
-what a claim's picture needs.
-"""
+"""Settings of `test`, and the suites that YAML files describe."""
 
 from __future__ import annotations
 
@@ -28,9 +26,7 @@ powers = settings.powers
 
 
 class SuiteConfig(Config):
-    """Everything that decides what `test` does: which suite, which of its claims, and
-    on what model.
-    """
+    """Settings of `test`: which suite, which of its claims, and on which model."""
 
     # fmt: off
     command: ClassVar[str] = "test"
@@ -57,7 +53,8 @@ class SuiteConfig(Config):
     add: str | None = setting(
         None, "test", "keep the adversarial scene of this run as a counterexample "
                       "beside the suite, and try it",
-        "the name or the folder of a run of attack", otherwise="nothing is added", power=powers.beside_suite,
+        "the name or the folder of a run of attack", otherwise="nothing is added",
+        power=powers.beside_suite,
     )
     update: bool = setting(
         False, "test", "expect from now on what the claims say today, and show what "
@@ -71,18 +68,24 @@ class SuiteConfig(Config):
         None, "test", "begin nothing more after this time; what is left is undecided",
         otherwise="what the suite says, or no limit", unit="seconds", gt=0.0, le=1e9,
     )
-    model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
+    model: str | None = setting_as_in(
+        SceneConfig, "model", default=None, otherwise="what the suite says, or reference"
+    )
     junit: str | None = setting(
-        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none", power=powers.file
+        None, "files", "write JUnit XML, a test case for each claim", "a file",
+        otherwise="none", power=powers.file,
     )
     sarif: str | None = setting(
         None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file",
         otherwise="none", power=powers.file,
     )
     markdown: str | None = setting(
-        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none", power=powers.file
+        None, "files", "write a Markdown table, for the summary of a job", "a file",
+        otherwise="none", power=powers.file,
     )
-    seed: int | None = setting_as_in(SceneConfig, "seed", default=None, otherwise="what the suite says, or 0")
+    seed: int | None = setting_as_in(
+        SceneConfig, "seed", default=None, otherwise="what the suite says, or 0"
+    )
     threads: int | None = setting_as_in(SceneConfig, "threads")
     deterministic: bool = setting_as_in(SceneConfig, "deterministic")
     workers: int | None = setting_as_in(
@@ -101,15 +104,17 @@ class SuiteConfig(Config):
 
     @property
     def chosen(self) -> tuple[str, ...]:
+        """The names in `only`; empty for all claims."""
         return () if self.only is None else settings.split_names(self.only)
 
     @property
     def title(self) -> tuple[str, ...]:
+        """The names that a run's directory is named after."""
         return Path(self.suite).stem, self.command
 
 
 class DrawnConfig(SceneConfig):
-    """Pictures that are drawn from what controls span, with so many samples a pixel."""
+    """Settings of pictures that are sampled from the ranges of the controls."""
 
     command: ClassVar[str] = "test"
     without: ClassVar[tuple[str, ...]] = ("spp",)
@@ -132,11 +137,12 @@ OWN = (
     "cluster",
     "seconds",
 )
-"""Settings that the suite or its command says for all claims."""
+"""Settings that the suite or its command sets for all claims."""
 
-PICTURES = 400  # pictures that a claim may take, and the most that it may ask for
+# default and limit of the pictures of a claim
+PICTURES = 400
 MOST = 1_000_000
-# what stands for all of them, and no claim is called
+# stands for all counterexamples; no claim may have this name
 COUNTEREXAMPLES = "counterexamples"
 Settings = dict[str, object]
 
@@ -170,7 +176,7 @@ class _FromYaml(BaseModel):
     @field_validator(*NUMBERS, mode="before", check_fields=False)
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
-        """Refuse true for a number: YAML's `pictures: yes` is a slip, not 1."""
+        """Reject true for a number: YAML's `pictures: yes` is a slip, not 1."""
         if isinstance(value, bool):
             raise ValueError(f"expected {EXPECTED[info.field_name]}, got {value}")
         return value
@@ -182,16 +188,14 @@ class _Claim(_FromYaml):
 
 
 class _PicturesClaim(_Claim):
-    """Pictures decide it that are drawn, at most so many, from what the controls
-    span.
-    """
+    """A claim that sampled pictures decide, `pictures` of them at most."""
 
     kind: ClassVar[type[SceneConfig]] = DrawnConfig
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
 
 
 class ShareClaim(_PicturesClaim):
-    """Something is so in at least a share of the pictures that the controls span."""
+    """A claim that something holds in at least a fraction of the pictures."""
 
     at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
 
@@ -199,12 +203,10 @@ class ShareClaim(_PicturesClaim):
     @classmethod
     def _per_cent(cls, value: Any) -> Any:
         """Accept ``95 %``."""
-        found = (
-            re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value)
-            if isinstance(value, str)
-            else None
-        )
-        return value if found is None else float(found[1]) / 100.0
+        if not isinstance(value, str):
+            return value
+        percentage = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value)
+        return value if percentage is None else float(percentage[1]) / 100.0
 
 
 class RightClaim(ShareClaim):
@@ -214,9 +216,10 @@ class RightClaim(ShareClaim):
 
 
 class MustChangeClaim(ShareClaim):
-    """The model says something else where there is nothing left to see: a model that
-    does not is not looking. `when` is what is done to the picture, a name of
-    `SweepConfig.blind_changes`.
+    """The prediction changes if nothing of the object is left to see.
+
+    A model whose prediction does not change ignores the object. `when` is what is done
+    to the picture, a name of `SweepConfig.blind_changes`.
     """
 
     claim: Literal["must_change"]
@@ -224,8 +227,9 @@ class MustChangeClaim(ShareClaim):
 
 
 class MustNotChangeClaim(ShareClaim):
-    """The model says the same where a change means nothing; `when` is a name of
-    `SweepConfig.harmless_changes`.
+    """The prediction stays the same under a change without meaning.
+
+    `when` is a name of `SweepConfig.harmless_changes`.
     """
 
     claim: Literal["must_not_change"]
@@ -233,8 +237,9 @@ class MustNotChangeClaim(ShareClaim):
 
 
 class NotBrokenClaim(_Claim):
-    """No search finds a configuration within a budget that the model gets wrong; its
-    settings are those of `attack`.
+    """No search within a budget finds a configuration that the model gets wrong.
+
+    Its settings are those of `attack`.
     """
 
     kind: ClassVar[type[SceneConfig]] = AttackConfig
@@ -242,8 +247,9 @@ class NotBrokenClaim(_Claim):
 
 
 class NoWorseClaim(_PicturesClaim):
-    """The model is right at most so many percentage points less often than another one,
-    on the same pictures.
+    """The model is right less often than another by at most `points` percentage points.
+
+    Both predict the same pictures.
     """
 
     claim: Literal["no_worse"]
@@ -253,18 +259,21 @@ class NoWorseClaim(_PicturesClaim):
 
 ChangeClaim = MustChangeClaim | MustNotChangeClaim
 AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | ChangeClaim
-"""The kinds of claims; each is tried by a method of `Trial`. A claim about the frames
-of a drive would stand here.
-"""
+"""The kinds of claims; each is tested by a method of `Trial`."""
 
 KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
 
 class Suite(_FromYaml):
-    """What the file of a suite says: settings of all claims, as for `attack`, in whose
-    place come those of a claim; the root of all random numbers; `confidence` of each
-    claim that is decided by drawn pictures; seconds after which nothing more is begun,
-    None for no limit; and the claims by name.
+    """The content of a suite's file.
+
+    Attributes:
+        title: what it is about.
+        settings: settings of all claims, as for `attack`; those of a claim override them.
+        seed: root of all random numbers.
+        confidence: of each claim that sampled pictures decide.
+        seconds: after which nothing more begins, None for no limit.
+        claims: claims by name.
     """
 
     title: Annotated[str, Field(min_length=1, max_length=200)] = "Claims about a model"
@@ -280,11 +289,10 @@ class Suite(_FromYaml):
     @field_validator("claims")
     @classmethod
     def _names(cls, value: dict[str, AnyClaim]) -> dict[str, AnyClaim]:
+        """Check the names of claims."""
         for name in value:
-            if (
-                not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name)
-                or name == COUNTEREXAMPLES
-            ):
+            is_valid = re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name)
+            if not is_valid or name == COUNTEREXAMPLES:
                 raise ValueError(
                     "expected names of small letters, digits and "
                     f"hyphens, got {settings.shown(name)}"
@@ -292,81 +300,94 @@ class Suite(_FromYaml):
         return value
 
     def config_of(self, name: str, **changes: object) -> SceneConfig:
-        """Return what a claim's pictures are made with; settings that the command says
-        for all claims go over its own, None says nothing. An InputError where one is
-        unknown, impossible, or the suite's own.
+        """Return the settings that a claim is tested with.
+
+        Args:
+            name: name of the claim.
+            **changes: settings of the command, which override those of the claim; None
+                leaves them.
+
+        Raises:
+            InputError: if a setting is unknown, impossible, or belongs to the suite.
         """
         claim = self.claims[name]
-        for where, given in (
+        for where, claim_settings in (
             ("settings", self.settings),
             (f"claims.{name}.settings", claim.settings),
         ):
-            if own := [known for known in given if known in OWN]:
-                raise InputError(
-                    f"{where}: {own[0]} is said for the whole suite; leave it out there"
-                )
+            for known in claim_settings:
+                if known in OWN:
+                    raise InputError(
+                        f"{where}: {known} is said for the whole suite; leave it out there"
+                    )
         changed = {key: value for key, value in changes.items() if value is not None}
+        merged = {**self.settings, **claim.settings, "seed": self.seed, **changed}
         try:
-            return claim.kind(
-                **{**self.settings, **claim.settings, "seed": self.seed, **changed}
-            )
+            return claim.kind(**merged)
         except InputError as error:
             raise InputError(f"claims.{name}: {error}") from None
 
 
 def read_suite(path: str | Path) -> Suite:
+    """Read the suite of a YAML file.
+
+    Raises:
+        FileFormatError: if the file describes none.
+    """
     return suite_of(settings.read_yaml(path), str(path))
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
-    """Return the suite that a mapping describes, as it stands in the file `where`; a
-    FileFormatError says in one sentence what is missing, unknown, or of another kind.
+    """Parse the content of a suite's file; `where` names the file in messages.
+
+    Raises:
+        FileFormatError: with what is missing, unknown, or of another type.
     """
+    values = {
+        name: value for name, value in data.items() if name not in ("schema", "command")
+    }
     try:
-        return Suite(
-            **{
-                name: value
-                for name, value in data.items()
-                if name not in ("schema", "command")
-            }
-        )
+        return Suite(**values)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        # a slip in a name
-        first = next(
-            (each for each in details if each["type"] == "extra_forbidden"), details[0]
-        )
-        raise errors.FileFormatError(f"{where}: {_told(first)}") from None
+        # a typing error in a name explains other problems
+        unknown = [each for each in details if each["type"] == "extra_forbidden"]
+        first = (unknown or details)[0]
+        raise errors.FileFormatError(f"{where}: {_describe_error(first)}") from None
 
 
-def _told(error: Any) -> str:
+def _describe_error(error: Any) -> str:
+    """Describe a problem that pydantic found, with what was expected."""
     kind = error["type"]
-    place = [str(part) for part in error["loc"] if part not in KINDS]
+    location = [str(part) for part in error["loc"] if part not in KINDS]
     got = settings.shown(error["input"])
-    if place[-1] == "[key]":  # a name that is a number
+    if location[-1] == "[key]":  # a name that is a number
         return (
-            f"{place[0]}: expected names of small letters, digits and hyphens, got "
+            f"{location[0]}: expected names of small letters, digits and hyphens, got "
             f"{got}; put it in quotes"
         )
     if kind.startswith("union_tag"):
-        place.append("claim")
-        got = (
-            "nothing"
-            if kind == "union_tag_not_found"
-            else settings.shown(error["ctx"]["tag"])
-        )
-    where = ".".join(place)
-    name = place[-1]
+        location.append("claim")
+        got = "nothing"
+        if kind != "union_tag_not_found":
+            got = settings.shown(error["ctx"]["tag"])
+    where = ".".join(location)
+    name = location[-1]
     if kind == "extra_forbidden":
-        if name in EXPECTED:
-            return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
-        near = difflib.get_close_matches(name, sorted(EXPECTED), 1)
-        guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
-        return (
-            f"{where}: there is no such name in a suite, or in a claim of this "
-            f"kind; {guess}"
-        )
+        return f"{where}: {_describe_unknown_name(name, in_claim=len(location) > 2)}"
     if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
     got = {"missing": "nothing", "too_short": "none"}.get(kind, got)
     return f"{where}: expected {EXPECTED.get(name, A_CLAIM)}, got {got}"
+
+
+def _describe_unknown_name(name: str, *, in_claim: bool) -> str:
+    """Describe a name that a suite or a claim does not have."""
+    if name in EXPECTED:
+        owner = "a claim of this kind" if in_claim else "a suite"
+        return f"{owner} has no {name}; leave it out"
+    similar = difflib.get_close_matches(name, sorted(EXPECTED), 1)
+    guess = "docs/testing.md has the names"
+    if similar:
+        guess = f"did you mean {similar[0]}?"
+    return f"there is no such name in a suite, or in a claim of this kind; {guess}"
